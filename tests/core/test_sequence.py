@@ -185,10 +185,10 @@ def test_a_motion_is_as_it_was_made() -> None:
     [
         ({"distance_m": -1.0}, "distance_m is -1"),
         ({"distance_m": 1001.0}, "distance_m is 1001"),
-        ({"distance_m": 1.0, "distance_std_m": 0.0}, "distance_std_m is 0, it must be between 0.001"),
+        ({"distance_m": 1.0, "distance_std_m": 0.0}, "distance_std_m is 0; it must be between 0.001"),
         ({"turn": math.nan}, "turn is nan"),
         ({"turn": 1.0, "turn_std": 0.0}, "turn_std is 0"),
-        ({"direction": 1.0}, "distance_m is missing"),
+        ({"direction": 1.0}, "without distance_m"),
     ],
 )
 def test_motions_that_cannot_be_are_refused(values: dict[str, float], message: str) -> None:
@@ -319,5 +319,5 @@ class TestSearch:
 
     def test_motions_are_counted(self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
-        with pytest.raises(InvalidMotionError, match="1 motions are given, 3 pictures have 2"):
+        with pytest.raises(InvalidMotionError, match="1 motions are given; 3 pictures need 2"):
             localise_sequence(plan, grid, encoders, queries, [Motion()])

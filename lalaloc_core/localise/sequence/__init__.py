@@ -1,11 +1,11 @@
-"""Several photographs of one visit, answered jointly: the posterior of each, and of the path.
+"""Joint localisation of several photographs of one visit: the posterior of each, and of the path.
 
-Every picture has one state, a pose of the plan's grid with a heading. Pictures are a chain: what was measured of the
-motion between two of them (`motion.py`) links their states, and all share one error of the camera height.
+The state of a picture is a pose of the plan's grid with a heading. Pictures form a chain: the measured motions between
+neighbours (`motion.py`) link their states, and all share one error of the camera height.
 
 Begin with `search.py`, the path of a query. `chain.py` sums over all paths (forward-backward) and finds the best ones
-(Viterbi), `joint.py` optimises all poses of a path together, `refinement.py` is what goes there and comes back,
-`paths.py` says how probable paths are.
+(Viterbi), `joint.py` refines all poses of a path together, `refinement.py` makes its jobs and reads its results, and
+`paths.py` computes the probability of paths.
 """
 
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult

@@ -1,7 +1,7 @@
 """Chains of pictures: sums over all paths through their states, and the best paths (Rabiner 1989).
 
-All pictures share one camera height. The chain is walked once for every height that is tried, and the heights share the
-probability in proportion to how likely they make all pictures together.
+All pictures share one camera height. The chain is summed once for every height that is tried, and the probability of a
+height is proportional to the likelihood of all pictures at it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _COMPARED = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
-    """What a chain says.
+    """Marginal probabilities of a chain.
 
     Attributes:
         log_evidence: log of the sum over all paths and heights.
-        state: (n, k) of every picture, the probability of its states; they sum to one.
+        state: for every picture the (n, k) probability of its states; the sum is one.
         height: (j,) probability of every height.
     """
 
@@ -42,18 +42,18 @@ def forward_backward(
     """Sum over all paths.
 
     Args:
-        log_likelihood: of every picture, by height and state.
-        transitions: between neighbours.
-        log_prior: of the heights.
+        log_likelihood: for every picture the log likelihood by height and state.
+        transitions: transitions between neighbours.
+        log_prior: (j,) log prior of the heights.
     """
-    peak = [float(one.max()) for one in log_likelihood]
-    likelihood = [np.exp(one - top) for one, top in zip(log_likelihood, peak, strict=True)]
+    peak = [float(values.max()) for values in log_likelihood]
+    likelihood = [np.exp(values - top) for values, top in zip(log_likelihood, peak, strict=True)]
     forward, log_sum = [], log_prior + sum(peak)
     message = np.ones((len(log_prior), 1, 1))
-    for index, one in enumerate(likelihood):
+    for index, values in enumerate(likelihood):
         if index:
             message = _onwards(transitions[index - 1], forward[-1])
-        joint, log_scale = _scaled(message * one)
+        joint, log_scale = _scaled(message * values)
         log_sum = log_sum + log_scale
         forward.append(joint)
     log_evidence = float(np.logaddexp.reduce(log_sum))
@@ -70,7 +70,7 @@ def forward_backward(
 
 
 def _scaled(values: Float[np.ndarray, "j n k"]) -> tuple[Float[np.ndarray, "j n k"], Float[np.ndarray, "j"]]:
-    """Values with a sum of one for each height, and the logs of what the sums were."""
+    """Scale values to a sum of one for each height; return them and the logs of the former sums."""
     total = values.sum(axis=(1, 2))
     safe = np.where(total > 0.0, total, 1.0)
     with np.errstate(divide="ignore"):
@@ -115,12 +115,11 @@ def _back(transition: Transition, message: Float[np.ndarray, "j m l"]) -> Float[
 
 @dataclass(frozen=True, eq=False)
 class BestPaths:
-    """The best path through every state of every picture.
+    """Best path through every state of every picture.
 
     Attributes:
-        score: (n, k) of every picture, the log likelihood of the best path through each state.
-        before, after: (n, k) of every picture, the state of the one before and after it on that path, counted in
-            row-major order.
+        score: for every picture the (n, k) log likelihood of the best path through each state.
+        before, after: for every picture the (n, k) state of its neighbour on that path, in row-major order.
     """
 
     score: list[Float[np.ndarray, "_ _"]]
@@ -128,7 +127,7 @@ class BestPaths:
     after: list[Int[np.ndarray, "_ _"]]
 
     def through(self, picture: int, state: int) -> list[int]:
-        """The best path through a state of a picture."""
+        """Return the best path through a state of a picture."""
         path = [state]
         for index in range(picture, 0, -1):
             path.insert(0, int(self.before[index].ravel()[path[0]]))
@@ -138,24 +137,26 @@ class BestPaths:
 
 
 def best_paths(log_likelihood: Sequence[Float[np.ndarray, "_ _"]], transitions: Sequence[Transition]) -> BestPaths:
-    """Viterbi's algorithm in both directions, at one height."""
+    """Find the best paths by Viterbi's algorithm in both directions, at one height."""
     count = len(log_likelihood)
-    reached, left = list(log_likelihood), [np.zeros_like(one) for one in log_likelihood]
-    nothing = [np.full(one.shape, -1) for one in log_likelihood]
+    reached, left = list(log_likelihood), [np.zeros_like(values) for values in log_likelihood]
+    nothing = [np.full(values.shape, -1) for values in log_likelihood]
     before, after = list(nothing), list(nothing)
     for index in range(1, count):
         best, before[index] = _best_onwards(transitions[index - 1], reached[index - 1])
         reached[index] = best + log_likelihood[index]
     for index in reversed(range(count - 1)):
         left[index], after[index] = _best_back(transitions[index], left[index + 1] + log_likelihood[index + 1])
-    return BestPaths([one + other for one, other in zip(reached, left, strict=True)], before, after)
+    return BestPaths(
+        [sum_before + sum_after for sum_before, sum_after in zip(reached, left, strict=True)], before, after
+    )
 
 
 _Best = tuple[Float[np.ndarray, "_ _"], Int[np.ndarray, "_ _"]]
 
 
 def _best_onwards(transition: Transition, score: Float[np.ndarray, "n k"]) -> _Best:
-    """The best first state for every second one of a transition."""
+    """Return the best first state for every second state of a transition."""
     _, k, m, after = transition.sizes
     placed, place = _best_place(transition, score, m)
     turned, heading = _best_heading(placed, transition.turns, after)
@@ -164,7 +165,7 @@ def _best_onwards(transition: Transition, score: Float[np.ndarray, "n k"]) -> _B
 
 
 def _best_back(transition: Transition, score: Float[np.ndarray, "m l"]) -> _Best:
-    """The best second state for every first one of a transition."""
+    """Return the best second state for every first state of a transition."""
     n, k, _, after = transition.sizes
     turned, heading = _best_heading(score, None if transition.turns is None else transition.turns.T, k)
     placed, place = _best_place(transition, turned, n, backwards=True)
@@ -178,7 +179,7 @@ def _or_floor(
     found: Float[np.ndarray, "m l"],
     state: Int[np.ndarray, "m l"],
 ) -> _Best:
-    """What was found, or the best state of all where the transition has nothing better than its floor."""
+    """Replace results below the transition's floor by the best state of all at the floor."""
     if not transition.floor:
         return found, state
     anywhere = float(score.max()) + np.log(transition.floor)
@@ -187,7 +188,7 @@ def _or_floor(
 
 
 def _best_heading(score: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "k l"] | None, headings: int) -> _Best:
-    """The best of the headings before for every one after, place by place."""
+    """Return the best heading before for every heading after, place by place."""
     if turns is None:
         best = score.argmax(axis=1)[:, None]
         value = np.take_along_axis(score, best, axis=1)
@@ -206,7 +207,7 @@ def _best_heading(score: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "k l
 def _best_place(
     transition: Transition, score: Float[np.ndarray, "n k"], places: int, *, backwards: bool = False
 ) -> _Best:
-    """The best of the places before for every one after, heading by heading of the first picture."""
+    """Return the best place before for every place after, heading by heading of the first picture."""
     headings = score.shape[1]
     if transition.places is None:
         best = score.argmax(axis=0)[None]
@@ -220,7 +221,7 @@ def _best_place(
 
 
 def _best_of_rows(pairs: csr_array, score: Float[np.ndarray, "n k"]) -> _Best:
-    """For every row of a sparse matrix the best of `log value + score` over its entries, and which column has it."""
+    """Return the best `log value + score` over the entries of every row of a sparse matrix, and its column."""
     rows, columns = len(pairs.indptr) - 1, score.shape[1]
     value, best = np.full((rows, columns), -np.inf), np.zeros((rows, columns), int)
     filled = np.flatnonzero(np.diff(pairs.indptr))
@@ -234,7 +235,7 @@ def _best_of_rows(pairs: csr_array, score: Float[np.ndarray, "n k"]) -> _Best:
         total = log_value[:, None] + score[pairs.indices, part]
         highest = np.maximum.reduceat(total, begins, axis=0)
         value[filled, part] = highest
-        # Of equals the last: every entry that is no worse than the row's best names its column.
+        # The last of equal entries wins: every entry that equals the row's best writes its column.
         entry, column = np.nonzero(total >= highest[row_of])
         best[filled[row_of[entry]], first + column] = pairs.indices[entry]
     return value, best

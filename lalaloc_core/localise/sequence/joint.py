@@ -1,12 +1,12 @@
-"""All poses of a path optimised together: what the pictures say of the walls, and what was measured of the motions.
+"""Joint refinement of all poses of a path, by the predicted walls and the measured motions.
 
 Levenberg-Marquardt lowers, for every path of a job,
 
     sum over pictures ½ sum over azimuths log(1 + r²)  +  ½ scale² (sum of the motions' squared residuals)
     +  ½ (stiffness δ)²
 
-by all positions, the headings that are not known, and one δ, the log of true over stated camera height. The derivatives
-are in closed form (`render.gradient`), so numpy does it: nothing here needs a network. Poses stay inside their rooms.
+by all positions, the unknown headings, and one δ, the log of true over stated camera height. The derivatives are in
+closed form (`render.gradient`), so numpy suffices. Poses stay inside their rooms.
 """
 
 from __future__ import annotations
@@ -23,24 +23,28 @@ from lalaloc_core.render.gradient import log_distance_gradient, log_profile_grad
 
 _MARGIN_M, _MAX_STEP_M, _MAX_TURN = 0.03, 0.5, 0.2
 _ITERATIONS, _FIRST_DAMPING = 25, 1e-2
-# A path is done when no pose moves farther, or the cost falls by less than this share.
+# A path has converged if no pose moves farther, or the cost falls by less than this share.
 _SHORT_M, _LITTLE = 1e-3, 1e-4
-# Keeps systems with an unknown that nothing is known of from being singular.
+# Keeps systems with undetermined unknowns from being singular.
 _HELD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceJob:
-    """Paths to be optimised: `m` of them, through `t` pictures.
+    """`m` paths to be refined, through `t` pictures.
 
     Attributes:
-        roll: (m, t) what is added to the headings (radians), which are of frames as in `poses.Query`.
-        turnable: (t,) which headings are searched.
-        log_profile, precision: as in `poses.RefinementJob`.
-        motions: between neighbours; `trusted` (m, t - 1) says of which paths they hold.
-        motion_scale: factor that turns their residuals into some that count among azimuth columns.
-        height_offset: (m,) where to begin with δ.
+        position_m: (m, t, 2) positions (m).
+        heading: (m, t) headings (radians) in the frames, as in `poses.Query`.
+        roll: (m, t) angles (radians) to add for the panoramas' headings.
+        turnable: (t,) pictures whose heading is searched.
+        walls_m, log_profile, precision: as in `poses.RefinementJob`.
+        motions: motions between neighbours.
+        trusted: (m, t - 1) motions that each path follows.
+        motion_scale: factor that scales the motions' residuals to those of azimuth columns.
+        height_offset: (m,) start of δ.
         height_free: whether δ is solved for.
+        height_stiffness, height_bounds: as in `poses.RefinementJob`.
     """
 
     position_m: Float[np.ndarray, "m t 2"]
@@ -61,11 +65,14 @@ class SequenceJob:
 
 @dataclass(frozen=True, eq=False)
 class SequenceResult:
-    """Where paths ended.
+    """Refined paths.
 
     Attributes:
-        information: of every picture, (m, p, p) by position and, where it was searched, heading: what is known of its
-            pose with all the others integrated out.
+        position_m: (m, t, 2) positions (m).
+        heading: (m, t) headings (radians) in the frames.
+        height_offset: (m,) δ.
+        information: for every picture the (m, p, p) information about its position and, if it was searched, heading,
+            with all other unknowns integrated out.
     """
 
     position_m: Float[np.ndarray, "m t 2"]
@@ -75,7 +82,7 @@ class SequenceResult:
 
 
 def refine_sequence(job: SequenceJob) -> SequenceResult:
-    """Optimise every path of a job, each on its own."""
+    """Refine every path of a job."""
     count, pictures = job.heading.shape
     unknowns = np.zeros((count, 3 * pictures + 1))
     unknowns[:, -1] = job.height_offset
@@ -169,7 +176,7 @@ def _evaluate(job: SequenceJob, unknowns: Float[np.ndarray, "m u"]) -> _Evaluati
 def motion_residuals(
     motion: Motion, position_m: Float[np.ndarray, "m 2 2"], heading: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "m r"], Float[np.ndarray, "m r 6"]]:
-    """By how many deviations pairs of poses differ from a motion, and the derivatives by both poses' x, y, heading."""
+    """Return the residuals of pairs of poses (in deviations), and their derivatives by both poses' x, y, heading."""
     off: list[np.ndarray] = []
     by_both: list[np.ndarray] = []
     moved = position_m[:, 1] - position_m[:, 0]
@@ -198,7 +205,7 @@ def motion_residuals(
 
 
 def _by_displacement(by_moved: Float[np.ndarray, "m 2"], by_heading: Float[np.ndarray, "m"]) -> np.ndarray:
-    """Derivatives by both poses of what depends on the displacement and the first heading."""
+    """Return derivatives by both poses from those by the displacement and the first heading."""
     zero = np.zeros(len(by_moved))
     return np.stack([-by_moved[:, 0], -by_moved[:, 1], by_heading, by_moved[:, 0], by_moved[:, 1], zero], axis=1)
 
@@ -206,7 +213,7 @@ def _by_displacement(by_moved: Float[np.ndarray, "m 2"], by_heading: Float[np.nd
 def _possible(
     job: SequenceJob, unknowns: Float[np.ndarray, "m u"], step: Float[np.ndarray, "m u"]
 ) -> Float[np.ndarray, "m u"]:
-    """The step, shortened where a pose would move too far or come too close to a wall."""
+    """Shorten steps that move a pose too far or too close to a wall."""
     count, pictures = job.heading.shape
     poses = step[:, :-1].reshape(count * pictures, 3).copy()
     begin = (job.position_m + unknowns[:, :-1].reshape(count, pictures, 3)[:, :, :2]).reshape(-1, 2)
@@ -222,7 +229,7 @@ def _possible(
 
 
 def _information(job: SequenceJob, curvature: Float[np.ndarray, "m u u"]) -> list[Float[np.ndarray, "m p p"]]:
-    """What is known of each pose, in units of the curvature."""
+    """Return the information about each pose, in units of the curvature."""
     spread = np.linalg.inv(curvature + _HELD * np.eye(curvature.shape[1]))
     found = []
     for t, turnable in enumerate(job.turnable):
@@ -234,7 +241,7 @@ def _information(job: SequenceJob, curvature: Float[np.ndarray, "m u u"]) -> lis
 def motion_costs(
     motions: Sequence[Motion], position_m: Float[np.ndarray, "m t 2"], heading: Float[np.ndarray, "m t"]
 ) -> Float[np.ndarray, "m s"]:
-    """Half the sum of the squared residuals of every motion, for every path; headings are of the panoramas."""
+    """Return half the sum of the squared residuals of every motion and path, by the panoramas' headings."""
     costs = [
         0.5 * np.square(motion_residuals(motion, position_m[:, s : s + 2], heading[:, s : s + 2])[0]).sum(axis=1)
         for s, motion in enumerate(motions)

@@ -1,4 +1,4 @@
-"""What was measured of the motion between two pictures, and how likely it makes pairs of poses.
+"""Measured motions between two pictures, and the likelihood of pairs of poses.
 
 With the displacement v from the first place to the second, the measured distance d, the turn τ (second heading minus
 first, clockwise) and, where it was measured, the direction φ (of the displacement against the first heading):
@@ -7,8 +7,8 @@ first, clockwise) and, where it was measured, the direction φ (of the displacem
     r_dist = (|v| - d) / σ_d                                      without a direction
     r_along = (v · u - d) / σ_d,  r_across = (v · u') / (d σ_φ)   with one, u along heading + φ and u' at right angles
 
-and the likelihood is `exp(-½ Σ r²) + FLOOR`, as a measurement may be wrong altogether. Deviations are widened by what
-poses of a grid are off.
+and the likelihood is `exp(-½ Σ r²) + FLOOR`, as a measurement can be an outlier. Deviations are widened by the distance
+of grid poses from the camera.
 """
 
 from __future__ import annotations
@@ -25,30 +25,33 @@ from scipy.spatial import KDTree
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 
-# Likelihood of a measurement that is wrong altogether, in units of that of a perfect one.
+# Likelihood of an outlier, in units of that of a perfect measurement.
 FLOOR = 1e-4
-# Pairs that are off by more deviations than these are no more likely than the floor.
+# Residuals from here on are less likely than the floor.
 _MAX_DEVIATIONS = math.sqrt(-2.0 * math.log(FLOOR))
 MAX_DISTANCE_M = 1000.0
-# Deviations must be more than nothing: exact measurements would leave no pair of grid poses.
+# Smallest deviations: exact measurements would leave no pair of grid poses.
 MIN_DISTANCE_STD_M, MIN_ANGLE_STD = 1e-3, math.radians(0.01)
-# How far grid poses are from where the camera is, along any direction, as a share of the grid's step.
+# Deviation of grid poses from the camera along any direction, as a share of the grid's step.
 _OFF_GRID = 0.5
-# Pairs of places times headings that are compared for one motion, and pairs of states that are kept: more of them than
-# this cost seconds and gigabytes, and come of measurements that say next to nothing.
+# Limits of pairs of places times headings that are compared for one motion, and of pairs of states that are kept. More
+# take seconds and gigabytes, and come from very uncertain measurements.
 _MAX_COMPARED, _MAX_KEPT = 64_000_000, 4_000_000
-# Sideways errors of short distances do not vanish with them.
+# Smallest sideways deviation, for short distances.
 _MIN_ACROSS_STD_M = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A measured motion; what is None was not measured. Angles in radians.
+    """A measured motion; None stands for quantities that were not measured. Angles in radians.
 
     Attributes:
-        distance_m: between the two places, as the crow flies.
+        distance_m: straight-line distance (m) between the two places.
+        distance_std_m: its standard deviation (m).
         turn: heading of the second picture minus that of the first, clockwise.
-        direction: azimuth of the displacement minus the heading of the first picture; needs the distance.
+        turn_std: its standard deviation.
+        direction: azimuth of the displacement minus the heading of the first picture; requires the distance.
+        direction_std: its standard deviation.
     """
 
     distance_m: float | None = None
@@ -65,7 +68,7 @@ class Motion:
             _check(name, getattr(self, name), -2.0 * math.tau, 2.0 * math.tau)
             _check(f"{name}_std", getattr(self, f"{name}_std"), MIN_ANGLE_STD, math.tau)
         if self.direction is not None and self.distance_m is None:
-            raise InvalidMotionError("a direction needs the distance, distance_m is missing")
+            raise InvalidMotionError("direction is given without distance_m: give both or neither")
 
     @property
     def is_unknown(self) -> bool:
@@ -81,16 +84,17 @@ class Motion:
 
 def _check(name: str, value: float | None, least: float, most: float) -> None:
     if value is not None and not least <= value <= most:
-        raise InvalidMotionError(f"{name} is {value:g}, it must be between {least:g} and {most:g}")
+        raise InvalidMotionError(f"{name} is {value:g}; it must be between {least:g} and {most:g}")
 
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """The states that a picture may have: every pose under every hypothesis of how it is turned.
+    """States of a picture: every pose under every hypothesis of the heading.
 
     Attributes:
+        position_m: (n, 2) positions (m).
         heading: (k,) headings (radians) of the panorama.
-        sector: angle (radians) that each of them stands for; 0 where the heading is known.
+        sector: angle (radians) that each heading stands for; 0 if the heading is known.
     """
 
     position_m: Float[np.ndarray, "n 2"]
@@ -100,14 +104,14 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """How likely a motion makes all pairs of states of two pictures.
+    """Likelihood of all pairs of states of two pictures.
 
     Attributes:
-        places: likelihoods of pairs of places but for the floor, (n', n); where they are directed of pairs of states
-            with the first heading, (n' k, n k) in row-major order. None: all alike.
-        turns: (k, k') of pairs of headings; None: all alike.
+        places: (n', n) likelihoods of pairs of places without the floor; if directed, (n' k, n k) of pairs of states
+            with the first heading, in row-major order. None: all equal.
+        turns: (k, k') likelihoods of pairs of headings; None: all equal.
         sizes: n, k, n' and k'.
-        floor: what is added to every pair.
+        floor: likelihood added to every pair.
         is_directed: whether pairs of places depend on the first heading.
     """
 
@@ -118,7 +122,7 @@ class Transition:
     is_directed: bool = False
 
     def likelihood(self, first: int, second: int) -> float:
-        """That of a pair of states, counted in row-major order, without the floor."""
+        """Return the likelihood of a pair of states, by row-major numbers, without the floor."""
         _, k, _, after = self.sizes
         (i, a), (j, b) = divmod(first, k), divmod(second, after)
         turned = 1.0 if self.turns is None else float(self.turns[a, b])
@@ -127,7 +131,7 @@ class Transition:
         return turned * float(self.places[j * k + a, first] if self.is_directed else self.places[j, i])
 
     def among(self, first: np.ndarray, second: np.ndarray) -> Transition:
-        """The transition between some of the poses alone, by their numbers."""
+        """Return the transition between some of the poses, by their numbers."""
         _, k, _, after = self.sizes
         places = self.places
         if places is not None:
@@ -143,10 +147,13 @@ def _states(poses: np.ndarray, headings: int) -> np.ndarray:
 
 
 def transition(motion: Motion, first: States, second: States, step_m: float) -> Transition:
-    """What a motion says of two pictures whose poses are of a grid.
+    """Return the transition of a motion between pictures whose states are grid poses.
 
     Args:
-        step_m: of the grid.
+        motion: the motion.
+        first: states of the first picture.
+        second: states of the second picture.
+        step_m: step (m) of the grid.
     """
     sizes = len(first.position_m), len(first.heading), len(second.position_m), len(second.heading)
     turns = None
@@ -168,7 +175,7 @@ def transition(motion: Motion, first: States, second: States, step_m: float) -> 
 
 
 class _Pairs(NamedTuple):
-    """Numbers of places, the displacement (m) from one to the other, and its length's deviation in units of its own."""
+    """Pairs of places: their numbers, the displacement (m), and the residual of its length."""
 
     source: Int[np.ndarray, "p"]
     target: Int[np.ndarray, "p"]
@@ -177,11 +184,11 @@ class _Pairs(NamedTuple):
 
 
 def _pairs_at_distance(distance_m: float, std_m: float, first: States, second: States) -> _Pairs:
-    """The pairs of places that are about so far apart."""
+    """Return the pairs of places at about a distance (m)."""
     near = KDTree(second.position_m).query_ball_point(first.position_m, distance_m + _MAX_DEVIATIONS * std_m)
-    count = np.array([len(one) for one in near])
+    count = np.array([len(targets) for targets in near])
     source = np.repeat(np.arange(len(near)), count)
-    target = np.concatenate([np.asarray(one, dtype=int) for one in near]) if count.any() else np.empty(0, int)
+    target = np.concatenate([np.asarray(targets, dtype=int) for targets in near]) if count.any() else np.empty(0, int)
     moved_m = second.position_m[target] - first.position_m[source]
     off = (np.hypot(moved_m[:, 0], moved_m[:, 1]) - distance_m) / std_m
     kept = np.abs(off) < _MAX_DEVIATIONS
@@ -189,9 +196,9 @@ def _pairs_at_distance(distance_m: float, std_m: float, first: States, second: S
 
 
 def _directed(motion: Motion, pairs: _Pairs, first: States, second: States, off_m: float) -> csr_array | None:
-    """Likelihoods of pairs of states with the first heading; None where a direction leaves too many to be compared.
+    """Return likelihoods of pairs of states with the first heading; None if there are too many.
 
-    The chain then goes by the distance alone; the optimiser, to which paths are few, goes by the direction still.
+    The chain then uses the distance alone; joint refinement still uses the direction.
     """
     headings = len(first.heading)
     if len(pairs.source) * headings > _MAX_COMPARED:

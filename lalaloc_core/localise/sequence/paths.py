@@ -1,8 +1,8 @@
-"""How probable paths are, and with them the places of every picture.
+"""Posterior over paths, and over the places of every picture.
 
-As in `localise.posterior`, the optimiser tells how far down the cost of a path goes. The states around a path are its
-*basin*. A path that was refined has as much probability as its negative log likelihood says, with all basins as wide as
-that of the likeliest is on the grid; all other paths gain what these gain usually.
+As in `localise.posterior`, refinement finds the depth of a path's minimum. The states around a path are its *basin*.
+The probability of a refined path follows from its negative log likelihood, with all basins as wide as that of the
+likeliest path on the grid; all other paths gain the median.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
 from lalaloc_core.localise.sequence.motion import States, Transition
 from lalaloc_core.render.sampling import PoseSet
 
-# States that are less probable than this are nowhere to be seen.
+# States below this probability are left out.
 _NEGLIGIBLE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One picture as the chain has it.
+    """One picture of the chain.
 
     Attributes:
-        index: (n,) which poses of the grid are its states, under each of k hypotheses.
-        cost: (j, n, k) by height, state and hypothesis.
-        log_likelihood: (j, n, k) the same as a log likelihood, with the prior of the state.
-        doubted: whether its heading was said, and is not what the picture shows.
+        query: the encoded panorama.
+        index: (n,) numbers of the grid poses that are its states, under each of k hypotheses.
+        states: their positions and headings.
+        cost: (j, n, k) matching cost by height, pose and hypothesis.
+        log_likelihood: (j, n, k) log likelihood with the prior of the state.
+        doubted: whether a heading was given that the picture contradicts.
     """
 
     query: Query
@@ -47,11 +49,14 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """One path: a state of each picture as the grid has it, and where refinement took it.
+    """One path: a state of each picture on the grid, and its refined pose.
 
     Attributes:
-        nll: its negative log likelihood on the grid.
-        refined_nll: the same of where it ended; None where it was not refined.
+        states: row-major numbers of the states.
+        starts: the states as candidates.
+        nll: negative log likelihood on the grid.
+        ends: the refined candidates.
+        refined_nll: negative log likelihood after refinement; None without.
     """
 
     states: tuple[int, ...]
@@ -63,7 +68,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class PathPosterior:
-    """Probabilities of paths, and of the places of every picture with its candidates."""
+    """Probability of each path, and the posterior of every picture."""
 
     path: Float[np.ndarray, "m"]
     pictures: list[Posterior]
@@ -71,7 +76,7 @@ class PathPosterior:
 
 @dataclass(frozen=True, eq=False)
 class _Basin:
-    """The states around a path: their numbers by picture, and what the chain says of them alone."""
+    """States around a path: their numbers by picture, and the marginals of the chain among them."""
 
     kept: list[np.ndarray]
     marginals: Marginals
@@ -88,12 +93,17 @@ def path_posterior(
     candidates: Sequence[Sequence[Candidate]],
     separation_m: float,
 ) -> PathPosterior:
-    """The posterior over paths.
+    """Return the posterior over paths.
 
     Args:
-        poses: of the grid.
-        whole: what the chain says of all states.
-        candidates: of each picture, what probabilities are wanted of, the answer first.
+        pictures: the pictures.
+        transitions: transitions between neighbours.
+        paths: the best paths.
+        poses: poses of the grid.
+        log_heights: (j,) log prior of the heights.
+        whole: marginals of the chain over all states.
+        candidates: for each picture the candidates whose probability is wanted, the answer first.
+        separation_m: radius (m) of a basin.
     """
     basins = [_basin(pictures, transitions, log_heights, path, separation_m) for path in paths]
     log_mass = np.array([basin.marginals.log_evidence for basin in basins])
@@ -124,7 +134,7 @@ def path_posterior(
             inside[basin.kept[t]] = share * basin.marginals.state[t]
             moved = None if path.refined_nll is None else (path.starts[t], path.ends[t])
             parts.append(_weighted(picture, inside, moved))
-        position, heading, value, pose = (np.concatenate(one) for one in zip(*parts, strict=True))
+        position, heading, value, pose = (np.concatenate(values) for values in zip(*parts, strict=True))
         found.append(
             posterior_from_weights(
                 picture.query,
@@ -142,14 +152,14 @@ def path_posterior(
 def _weighted(
     picture: Observation, weight: Float[np.ndarray, "n k"], moved: tuple[Candidate, Candidate] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Places, headings, weights and grid poses of all states that count, moved and turned by refinement."""
+    """Return places, headings, weights and grid poses of the probable states, moved and turned by refinement."""
     row, hypothesis = np.nonzero(weight > _NEGLIGIBLE)
     position = picture.states.position_m[row].copy()
     heading = picture.states.heading[hypothesis].copy()
     if moved is not None:
         start, end = moved
         position += end.position_m - start.position_m
-        # Neighbours tell how it is turned far better than sectors do.
+        # The refined heading is far more accurate than a sector.
         heading[:] = picture.query.roll[end.hypothesis] + end.frame_heading
     return position, heading, weight[row, hypothesis], picture.index[row]
 
@@ -161,7 +171,7 @@ def _basin(
     path: Path,
     separation_m: float,
 ) -> _Basin:
-    """All that lies around a path, and is turned alike."""
+    """Return the states around a path at about its headings."""
     kept, inside = [], []
     for picture, start in zip(pictures, path.starts, strict=True):
         near = np.linalg.norm(picture.states.position_m - start.position_m, axis=1) < separation_m
@@ -172,5 +182,5 @@ def _basin(
         likelihood[:, :, turned] = -np.inf
         kept.append(rows)
         inside.append(likelihood)
-    among = [one.among(*pair) for one, pair in zip(transitions, itertools.pairwise(kept), strict=True)]
+    among = [transition.among(*pair) for transition, pair in zip(transitions, itertools.pairwise(kept), strict=True)]
     return _Basin(kept, forward_backward(inside, among, log_heights))

@@ -1,4 +1,4 @@
-"""What goes to the joint optimiser, and what comes back: paths with all the evidence weighed at their new poses."""
+"""Joint refinement from the search's side: jobs from paths, and paths from results."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
 from lalaloc_core.localise.sequence.paths import Observation, Path
 from lalaloc_core.render.sampling import PoseSet
 
-# Paths that end as near as this, and turned as alike (radians), are one.
+# Paths that end closer than this (m, radians) in every picture are one.
 _SAME_M, _SAME_TURN = 0.2, math.radians(5.0)
 
 
 def are_alike(
     pictures: Sequence[Observation],
-    one: Sequence[Candidate],
+    path: Sequence[Candidate],
     other: Sequence[Candidate],
     within_m: float,
     within_angle: float,
 ) -> bool:
-    """Whether two paths are at the same places, turned alike, in every picture."""
-    for picture, first, second in zip(pictures, one, other, strict=True):
+    """Return whether two paths have about the same places and headings in every picture."""
+    for picture, first, second in zip(pictures, path, other, strict=True):
         apart_m = np.linalg.norm(first.position_m - second.position_m)
         turned = wrap_angle(panorama_heading(picture.query, first) - panorama_heading(picture.query, second))
         if apart_m >= within_m or abs(turned) > within_angle:
@@ -52,12 +52,12 @@ def job_parts(
     weights: MatchingWeights,
     config: LocaliseConfig,
 ) -> list[RefinementJob]:
-    """What the optimiser would need of every picture if it were alone."""
+    """Return the refinement job of every picture alone."""
     return [
         refinement_job(
-            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.matching
+            plan, picture.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.matching
         )
-        for t, one in enumerate(pictures)
+        for t, picture in enumerate(pictures)
     ]
 
 
@@ -69,12 +69,13 @@ def sequence_job(
     motions: Sequence[Motion],
     temperature: float,
 ) -> SequenceJob:
-    """What the optimiser needs of all pictures, and the motions that a path goes by."""
-    rolls = [one.query.roll[[path.starts[t].hypothesis for path in paths]] for t, one in enumerate(pictures)]
+    """Return the joint job of all pictures, with the motions that each path follows."""
+    hypotheses = [[path.starts[t].hypothesis for path in paths] for t in range(len(pictures))]
+    rolls = [picture.query.roll[numbers] for picture, numbers in zip(pictures, hypotheses, strict=True)]
     trusted = [
         [
-            not one.floor or one.likelihood(*pair) > FLOOR
-            for one, pair in zip(transitions, itertools.pairwise(path.states), strict=True)
+            not transition.floor or transition.likelihood(*pair) > FLOOR
+            for transition, pair in zip(transitions, itertools.pairwise(path.states), strict=True)
         ]
         for path in paths
     ]
@@ -109,7 +110,7 @@ def ended_paths(
     result: SequenceResult,
     config: LocaliseConfig,
 ) -> list[Path]:
-    """The paths where the optimiser took them, best first, of those that met only the best."""
+    """Return the refined paths, best first, without duplicates."""
     temperature = encoders.manifest.evidence.temperature
     ends: list[list[Candidate]] = []
     for t, picture in enumerate(pictures):
@@ -130,11 +131,11 @@ def ended_paths(
             height_offset=result.height_offset,
         )
         ends.append(refined(plan, encoders, picture.query, starts, alone, config.matching))
-    moved = [replace(path, ends=tuple(one[m] for one in ends)) for m, path in enumerate(paths)]
+    moved = [replace(path, ends=tuple(candidates[m] for candidates in ends)) for m, path in enumerate(paths)]
     log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
     found = []
     for path, log_motion in zip(moved, log_motions, strict=True):
-        # Every picture counts the prior of the one height that they share.
+        # Every picture's cost includes the prior of the shared height, which counts once.
         height = path.ends[0].terms["height"]
         nll = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
         priors = sum(
@@ -142,14 +143,14 @@ def ended_paths(
         )
         found.append(replace(path, refined_nll=float(nll - priors)))
     kept: list[Path] = []
-    for path in sorted(found, key=lambda one: one.refined_nll or 0.0):
+    for path in sorted(found, key=lambda ended: ended.refined_nll or 0.0):
         if not any(are_alike(pictures, path.ends, other.ends, _SAME_M, _SAME_TURN) for other in kept):
             kept.append(path)
     return kept
 
 
 def _log_prior(picture: Observation, state: int, temperature: float) -> float:
-    """That of a state."""
+    """Return the log prior of a state."""
     row, hypothesis = divmod(state, len(picture.states.heading))
     return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
 
@@ -157,7 +158,7 @@ def _log_prior(picture: Observation, state: int, temperature: float) -> float:
 def path_motion_costs(
     pictures: Sequence[Observation], motions: Sequence[Motion], paths: Sequence[Path]
 ) -> Float[np.ndarray, "m s"]:
-    """Half the squared residuals of every motion along some paths."""
+    """Return half the squared residuals of every motion along some paths."""
     position_m = np.array([[end.position_m for end in path.ends] for path in paths])
     queries = [picture.query for picture in pictures]
     headings = [[panorama_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]

@@ -1,4 +1,4 @@
-"""The path of a query of several pictures: compare each with the grid, link them, optimise the best paths, rank."""
+"""Path of a query of several pictures: compare each with the grid, link them, refine the best paths, rank."""
 
 from __future__ import annotations
 
@@ -33,24 +33,26 @@ from lalaloc_core.localise.sequence.refinement import are_alike, ended_paths, jo
 from lalaloc_core.localise.steps import run_steps
 
 SequenceRefine = Literal["none", "lpo"]
-# Runs joint optimisation; None when it could not answer (in time).
+# Runs joint refinement; None if it has no result (in time).
 SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
-# Places that a picture may have; of more, those that are best by every `_STRIDE`th azimuth.
+# Maximum number of a picture's places, the best by every `_STRIDE`th azimuth.
 _MAX_PLACES, _STRIDE = 2048, 4
-# Paths that are optimised, and how many modes of each picture they are looked for through.
+# Number of refined paths, and of modes of each picture through which paths are searched.
 _PATHS, _MODES = 8, 8
-# A motion is contradicted by what is less likely than four standard deviations off.
+# Half squared residual, of four standard deviations, beyond which the answer contradicts a motion.
 _CONTRADICTED = 0.5 * 4.0**2
 
 
 @dataclass(frozen=True)
 class SequenceLocalisation:
-    """Where the pictures of a sequence were taken.
+    """Localisation of a sequence.
 
     Attributes:
-        pictures: of each picture the candidates, best path first, with the posterior that all pictures together give.
-        path_probability: that of the answers of all pictures being right at once, given that they are of the plan.
-        motions_contradicted: numbers of the motions that the answer differs from by more than they allow for.
+        pictures: for each picture the candidates, best path first, with the posterior given all pictures.
+        path_probability: probability that the answers of all pictures are right, given that they are of the plan.
+        stage: the last stage that ran.
+        motions_contradicted: numbers of the motions that the answer contradicts.
+        timings_ms: milliseconds per stage.
     """
 
     pictures: list[Localisation]
@@ -85,15 +87,20 @@ def localise_sequence(
     top_k: int = 5,
     config: LocaliseConfig | None = None,
 ) -> SequenceLocalisation:
-    """Find the places of several encoded panoramas of one visit in a plan.
+    """Localise several encoded panoramas of one visit in a plan.
 
     Args:
-        queries: in the order in which they were taken, all with the same statement about the camera's height.
-        motions: between neighbours.
-        refiner: optimises paths; None ends at the grid.
+        plan: the floor plan.
+        grid: the plan's pose grid.
+        encoders: networks of the model.
+        queries: encoded panoramas in the order in which they were taken, all with the same stated camera height.
+        motions: motions between neighbours.
+        refiner: refines paths; None ends at the grid.
+        top_k: maximum number of candidates of each picture.
+        config: settings of the search.
 
     Raises:
-        InvalidMotionError: there is not one motion less than there are pictures.
+        InvalidMotionError: the number of motions is not one less than that of the pictures.
     """
     refine: SequenceRefine = "none" if refiner is None else "lpo"
     steps = localise_sequence_steps(plan, grid, encoders, queries, motions, refine=refine, top_k=top_k, config=config)
@@ -112,9 +119,9 @@ def localise_sequence_steps(
     config: LocaliseConfig | None = None,
     clock: StageClock | None = None,
 ) -> SequenceSteps:
-    """`localise_sequence` for who waits for the optimiser elsewhere; models without a profile end at the grid."""
+    """Run `localise_sequence` for callers that refine paths elsewhere; models without a profile end at the grid."""
     if len(motions) != len(queries) - 1:
-        raise InvalidMotionError(f"{len(motions)} motions are given, {len(queries)} pictures have {len(queries) - 1}")
+        raise InvalidMotionError(f"{len(motions)} motions are given; {len(queries)} pictures need {len(queries) - 1}")
     config, clock = config or LocaliseConfig(), clock or StageClock()
     weights, height = encoders.manifest.evidence, queries[0].camera_height
     with clock.stage("retrieve"):
@@ -125,11 +132,11 @@ def localise_sequence_steps(
         ]
         log_heights = -height.penalty(_offsets(pictures[0].query, config))
         log_heights = log_heights - np.logaddexp.reduce(log_heights)
-        whole = forward_backward([one.log_likelihood for one in pictures], transitions, log_heights)
-        at = int(whole.height.argmax())
-        paths = _paths(grid, pictures, transitions, at, float(log_heights[at]), config)
+        whole = forward_backward([picture.log_likelihood for picture in pictures], transitions, log_heights)
+        height_index = int(whole.height.argmax())
+        paths = _paths(grid, pictures, transitions, height_index, float(log_heights[height_index]), config)
     stage: Literal["retrieval", "lpo"] = "retrieval"
-    if refine == "lpo" and all(config.matching.compares_profiles(one.query) for one in pictures):
+    if refine == "lpo" and all(config.matching.compares_profiles(picture.query) for picture in pictures):
         with clock.stage("lpo"):
             parts = job_parts(plan, grid, pictures, paths, weights, config)
             job = sequence_job(parts, pictures, paths, transitions, motions, weights.temperature)
@@ -156,14 +163,14 @@ def localise_sequence_steps(
             with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
             for picture, answers in zip(pictures, candidates, strict=True)
         ]
-    told = [
+    localisations = [
         _localisation(
             picture, answers, posterior, stage, _signals(plan, grid, encoders, picture, answers[0], posterior, config)
         )
         for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
     ]
     missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
-    return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
+    return SequenceLocalisation(localisations, float(found.path[0]), stage, missed, clock.timings_ms)
 
 
 def _localisation(
@@ -173,7 +180,7 @@ def _localisation(
     stage: Literal["retrieval", "lpo"],
     signals: Signals,
 ) -> Localisation:
-    """What is told of one picture."""
+    """Return the localisation of one picture."""
     return Localisation(
         query=picture.query,
         candidates=answers,
@@ -192,11 +199,11 @@ def _contradicted_motions(
     path: Path,
     stage: Literal["retrieval", "lpo"],
 ) -> tuple[int, ...]:
-    """Numbers of the motions that a path differs from by more than they allow for."""
+    """Return the numbers of the motions that a path contradicts."""
     if stage == "retrieval":
-        # The places of a grid are off themselves.
+        # Transitions allow for the distance of grid poses from the camera.
         pairs = zip(transitions, itertools.pairwise(path.states), strict=True)
-        return tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
+        return tuple(s for s, (link, pair) in enumerate(pairs) if link.floor and link.likelihood(*pair) <= FLOOR)
     costs = path_motion_costs(pictures, motions, [path])[0]
     return tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
 
@@ -210,7 +217,7 @@ def _signals(
     posterior: Posterior,
     config: LocaliseConfig,
 ) -> Signals:
-    """Of one picture; heights that nobody expects cost what they do of a single picture."""
+    """Return the signals of one picture, with the penalty of the camera height as for a single picture."""
     query, weights = picture.query, encoders.manifest.evidence
     penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
     grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
@@ -220,7 +227,7 @@ def _signals(
 
 
 def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
-    """The height offsets that are tried; latents are of the stated height alone."""
+    """Return the height offsets that are tried; latents are of the stated height alone."""
     return query.camera_height.offsets if config.matching.compares_profiles(query) else np.zeros(1)
 
 
@@ -228,21 +235,21 @@ def _picture(
     plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: LocaliseConfig
 ) -> Observation:
     """Compare a picture with the grid at every height."""
-    evidence = config.matching
-    doubted = contradicted(plan, grid, query, weights, evidence)
+    matching = config.matching
+    doubted = contradicted(plan, grid, query, weights, matching)
     query = query.searched if doubted and query.searched is not None else query
     index = np.arange(len(grid.poses))
-    if evidence.compares_profiles(query):
-        layouts, reach_m = grid.layouts(plan), evidence.grid_reach * grid.step_m
+    if matching.compares_profiles(query):
+        layouts, reach_m = grid.layouts(plan), matching.grid_reach * grid.step_m
         if len(index) > _MAX_PLACES:
-            coarse, _ = MatchingCost(plan, query, reach_m, weights, evidence, stride=_STRIDE).costs(layouts)
+            coarse, _ = MatchingCost(plan, query, reach_m, weights, matching, stride=_STRIDE).costs(layouts)
             index = np.sort(np.argpartition(coarse.min(axis=0), _MAX_PLACES)[:_MAX_PLACES])
             layouts = layouts.rows(index)
         costs = []
         for offset in query.camera_height.offsets:
             height_m = query.camera_height.height_m * math.exp(offset)
             exact = replace(query.scaled(float(offset)), camera_height=CameraHeight(height_m, 0.0))
-            costs.append(MatchingCost(plan, exact, reach_m, weights, evidence).costs(layouts)[0].T)
+            costs.append(MatchingCost(plan, exact, reach_m, weights, matching).costs(layouts)[0].T)
         cost = np.stack(costs).astype(np.float64)
     else:
         distance = latent_distances(grid.known_latents, query.latents)
@@ -258,12 +265,12 @@ def _paths(
     grid: PoseGrid,
     pictures: list[Observation],
     transitions: list[Transition],
-    at: int,
+    height_index: int,
     log_height: float,
     config: LocaliseConfig,
 ) -> list[Path]:
-    """The best paths of which no two are alike, at one of the heights."""
-    found = best_paths([one.log_likelihood[at] for one in pictures], transitions)
+    """Return the best distinct paths at one of the heights."""
+    found = best_paths([picture.log_likelihood[height_index] for picture in pictures], transitions)
     through: dict[tuple[int, ...], float] = {}
     for t, picture in enumerate(pictures):
         score, headings = found.score[t], len(picture.states.heading)
@@ -280,8 +287,10 @@ def _paths(
             state = int(row[mode]) * headings + int(hypothesis[mode])
             through.setdefault(tuple(found.through(t, state)), float(score.ravel()[state]))
     kept: list[Path] = []
-    for states in sorted(through, key=lambda one: -through[one]):
-        starts = tuple(_start(grid, picture, state, at) for picture, state in zip(pictures, states, strict=True))
+    for states in sorted(through, key=lambda path: -through[path]):
+        starts = tuple(
+            _start(grid, picture, state, height_index) for picture, state in zip(pictures, states, strict=True)
+        )
         alike = (are_alike(pictures, starts, path.ends, config.separation_m, HEADING_SEPARATION) for path in kept)
         if not any(alike):
             kept.append(Path(states, starts, -through[states] - log_height, starts))
@@ -290,8 +299,8 @@ def _paths(
     return kept
 
 
-def _start(grid: PoseGrid, picture: Observation, state: int, at: int) -> Candidate:
-    """A state of a picture as a candidate."""
+def _start(grid: PoseGrid, picture: Observation, state: int, height_index: int) -> Candidate:
+    """Return a state of a picture as a candidate."""
     row, hypothesis = divmod(state, len(picture.states.heading))
     pose, query = int(picture.index[row]), picture.query
     offsets = query.camera_height.offsets
@@ -300,6 +309,6 @@ def _start(grid: PoseGrid, picture: Observation, state: int, at: int) -> Candida
         pose,
         query,
         hypothesis,
-        cost=float(picture.cost[at, row, hypothesis]),
-        height_offset=float(offsets[at]) if picture.cost.shape[0] == len(offsets) else 0.0,
+        cost=float(picture.cost[height_index, row, hypothesis]),
+        height_offset=float(offsets[height_index]) if picture.cost.shape[0] == len(offsets) else 0.0,
     )
