@@ -60,10 +60,7 @@ class AnnotatedPhotographs:
         """Name of the data set in results."""
         return f"annotated photographs in galleries ({self.root.resolve().name})"
 
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance, without furniture level."""
-        return (Appearance(),)
+    appearances = (Appearance(),)
 
     @cached_property
     def photographs(self) -> tuple[AnnotatedPhotograph, ...]:

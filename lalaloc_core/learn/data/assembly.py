@@ -136,14 +136,7 @@ def _room_entries(
 def pose_fault(
     plan: FloorPlan, room_index: int, position_m: Float[np.ndarray, "2"], camera_height_m: float
 ) -> str | None:
-    """Return the reason why a camera pose in a room is impossible; None if it is possible.
-
-    Args:
-        plan: floor plan.
-        room_index: the camera's room.
-        position_m: (x, y) in the plan frame.
-        camera_height_m: above the floor.
-    """
+    """Return the reason why a camera pose in a room is impossible; None if it is possible."""
     room = plan.rooms[room_index]
     camera = f"the camera at ({position_m[0]:.3f}, {position_m[1]:.3f}) m"
     point = shapely.Point(position_m)

@@ -138,10 +138,7 @@ class Dataset(Protocol):
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Read one scene.
 
-        Args:
-            name: of the scene.
-            problems: receives the errors of cameras that cannot be used, which are left out; None raises the first
-                error.
+        Cameras that cannot be used are left out and their errors appended to `problems`; None raises the first error.
 
         Raises:
             DatasetError: the floor plan cannot be read, or a camera if `problems` is None.
@@ -152,11 +149,7 @@ class Dataset(Protocol):
 def load_scenes(dataset: Dataset, names: Iterable[str], problems: list[DatasetError] | None = None) -> Iterator[Scene]:
     """Load scenes one after another.
 
-    Args:
-        dataset: to read from.
-        names: of the scenes.
-        problems: receives the errors of scenes and cameras that cannot be used, which are left out; None raises the
-            first error.
+    Scenes and cameras that cannot be used are left out and their errors appended to `problems`; None raises the first.
 
     Raises:
         DatasetError: a scene or camera cannot be used and `problems` is None.

@@ -15,11 +15,7 @@ _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 
 
 def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
-    """Open the data set in a folder.
-
-    Args:
-        root: the folder.
-        dataset_format: a key of `dataset.DATASET_FORMATS`; None detects the format.
+    """Open the data set in a folder; the format is a key of `dataset.DATASET_FORMATS`, or None to detect it.
 
     Raises:
         DatasetError: the folder does not exist, holds no data set of the given or of any known format, or holds

@@ -53,10 +53,7 @@ class OwnData:
         """Name of the data set in results."""
         return f"own data ({self.root.resolve().name})"
 
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance, without furniture level."""
-        return (Appearance(),)
+    appearances = (Appearance(),)
 
     def scenes(self, split: Split) -> Sequence[str]:
         """Return the names of a split's scenes in order.

@@ -47,16 +47,8 @@ class Zind:
     """
 
     root: Path
-
-    @property
-    def description(self) -> str:
-        """Name of the data set in results."""
-        return "ZInD"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance, without furniture level."""
-        return (Appearance(),)
+    description = "ZInD"
+    appearances = (Appearance(),)
 
     def scenes(self, split: Split) -> Sequence[str]:
         """Return all floors of a split's homes on disk, including those without a metric scale.

@@ -62,11 +62,7 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path, *, stage: str | None = None) -> Checkpoint:
-        """Read a checkpoint without executing anything in the file.
-
-        Args:
-            path: of the file.
-            stage: required stage; None accepts any.
+        """Read a checkpoint, optionally of a required stage, without executing anything in the file.
 
         Raises:
             CheckpointError: the file is missing, damaged, or of another stage.

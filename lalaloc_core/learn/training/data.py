@@ -105,12 +105,7 @@ class TrainingData:
     ) -> Validate:
         """Create the validation with panorama queries, in the data set's usual appearance.
 
-        Args:
-            config: of the run.
-            scenes: validation scenes.
-            layout_encoder: frozen teacher; None uses the one being trained.
-            device: to run on.
-            folder: caches rendered panoramas; None caches nothing.
+        Without a `layout_encoder` the one being trained is used; `folder` caches rendered panoramas.
 
         Raises:
             DatasetError: a photograph cannot be read and `skip_bad` is off.

@@ -59,13 +59,7 @@ class Photographs:
 
 
 def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> Photographs:
-    """Read the panoramas (`*.jpg`, `*.jpeg`, `*.png`) of a folder and segment each.
-
-    Args:
-        folder: of the panoramas.
-        segmenter: TensorFlow Lite file, see `segmenter`.
-        height: rows of the returned panoramas.
-        width: columns of the returned panoramas and predictions.
+    """Read the panoramas (`*.jpg`, `*.jpeg`, `*.png`) of a folder and segment each with a TensorFlow Lite file.
 
     Raises:
         ConfigError: the segmenter cannot be run.

@@ -40,16 +40,9 @@ def train_layout(
     resume: bool = False,
     init_from: Path | None = None,
 ) -> Checkpoint:
-    """Run stage 1.
+    """Run stage 1 in `folder`, with batches from `workers` processes.
 
-    Args:
-        config: of the run.
-        folder: of the run.
-        device: to train on.
-        data: training and validation scenes.
-        workers: processes that make batches.
-        resume: continue from the checkpoint in `folder`.
-        init_from: bundle or run folder that provides the first weights; not with `resume`.
+    `init_from` is a bundle or run folder that provides the first weights; it excludes `resume`.
 
     Raises:
         CheckpointError: initial weights or the checkpoint are missing, or have other networks.
@@ -84,19 +77,10 @@ def train_image(
     init_from: Path | None = None,
     layout_from: Path | None = None,
 ) -> Checkpoint:
-    """Run stage 2 against a trained layout encoder.
+    """Run stage 2 in `folder`, against the layout encoder of the run folder `teacher` (default: `folder`).
 
-    Args:
-        config: of the run.
-        folder: of the run.
-        device: to train on.
-        data: training and validation scenes, and photographs.
-        teacher: run folder with the layout encoder; default: `folder`.
-        workers: processes that make batches.
-        resume: continue from the checkpoint in `folder`.
-        init_from: bundle or run folder that provides the first image encoder, and the layout encoder if `folder` has
-            none and `teacher` is not given; not with `resume`.
-        layout_from: bundle or run folder that provides the layout encoder if `folder` has none.
+    `init_from` is a bundle or run folder that provides the first image encoder; it excludes `resume`. Without
+    `teacher`, a `folder` without layout encoder gets the one of `layout_from` or `init_from`.
 
     Raises:
         CheckpointError: the layout encoder is missing or has other networks.
@@ -131,15 +115,7 @@ def train_end_to_end(
     workers: int = 1,
     resume: bool = False,
 ) -> Checkpoint:
-    """Train both branches at once.
-
-    Args:
-        config: of the run.
-        folder: of the run.
-        device: to train on.
-        data: training and validation scenes.
-        workers: processes that make batches.
-        resume: continue from the checkpoint in `folder`.
+    """Train both branches at once in `folder`.
 
     Raises:
         ConfigError: the architecture does not support end-to-end training.

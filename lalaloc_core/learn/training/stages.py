@@ -89,13 +89,7 @@ def panorama_batches(
 ) -> Iterator[Batch]:
     """Yield panorama batches from a step on, with homes or parts of the epoch that earlier steps have not used.
 
-    Args:
-        config: of the run.
-        source: of the scenes.
-        neighbours: add the layouts of neighbouring poses to each row.
-        first_step: number of the first step.
-        workers: processes that make batches; 0 makes them in this process.
-        device: renders deferred panoramas.
+    Rows hold the layouts of neighbouring poses if `neighbours` is set; `device` renders deferred panoramas.
     """
     first_visit = first_step * (config.image.batch // config.image.shots_per_home + 1)
     batches = load_batches(PanoramaBatches(config, source, neighbours, first_visit), workers)

@@ -52,12 +52,7 @@ class WarmStart:
 
 
 def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
-    """Load the weights of a stage from a bundle or a run's folder (its best checkpoint if there is one).
-
-    Args:
-        folder: of the bundle or the run.
-        stage: "layout" or "image".
-        config: configuration that the weights must fit.
+    """Load the weights of stage "layout" or "image" from a bundle or a run's folder (its best checkpoint, if any).
 
     Raises:
         CheckpointError: the folder has no such weights, or weights of other networks than `config` has.
@@ -153,12 +148,9 @@ def check_same_networks(stage: str, config: TrainConfig, trained: TrainConfig, w
 
 
 def find_checkpoint(stage: str, folder: Path, *, last: bool = False) -> Checkpoint:
-    """Load the checkpoint with a stage's networks: the stage's own, or that of end-to-end training.
+    """Load the checkpoint with the networks of stage "layout" or "image", possibly that of end-to-end training.
 
-    Args:
-        stage: "layout" or "image".
-        folder: of the run.
-        last: load the last checkpoint even if there is a best one.
+    The best checkpoint is preferred unless `last` is set.
 
     Raises:
         CheckpointError: there is no such checkpoint, or there are both.
