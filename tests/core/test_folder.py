@@ -267,15 +267,15 @@ class TestWorkedExample:
 
 
 class TestDocumentation:
-    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
 
     def test_page_lists_every_bad_scene(self) -> None:
         expected = []
         for split, excluded in EXCLUDED_BY_PAPER.items():
             for number in sorted(set(excluded) | {number for number in ERRATA if number in OFFICIAL[split]}):
                 sources = ["paper"] * (number in excluded) + ["errata"] * (number in ERRATA)
-                effect = "left out" if number in excluded else "kept"
-                expected.append(f"| {number} | {split} | {', '.join(sources)} | {effect} |")
+                used = "no" if number in excluded else "yes"
+                expected.append(f"| {number} | {split} | {', '.join(sources)} | {used} |")
         assert [line for line in self.page.splitlines() if re.match(r"\| \d", line)] == expected
 
     def test_page_shows_the_actual_error(self, tmp_path: Path) -> None:
@@ -290,6 +290,7 @@ class TestDocumentation:
         self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.chdir(ROOT)
-        (program,) = re.findall(r"```python\n(.*?)```", self.page, re.DOTALL)
+        guide = (ROOT / "docs" / "how-to" / "evaluate.md").read_text(encoding="utf-8")
+        (program,) = re.findall(r"```python\n(.*?)```", guide, re.DOTALL)
         exec(program, {})
         assert capsys.readouterr().out == "flat 7 ['kitchen.jpg', 'bedroom.jpg']\n"
