@@ -20,12 +20,12 @@ from lalaloc_core.importers.common.report import ImportReport, LayerUse
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.importing import (
     detect_format,
+    detect_media_type,
     export_plan,
     import_if_native,
     import_plan,
     import_plans,
     is_json,
-    media_type_of,
 )
 from lalaloc_core.importers.registry import EXPORT_FORMATS, FORMATS, ExportFormat, Format
 
@@ -44,10 +44,10 @@ __all__ = [
     "LayerUse",
     "Level",
     "detect_format",
+    "detect_media_type",
     "export_plan",
     "import_if_native",
     "import_plan",
     "import_plans",
     "is_json",
-    "media_type_of",
 ]

@@ -131,7 +131,7 @@ def is_json(content: bytes) -> bool:
     return is_wide or (start[:1] in (b"{", b"[") and not start.startswith(b"{\\rtf"))
 
 
-def media_type_of(content: bytes, format: str) -> str:
+def detect_media_type(content: bytes, format: str) -> str:
     """Return the media type of a file whose import reported `format`."""
     if content.startswith(b"PK\x03\x04"):
         return "application/zip"

@@ -12,7 +12,7 @@ from typing import Any
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportOptions, detect_format, import_if_native, is_json, media_type_of
+from lalaloc_core.importers import ImportOptions, detect_format, detect_media_type, import_if_native, is_json
 from service.conversion.converter import Converter
 from service.settings import Settings
 from service.workers.convert import report_of
@@ -58,7 +58,7 @@ def convert(content: bytes, options: ImportOptions, converter: Converter, settin
     if seems_native(content):
         imported = import_if_native(content, options, limits)
         if imported is not None:
-            return PlanFile(imported.plan(limits.plan), report_of(imported), media_type_of(content, "native"))
+            return PlanFile(imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native"))
     elif not is_json(content):
         # Reject unsupported formats before they take a worker.
         detect_format(content, limits)

@@ -19,9 +19,9 @@ from lalaloc_core.importers import (
     ImportedPlan,
     ImportLimits,
     ImportOptions,
+    detect_media_type,
     export_plan,
     import_plan,
-    media_type_of,
 )
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs
 
@@ -141,7 +141,7 @@ def _converting(limits: ImportLimits) -> Callable[[ImportJob | ExportJob], Impor
 
 def _import(job: ImportJob, limits: ImportLimits) -> Imported:
     imported = import_plan(job.content, job.options, limits)
-    media_type = media_type_of(job.content, imported.report.format)
+    media_type = detect_media_type(job.content, imported.report.format)
     return Imported(_plain(imported.document), report_of(imported), media_type)
 
 

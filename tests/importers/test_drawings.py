@@ -12,7 +12,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.vocabulary import role_of, type_of_room
+from lalaloc_core.importers.common.vocabulary import role_from_name, room_type_from_name
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import dxf_file, lines, shapes
 
@@ -190,7 +190,7 @@ def test_french_polylines_and_blocks_in_feet():
     ],
 )  # fmt: skip
 def test_role_of_a_layer(layer: str, role: str | None):
-    assert role_of(layer) == role
+    assert role_from_name(layer) == role
 
 
 @pytest.mark.parametrize(
@@ -198,4 +198,4 @@ def test_role_of_a_layer(layer: str, role: str | None):
     [("Küche", "kitchen"), ("Chambre 2", "bedroom"), ("LivingRoom", "living"), ("Bad/WC", "bathroom"), ("X17", None)],
 )
 def test_type_of_a_room(name: str, kind: str | None):
-    assert type_of_room(name) == kind
+    assert room_type_from_name(name) == kind

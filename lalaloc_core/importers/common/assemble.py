@@ -16,12 +16,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.checks import check_document
-from lalaloc_core.importers.common.geometry import polygons_of
+from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import type_of_room
+from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
@@ -126,7 +126,7 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: Report
     for obstacle in obstacles:
         if obstacle.intersects(shape):
             shape = shapely.difference(shape, obstacle)
-    floors = [simple for floor in polygons_of(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]
+    floors = [simple for floor in polygons_from_geometry(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]
     floors = [floor for floor in floors if floor.area >= DEFAULT_LIMITS.min_room_area_m2]
     label = f"room '{room.name}'" if room.name else "a room without a name"
     if not floors and room.shape.area < _SLIVER_M2:
@@ -144,7 +144,7 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: Report
         holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
         shape = shapely.Polygon(floor.exterior, holes)
         name = clean_name(room.name)
-        kind = room.type or type_of_room(name)
+        kind = room.type or room_type_from_name(name)
         cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
     return cleaned
 
@@ -152,12 +152,12 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: Report
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     """Return polygons with rounded coordinates whose outlines do not touch themselves."""
     found = []
-    for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
+    for part in polygons_from_geometry(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
         if shapely.Polygon(part.exterior).is_valid:
             found.append(part)
         else:
             apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
-            found += polygons_of(shapely.set_precision(apart, _GRID_M))
+            found += polygons_from_geometry(shapely.set_precision(apart, _GRID_M))
     return found
 
 

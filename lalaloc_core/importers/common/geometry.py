@@ -10,7 +10,7 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 
-def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
+def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
         return []
@@ -22,7 +22,7 @@ def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
             if part.area > 0.0:
                 found.append(part)
         elif isinstance(part, shapely.MultiPolygon | shapely.GeometryCollection):
-            found.extend(polygons_of(part))
+            found.extend(polygons_from_geometry(part))
     return found
 
 
@@ -31,7 +31,7 @@ def even_odd_polygons(rings: Iterable[shapely.Polygon]) -> list[shapely.Polygon]
     shape: BaseGeometry = shapely.Polygon()
     for ring in rings:
         shape = shapely.symmetric_difference(shape, ring)
-    return polygons_of(shape)
+    return polygons_from_geometry(shape)
 
 
 def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float, float]] | None:

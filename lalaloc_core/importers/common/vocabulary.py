@@ -90,25 +90,25 @@ _ENGLISH: Mapping[str, str] = {
 }
 
 
-def words_of(text: str) -> list[str]:
+def split_words(text: str) -> list[str]:
     """Split a name such as "A-DOOR_Frame", "LivingRoom" or "Außentür" into lower-case words without accents."""
     spaced = re.sub(r"(?<=[a-zß-öø-ÿ])(?=[A-ZÀ-Þ])", " ", text)
     folded = unicodedata.normalize("NFKD", spaced.replace("ß", "ss")).encode("ascii", "ignore").decode().casefold()
     return re.findall(r"[a-z]+", folded)
 
 
-def role_of(text: str) -> Role | None:
+def role_from_name(text: str) -> Role | None:
     """Return the role of a layer, block or class from its name, None if the name gives none."""
-    found = {role for word in words_of(text) if (role := _role_of_word(word)) is not None}
+    found = {role for word in split_words(text) if (role := _role_of_word(word)) is not None}
     return next((role for role in _ORDER if role in found), None)
 
 
-def type_of_room(label: str | None) -> str | None:
+def room_type_from_name(label: str | None) -> str | None:
     """Return the plan's room type for a name or class, None if it is not known."""
     if not label:
         return None
     # Compare whole words only: the Finnish "et" must not match "sheet".
-    words = words_of(label)
+    words = split_words(label)
     joined = "".join(words)
     english = [_ENGLISH.get(word, word) for word in (*words, joined)]
     found = room_type_from_label(" ".join(english))

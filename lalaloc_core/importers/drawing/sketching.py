@@ -20,7 +20,7 @@ from lalaloc_core.importers.common.geometry import opening_line
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import type_of_room
+from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, WallConfig, enclose
 
@@ -175,9 +175,9 @@ def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder
     rooms = []
     for index, area in enumerate(shapes):
         words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
-        known = [text for text in words if type_of_room(text) is not None]
+        known = [text for text in words if room_type_from_name(text) is not None]
         name = area.name or next(iter(known or words), None)
-        rooms.append(SketchedRoom(area.shape, name, type_of_room(area.kind) or type_of_room(name)))
+        rooms.append(SketchedRoom(area.shape, name, room_type_from_name(area.kind) or room_type_from_name(name)))
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")

@@ -16,7 +16,7 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.geometry import polygons_of
+from lalaloc_core.importers.common.geometry import polygons_from_geometry
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
@@ -124,7 +124,9 @@ def find_gaps(
     rank: Callable[[Gap], int | None] = rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
-    parts = [simple for part in polygons_of(walls) for simple in polygons_of(part.simplify(0.004))]
+    parts = [
+        simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))
+    ]
     tree = shapely.STRtree(parts)
     found: list[Gap] = []
     for part in parts:
@@ -322,10 +324,10 @@ def _insides(pieces: Sequence[BaseGeometry], config: WallConfig) -> list[shapely
     """Return the areas enclosed by the union of some pieces that are large enough for a room."""
     union = shapely.unary_union(list(pieces))
     rooms = []
-    for part in polygons_of(union):
+    for part in polygons_from_geometry(union):
         for ring in part.interiors:
             inside = shapely.Polygon(ring).difference(union)
-            for floor in polygons_of(inside):
+            for floor in polygons_from_geometry(inside):
                 if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config):
                     rooms.append(floor.simplify(0.004))
     return _distinct(rooms)

@@ -27,11 +27,11 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.checks import likely_unit
-from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_of
+from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.vocabulary import Role, role_of
+from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.drawing.sketching import sketch_drawing
@@ -204,11 +204,11 @@ def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterat
         # Layer 0 in a block stands for the layer of the insert.
         if block is not None and layer == "0":
             layer = block.layer
-        role = role_of(layer)
+        role = role_from_name(layer)
         if block is not None and block.role is not None and role in (None, "text"):
             role = block.role
         if isinstance(entity, Insert):
-            block_role = role_of(entity.dxf.name)
+            block_role = role_from_name(entity.dxf.name)
             role = block_role if block_role in ("door", "window", "passage", "obstacle", "ignored") else role
             for attribute in entity.attribs:
                 yield attribute, _Context(layer, "text")
@@ -277,7 +277,7 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
             builder.use(context.layer, "door swings")
             return
     if len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
-        shapes = polygons_of(shapely.Polygon(points))
+        shapes = polygons_from_geometry(shapely.Polygon(points))
         drawing.areas += [Area(shape, context.layer, role) for shape in shapes]
         builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
@@ -311,7 +311,7 @@ def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
     usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]
-    return even_odd_polygons(part for ring in usable for part in polygons_of(shapely.Polygon(ring)))
+    return even_odd_polygons(part for ring in usable for part in polygons_from_geometry(shapely.Polygon(ring)))
 
 
 def _sag(document: DxfDocument) -> float:

@@ -21,12 +21,12 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, clean_name
-from lalaloc_core.importers.common.geometry import opening_line, polygons_of
+from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions, check_units
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, chosen_levels
-from lalaloc_core.importers.common.vocabulary import Role, role_of, type_of_room
+from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
 
 _FEATURE_TYPES: Mapping[str, Role] = {
     "unit": "room", "room": "room", "corridor": "room", "area": "room", "opening": "door", "door": "door",
@@ -72,7 +72,7 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return a FeatureCollection in WGS84 if the plan has an anchor, else in metres with the member `units`."""
-    features = features_of(document, Projector(anchor))
+    features = plan_features(document, Projector(anchor))
     collection: dict[str, Any] = {"type": "FeatureCollection", "name": document.get("name", "floor plan")}
     if anchor is None:
         collection["units"] = "m"
@@ -156,7 +156,7 @@ class Projector:
         return [self.points([*ring, ring[0]]) for ring in rings]
 
 
-def features_of(document: Mapping[str, Any], projector: Projector) -> list[dict[str, Any]]:
+def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dict[str, Any]]:
     """Return the rooms, walls and openings of a plan as GeoJSON features with an IMDF `feature_type`."""
     found: list[dict[str, Any]] = []
     for number, room in enumerate(document["rooms"]):
@@ -348,13 +348,13 @@ def _role(feature: Feature) -> Role:
     else:
         role = "room" if is_area else "door"
         for key in ("layer", "class", "category", "type", "kind"):
-            role = role_of(str(properties.get(key) or "")) or role
+            role = role_from_name(str(properties.get(key) or "")) or role
     return "obstacle" if role == "wall" and is_area else role
 
 
 def _opening_role(properties: Mapping[str, Any], category: str) -> Role:
     """Return the role of an IMDF opening: a door, or a passage if `door` is null; windows need a `kind`."""
-    role = role_of(str(properties.get("kind") or category))
+    role = role_from_name(str(properties.get("kind") or category))
     if role == "door" or role == "window" or role == "passage":
         return role
     return "passage" if "door" in properties and properties["door"] is None else "door"
@@ -377,14 +377,14 @@ def _add_to_sketch(
         builder.use(layer, "ignored (not in the option layers)")
         return
     if role == "room":
-        parts = polygons_of(shape)
+        parts = polygons_from_geometry(shape)
         builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         kind = _room_type(properties, name)
         ceiling = _number(properties, "ceiling_height_m", "ceiling_height", "height")
         room_id = feature.id if len(parts) == 1 else None
         sketch.rooms += [SketchedRoom(part, name, kind, ceiling, room_id) for part in parts]
     elif role == "obstacle":
-        parts = polygons_of(shape)
+        parts = polygons_from_geometry(shape)
         builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
         sketch.obstacles += parts
     elif role in ("door", "window", "passage"):
@@ -419,8 +419,8 @@ def _name(properties: Mapping[str, Any]) -> str | None:
 
 def _room_type(properties: Mapping[str, Any], name: str | None) -> str | None:
     words = [properties.get(key) for key in ("type", "room", "category", "indoor")]
-    found = [type_of_room(str(word)) for word in words if isinstance(word, str)]
-    return next((kind for kind in found if kind is not None), None) or type_of_room(name)
+    found = [room_type_from_name(str(word)) for word in words if isinstance(word, str)]
+    return next((kind for kind in found if kind is not None), None) or room_type_from_name(name)
 
 
 def _number(properties: Mapping[str, Any], *keys: str) -> float | None:

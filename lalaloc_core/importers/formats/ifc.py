@@ -18,7 +18,7 @@ from pyproj.exceptions import ProjError
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.geometry import opening_line, polygons_of
+from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
@@ -30,7 +30,7 @@ from lalaloc_core.importers.common.sketch import (
     SketchedRoom,
     chosen_levels,
 )
-from lalaloc_core.importers.common.vocabulary import role_of
+from lalaloc_core.importers.common.vocabulary import role_from_name
 
 # Faces up to this height above the lowest point of a space are its floor.
 _FLOOR_M = 0.05
@@ -156,7 +156,7 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, b
         low, high = float(vertices[:, 2].min()), float(vertices[:, 2].max())
         parts = _footprint(vertices, triangles, low)
         name = str(space.LongName or space.Name or "")
-        if role_of(name) == "obstacle":
+        if role_from_name(name) == "obstacle":
             sketch.obstacles += parts
             builder.use("IfcSpace", "holes (shafts)")
             continue
@@ -259,7 +259,7 @@ def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shap
         return []
     seamed = [shapely.Polygon(triangle).buffer(_SEAM_M, join_style="mitre") for triangle in corners[flat]]
     union = shapely.unary_union(seamed)
-    return polygons_of(union.buffer(-_SEAM_M, join_style="mitre"))
+    return polygons_from_geometry(union.buffer(-_SEAM_M, join_style="mitre"))
 
 
 def _anchor(model: Any) -> Anchor | None:

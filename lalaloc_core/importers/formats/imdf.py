@@ -20,7 +20,7 @@ from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.limits import Budget, ImportLimits
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.formats.geojson import Projector, features_of, import_features, parse_features
+from lalaloc_core.importers.formats.geojson import Projector, import_features, parse_features, plan_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
 # Exported archives carry no time, so that equal plans give equal bytes.
@@ -91,7 +91,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     name = str(document.get("name", "floor plan"))
     ids = {kind: str(uuid.uuid5(_NAMESPACE, f"{kind}/{name}")) for kind in ("venue", "building", "level", "footprint")}
     by_type: dict[str, list[dict[str, Any]]] = {"unit": [], "opening": []}
-    for number, feature in enumerate(features_of(document, projector)):
+    for number, feature in enumerate(plan_features(document, projector)):
         kind = feature["properties"].pop("feature_type")
         properties = feature["properties"] | {"level_id": ids["level"]}
         if kind == "unit":

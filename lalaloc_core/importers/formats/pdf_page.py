@@ -14,7 +14,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_of
+from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.drawing.shapes import (
     CURVE_STEPS,
@@ -132,7 +132,7 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
         if leaves and not is_filled:
             drawing.swings += leaves
         elif len(points) >= 3 and (subpath.is_closed or is_filled):
-            shells += polygons_of(shapely.Polygon(points))
+            shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
             drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen))
     if is_filled and not is_dark and not is_stroked:

@@ -22,11 +22,11 @@ from defusedxml import ElementTree as SafeElementTree
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_of
+from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.vocabulary import Role, role_of
+from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import (
     CURVE_STEPS,
@@ -77,7 +77,7 @@ class _Context:
         texts = [str(own[key])[:200] for key in (_LABEL, "id", "class") if own.get(key)]
         labels = (*self.labels, *texts)[-64:]
         for text in (*texts[::-1],):
-            role = role_of(text)
+            role = role_from_name(text)
             if role is not None:
                 return _Context(labels, role, text, text)
         layer = texts[0] if texts and not self.layer else self.layer
@@ -284,7 +284,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
             drawing.swings += leaves
             builder.use(context.layer, "door swings", len(leaves))
         elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
-            shells += polygons_of(shapely.Polygon(points))
+            shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
             drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, context.role, float(width or 0.0)))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
@@ -334,7 +334,7 @@ def _name_of(element: Any, context: _Context) -> str | None:
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
         text = str(own.get(key) or "").strip()
-        if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_of(text) is None):
+        if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_from_name(text) is None):
             return text.replace("_", " ")
     if context.role != "room" or context.kind is None:
         return None

@@ -17,7 +17,7 @@ from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOp
 from lalaloc_core.importers.drawing.walls import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.importers.picture.gaps import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import Ink, read_ink
-from lalaloc_core.importers.picture.wall_mask import WallMask, bodies_of, dark_walls, outlined_walls, straightened
+from lalaloc_core.importers.picture.wall_mask import WallMask, dark_walls, outlined_walls, straightened, wall_polygons
 from lalaloc_core.importers.picture.windows import windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
@@ -118,7 +118,7 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
-    enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, rank)
+    enclosed = enclose(wall_polygons(walls, ink), [], (), _CONFIG, budget.check_time, rank)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), contents, is_dark)
 

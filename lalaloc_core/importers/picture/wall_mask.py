@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.importers.common.geometry import cross, polygons_of
+from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
@@ -137,7 +137,7 @@ def _without_furniture(
     return keep[labels]
 
 
-def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
+def wall_polygons(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
     """Return walls as straightened polygons in plan metres."""
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
@@ -154,8 +154,8 @@ def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
         inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]
         shell = shapely.Polygon(_ring(contours[index], ink), inner)
         # Contours run through pixel centres, so the wall reaches half a pixel farther.
-        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
-        found += [straightened(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
+        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_from_geometry(shell)]
+        found += [straightened(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
     return found
 
 
