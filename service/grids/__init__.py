@@ -1,7 +1,7 @@
-"""Latent grids of plans: found in memory or in the store, computed by one replica for all of them.
+"""Pose grids of plans: found in memory or in the store, computed by one replica for all of them.
 
-Begin with `grid_provider.py`, which everybody else asks. `builder.py` computes what `grid_jobs.py` queues, under
-leases; `throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
+Begin with `grid_provider.py`, the interface for all other packages. `builder.py` computes the grids that `grid_jobs.py`
+queues, under leases; `throttle.py` gives queries priority, and `sweeper.py` reacts to other replicas.
 """
 
 from service.grids.grid_provider import GridProvider, GridState

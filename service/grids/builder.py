@@ -1,4 +1,4 @@
-"""Computes the grids that are queued, each under its lease, and stores them."""
+"""Computation and storage of queued grids, each under its lease."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from service.storage.grid_format import SortedPrototypes
 from service.storage.records import millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 
-# How long a finished grid is kept at hand while the database is away.
+# Duration and interval (s) of retries to store a finished grid.
 _KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0
 # Not failures of the plan.
 _ABANDONED = (UnknownFloorPlanError, PlanNotReadyError, StoppingError, StoreUnavailableError)
-# Progress is told, and the lease renewed, so many times while it lasts.
+# Renewals, with the progress, per length of a lease.
 _HEARTBEATS = 8.0
-# So many replicas, or lives of one, may begin a grid without any of them finishing it.
+# Maximum number of unfinished attempts, by any replicas, before a grid counts as failed.
 _MAX_ATTEMPTS = 5
 # Stored pose grids (camera heights) per plan.
 _MAX_GRIDS_PER_PLAN = 8
@@ -65,10 +65,10 @@ class _LeaseHeartbeat:
 
 
 class GridBuilder:
-    """One thread that sees grids through.
+    """Thread that computes and stores grids.
 
     Attributes:
-        jobs: what it works on.
+        jobs: jobs of the thread.
     """
 
     def __init__(
@@ -83,8 +83,12 @@ class GridBuilder:
         """Start the thread.
 
         Args:
-            cache: where finished grids are kept at hand.
-            throttle: lets queries go first.
+            store: the store.
+            encoders: the networks.
+            cache: receives finished grids.
+            throttle: gives queries priority.
+            settings: the settings.
+            telemetry: the metrics.
         """
         self._store = store
         self._encoders = encoders
@@ -93,12 +97,12 @@ class GridBuilder:
         self._settings = settings
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
-        # Of the jobs that are being computed, all by the one thread of `GridJobs`.
+        # Of the running jobs, all on the one thread of `GridJobs`.
         self._heartbeats: list[_LeaseHeartbeat] = []
         self.jobs = GridJobs(self._work)
 
     def _work(self, job: GridJob) -> None:
-        """See a job through; whatever happens ends up in its future, unless another replica is at it."""
+        """Run a job; every outcome is set on its future, unless another replica holds the lease."""
         try:
             outcome = self._cache.load(job.key) or self._compute(job)
         except _LeaseLostError:
@@ -119,13 +123,13 @@ class GridBuilder:
         attempts = self._store.leases.claim(job.key, self._owner, self._settings.grids.grid_lease_s)
         if attempts is None:
             raise _LeaseLostError
-        # Whoever had the lease until now may have finished.
+        # The previous owner of the lease can have finished the grid.
         grid = self._cache.load(job.key)
         if grid is not None:
             self._store.leases.release(job.key, self._owner)
             return grid
         if attempts > _MAX_ATTEMPTS:
-            reason = f"its latent grid was begun {_MAX_ATTEMPTS} times and never finished"
+            reason = f"its pose grid was begun {_MAX_ATTEMPTS} times and never finished"
             raise PlanFailedError(job.plan_id, reason)
         with self._telemetry.timed(self._telemetry.grid_seconds):
             grid = self._embed(job, record.plan)
@@ -140,11 +144,11 @@ class GridBuilder:
 
         def after_chunk(progress: float, worked_s: float) -> None:
             job.progress = progress
-            # A small grid may be computed between two chunks of a large one, whose lease must last meanwhile.
-            for other in self._heartbeats:
-                other.beat()
+            # All of them: during a small grid, the lease of the large one that it interrupts must be renewed, too.
+            for running in self._heartbeats:
+                running.beat()
             if heartbeat.lost:
-                # Leases go with their plans; if this one has, the job fails when it is looked at again.
+                # Leases are deleted with their plan; in that case the job fails when it is polled.
                 raise _LeaseLostError
             if progress < 1.0:
                 self.jobs.preempt(job)
@@ -164,18 +168,18 @@ class GridBuilder:
             return StoppingError()
         if not self._store.plans.has_revision(job.key.revision_id):
             return UnknownFloorPlanError(job.plan_id)
-        # The plan has another revision by now, which the next query finds.
+        # The plan has a new revision, which the next query finds.
         return PlanNotReadyError(job.plan_id, 0.0, 0.0)
 
     def _renew(self, job: GridJob) -> bool:
         try:
             return self._store.leases.renew(job.key, self._owner, self._settings.grids.grid_lease_s, job.progress)
         except StoreUnavailableError:
-            # Nobody else can take the lease meanwhile either.
+            # No other replica can take the lease during the outage either.
             return True
 
     def _put(self, job: GridJob, grid: PoseGrid, prototypes: SortedPrototypes, *, always_keep_mm: int) -> bool:
-        """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""
+        """Store a grid; retry during an outage of the database, because the computation can have taken minutes."""
         give_up_at = monotonic() + _KEEP_TRYING_S
         while True:
             try:
@@ -189,20 +193,20 @@ class GridBuilder:
     def _note_failure(self, job: GridJob, error: Exception) -> None:
         logger = logging.getLogger(LOGGER_NAME)
         if isinstance(error, _ABANDONED):
-            logger.info("latent grid abandoned", extra={"fields": {"floorplan": job.plan_id, "reason": str(error)}})
+            logger.info("pose grid abandoned", extra={"fields": {"floorplan": job.plan_id, "reason": str(error)}})
         else:
-            logger.error("latent grid failed", exc_info=error, extra={"fields": {"floorplan": job.plan_id}})
+            logger.error("pose grid failed", exc_info=error, extra={"fields": {"floorplan": job.plan_id}})
         try:
             if not job.on_demand and not isinstance(error, _ABANDONED):
                 self._store.plans.set_failure(job.key.revision_id, _reason(error))
             self._store.leases.release(job.key, self._owner)
         except Exception:
-            # The lease runs out, and whoever takes it over fails in the same way.
+            # The lease expires, and the replica that takes it over will fail in the same way.
             logger.exception("cannot record the failure", extra={"fields": {"floorplan": job.plan_id}})
 
 
 def _reason(error: Exception) -> str:
-    """Why a grid failed, in a text that is fit for users: that of errors which are raised on purpose."""
+    """Return the error of a failed grid as a text for users; unexpected errors are not disclosed."""
     if isinstance(error, PlanFailedError):
         return error.reason
     return str(error) if isinstance(error, LaLaLocError) else "internal error"

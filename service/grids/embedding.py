@@ -1,4 +1,4 @@
-"""Computes a latent grid in chunks, and says how large it will be."""
+"""Computation of a pose grid in chunks, and estimates of its size."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings
 
-# Poses between two of which queries go first; networks embed fewer at a time than are rendered.
+# Poses per chunk, for models with wall profiles and for models with latents; queries go first between chunks.
 _RENDERED, _EMBEDDED = 256, 128
-# What queries make of a pose at first use: for every azimuth its log distance, in half precision where there are no
-# latents, and a code; what is seen through openings; and what the first look sees.
+# Memory that queries add at first use. Per azimuth: the log distance, in half precision without latents, and a code.
+# Per pose: views through openings, and arrays of the coarse pass.
 _BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400
 
 
@@ -31,14 +31,18 @@ def embed(
     camera_height_m: float,
     after_chunk: Callable[[float, float], None],
 ) -> PoseGrid:
-    """Sample and render the grid of a plan, and embed it where the model compares poses by their latents.
+    """Sample and render the poses of a plan, and embed them if the model compares latents.
 
     Args:
-        after_chunk: called with the share that is done (0 to 1) and the seconds that the last chunk took, and with 0
-            when the poses of another room are found; what it raises ends the work.
+        plan: the plan.
+        encoders: the networks.
+        step_m: grid step (m).
+        camera_height_m: camera height (m).
+        after_chunk: called with the share done (0 to 1) and the duration (s) of the last chunk, and with zeros after
+            each room of the sampling; an error that it raises ends the work.
 
     Raises:
-        InvalidPoseError: the networks have no latents for this plan at this camera height.
+        InvalidPoseError: the networks return non-finite latents at this camera height.
     """
     poses = pose_grid(plan, step_m, after_room=lambda: after_chunk(0.0, 0.0))
     chunk = _RENDERED if encoders.predicts_profile else _EMBEDDED
@@ -65,10 +69,10 @@ def embed(
 
 
 def check_size(plan: FloorPlan, settings: Settings) -> None:
-    """Refuse a plan whose grid would be too large.
+    """Check the estimated number of poses of a plan.
 
     Raises:
-        PlanTooLargeError: states the estimated number of poses and the limit.
+        PlanTooLargeError: the estimate exceeds the limit.
     """
     estimate = grid_size(plan, settings.grids.grid_step_m)
     if estimate > settings.grids.max_grid_poses:
@@ -76,7 +80,7 @@ def check_size(plan: FloorPlan, settings: Settings) -> None:
 
 
 def grid_bytes(grid: PoseGrid) -> int:
-    """The memory that a grid takes, with what queries make of it."""
+    """Return the memory of a grid, including the arrays that queries derive from it."""
     arrays = (grid.latents, grid.profile_m, grid.poses.position_m, grid.poses.room_index)
     stored = sum(array.nbytes for array in arrays if array is not None)
     return stored + len(grid.poses) * (_BYTES_PER_COLUMN * grid.profile_m.shape[1] + _BYTES_PER_POSE)

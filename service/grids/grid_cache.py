@@ -1,4 +1,4 @@
-"""Latent grids in memory, before those in the store."""
+"""Pose grids in memory, in front of those in the store."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.telemetry import Telemetry
 
 
 class GridCache(BoundedCache[GridKey, PoseGrid]):
-    """Finds grids that were computed before; safe to share between threads."""
+    """Cache of computed pose grids; safe to share between threads."""
 
     def __init__(self, store: Store, limit_bytes: int, telemetry: Telemetry) -> None:
         super().__init__(limit_bytes, grid_bytes)
@@ -22,17 +22,17 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
         self._loading = threading.Lock()
 
     def cached(self, key: GridKey) -> PoseGrid | None:
-        """A grid that is in memory."""
+        """Return a grid from memory."""
         grid = self.get(key)
         if grid is not None:
             self._telemetry.grid_cache_hits.inc()
         return grid
 
     def find(self, key: GridKey) -> PoseGrid | None:
-        """A grid from memory or from the store.
+        """Return a grid from memory or from the store.
 
         Raises:
-            StoreUnavailableError: it is not in memory, and the database is away.
+            StoreUnavailableError: the grid is not in memory, and the database is unavailable.
         """
         grid = self.cached(key)
         if grid is not None:
@@ -41,7 +41,7 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
         return self.load(key)
 
     def load(self, key: GridKey) -> PoseGrid | None:
-        """As `find`, without counting; one at a time, so that many queries for one plan read it once."""
+        """Return a grid as `find` does, without metrics; one at a time, so that queries for one plan read it once."""
         with self._loading:
             grid = self.get(key)
             if grid is None:

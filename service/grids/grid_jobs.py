@@ -1,8 +1,8 @@
-"""Grids that are to be computed: by one thread here, or by another replica, whichever took the lease.
+"""Jobs of computing grids, by one thread of this replica or by another replica, whichever holds the lease.
 
-A job waits in the queue, is computed here under a lease, or is *remote*: another replica has the lease, and the
-store is asked now and then how far it is. A lease that ran out puts the job back into the queue. Small grids go first,
-also before the rest of a large one that has begun.
+A job waits in the queue, is computed here under a lease, or is *remote*: another replica holds the lease, and its
+progress is polled. When its lease expires, the job returns to the queue. Small grids go first, even in the middle of a
+large one.
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ from lalaloc_core.localise.poses import PoseGrid
 from service.errors import OverloadedError, StoppingError
 from service.storage.records import GridKey
 
-# More are not queued: whoever asks is told, and what has no grid is found again by `GridProvider.queue_missing`.
+# Limits of the queue. Callers get an error beyond them, and `GridProvider.queue_missing` finds missing grids later.
 MAX_JOBS = 256
 MAX_ON_DEMAND = 16
-# A grid of so many poses takes a moment, and does not wait behind larger ones.
+# Maximum number of poses of a small grid, which does not wait behind larger ones.
 _SMALL_POSES = 2000
 
 
 @dataclass(eq=False)
 class GridJob:
-    """One grid that is to be computed.
+    """Grid to be computed.
 
     Attributes:
-        poses: about how many it has.
-        on_demand: whether a query asked for it, for a camera height that is not the plan's own.
-        cancelled: set to end the work.
-        progress: share that is done, 0 to 1, here or there.
-        remote: whether another replica computes it.
+        key: key of the grid.
+        plan_id: id of the plan.
+        poses: estimated number of poses.
+        on_demand: a query needs the grid, for a camera height other than the plan's own.
+        future: result of the job.
+        cancelled: event that ends the work.
+        progress: share that is done, 0 to 1, here or in another replica.
+        remote: another replica computes the grid.
     """
 
     key: GridKey
@@ -46,7 +49,7 @@ class GridJob:
 
 
 class GridJobs:
-    """The jobs of this replica and the thread that works on them."""
+    """Jobs of this replica, and the thread that works on them."""
 
     def __init__(self, work: Callable[[GridJob], None]) -> None:
         """Start the thread.
@@ -66,14 +69,20 @@ class GridJobs:
         return len(self._jobs)
 
     def get(self, key: GridKey) -> GridJob | None:
-        """The job for a grid."""
+        """Return the job for a grid."""
         return self._jobs.get(key)
 
     def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> GridJob:
-        """The job for a grid, a new one if there is none.
+        """Return the job for a grid, a new one if there is none.
+
+        Args:
+            key: key of the grid.
+            plan_id: id of the plan.
+            poses: estimated number of poses.
+            on_demand: see `GridJob`.
 
         Raises:
-            OverloadedError: too many jobs are waiting already.
+            OverloadedError: too many jobs wait already.
             StoppingError: the service stops.
         """
         with self._changed:
@@ -82,12 +91,12 @@ class GridJobs:
                 return job
             if self.closing.is_set():
                 raise StoppingError()
-            if on_demand and sum(other.on_demand for other in self._jobs.values()) >= MAX_ON_DEMAND:
+            if on_demand and sum(pending.on_demand for pending in self._jobs.values()) >= MAX_ON_DEMAND:
                 raise OverloadedError(MAX_ON_DEMAND)
             if len(self._jobs) >= MAX_JOBS:
                 raise OverloadedError(MAX_JOBS)
             job = GridJob(key, plan_id, poses, on_demand)
-            # Others may wait for the same future: nobody can cancel it for them.
+            # Marked as running, so that no caller can cancel the future for the others.
             job.future.set_running_or_notify_cancel()
             self._jobs[key] = job
             self._queued.append(job)
@@ -95,7 +104,7 @@ class GridJobs:
             return job
 
     def end(self, job: GridJob, outcome: PoseGrid | Exception) -> None:
-        """Forget a job, then give its outcome to those who wait, so that they find the plan in its final state."""
+        """Remove a job, then set its result, so that waiting queries find the plan in its final state."""
         with self._changed:
             self._jobs.pop(job.key, None)
         if isinstance(outcome, Exception):
@@ -104,24 +113,24 @@ class GridJobs:
             job.future.set_result(outcome)
 
     def remote(self) -> list[GridJob]:
-        """The jobs that other replicas have the lease of."""
+        """Return the jobs whose lease another replica holds."""
         with self._changed:
             return [job for job in self._jobs.values() if job.remote]
 
     def requeue(self, job: GridJob) -> None:
-        """Queue a job that was remote: its lease has run out."""
+        """Queue a remote job whose lease expired."""
         with self._changed:
             job.remote = False
             self._queued.append(job)
             self._changed.notify()
 
     def revisions(self) -> set[str]:
-        """The revisions that there are jobs for."""
+        """Return the revisions with jobs."""
         with self._changed:
             return {key.revision_id for key in self._jobs}
 
     def cancel(self, revision_id: str) -> None:
-        """End the jobs for a revision that is gone."""
+        """Cancel the jobs of a deleted revision."""
         with self._changed:
             for job in self._jobs.values():
                 if job.key.revision_id == revision_id:
@@ -133,7 +142,7 @@ class GridJobs:
             self._work(job)
 
     def close(self) -> None:
-        """End the work; all who still wait get StoppingError."""
+        """Stop the work; jobs that still wait fail with `StoppingError`."""
         with self._changed:
             self.closing.set()
             self._queued.clear()

@@ -1,4 +1,4 @@
-"""Finds latent grids, or has them computed; safe to share between threads."""
+"""Provider of pose grids: found in memory or in the store, or computed; safe to share between threads."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from service.storage.grid_format import SortedPrototypes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 
-# Plans whose missing grids are queued at a time, so that replicas share a backlog.
+# Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16
-# Uploads compute small grids in turns; one that would wait for longer leaves its grid to the background.
+# Time (s) that an upload waits for its turn to compute a small grid before it leaves it to the background.
 _INLINE_WAIT_S = 1.0
 
 
@@ -64,10 +64,10 @@ class GridState:
 
 
 class GridProvider:
-    """The latent grids of one model at one grid step.
+    """Pose grids of one model at one grid step.
 
     Attributes:
-        throttle: queries say here when they compute, and grids let them go first.
+        throttle: priority of queries over the computation of grids.
     """
 
     def __init__(
@@ -88,27 +88,29 @@ class GridProvider:
         self._inline = threading.Lock()
         self._jobs = GridBuilder(store, encoders, self._cache, self.throttle, settings, telemetry).jobs
         self._unprepared = 0
-        telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it here.", lambda: self.pending)
-        telemetry.gauge("lalaloc_grids_preparing", "Plans without a latent grid, wherever.", lambda: self.preparing)
-        telemetry.gauge("lalaloc_grid_cache_bytes", "Latent grids in memory.", lambda: self._cache.bytes)
+        telemetry.gauge("lalaloc_grids_pending", "Pose grids computed or queued in this replica.", lambda: self.pending)
+        telemetry.gauge(
+            "lalaloc_grids_preparing", "Plans without a pose grid, in all replicas.", lambda: self.preparing
+        )
+        telemetry.gauge("lalaloc_grid_cache_bytes", "Pose grids in memory.", lambda: self._cache.bytes)
 
     @property
     def pending(self) -> int:
-        """Latent grids being computed or waiting for it here."""
+        """Number of grids that are computed or queued here."""
         return len(self._jobs)
 
     @property
     def preparing(self) -> int:
-        """The same here and elsewhere, with plans whose grid nobody has queued yet, as of the last `queue_missing`."""
+        """Number of plans without a grid in all replicas, queued or not, as of the last `queue_missing`."""
         return max(self.pending, self._unprepared)
 
     @property
     def model(self) -> tuple[str, float]:
-        """What grids are kept by beside revision and height: the digest of the model, and the grid step (m)."""
+        """Digest of the model and grid step (m), the parts of a grid's key that all plans share."""
         return self._model_sha256, self._settings.grids.grid_step_m
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
-        """The key of a revision's grid for this model and grid step."""
+        """Return the key of a revision's grid for this model and grid step."""
         return GridKey(
             revision_id=revision_id,
             model_sha256=self._model_sha256,
@@ -117,7 +119,7 @@ class GridProvider:
         )
 
     def states(self, plans: list[PlanSummary]) -> list[GridState]:
-        """How far each plan's own grid is, whoever computes it."""
+        """Return the state of each plan's own grid, whichever replica computes it."""
         keys = [self.key(summary.revision_id, summary.camera_height_m) for summary in plans]
         step_m, revision_ids = self._settings.grids.grid_step_m, [summary.revision_id for summary in plans]
         places = [(key.revision_id, key.camera_height_mm) for key in keys]
@@ -126,7 +128,7 @@ class GridProvider:
         leased = {}
         if not all(place in stored for place in places):
             leased = self._store.leases.progress(self._model_sha256, step_m, revision_ids)
-            # Leases end as grids are stored, which may have been just now.
+            # Read again, because a grid can have been stored, and its lease ended, in between.
             stored = self._store.grids.poses(self._model_sha256, step_m, revision_ids)
         return [
             GridState.of_stored(summary.failure, stored.get(place), leased.get(place), job)
@@ -134,15 +136,15 @@ class GridProvider:
         ]
 
     def check_size(self, plan: FloorPlan) -> None:
-        """Refuse a plan whose grid would be too large.
+        """Check the estimated number of poses of a plan.
 
         Raises:
-            PlanTooLargeError: states the estimated number of poses and the limit.
+            PlanTooLargeError: the estimate exceeds the limit.
         """
         check_size(plan, self._settings)
 
     def prepare(self, plan: FloorPlan) -> ComputedGrid | None:
-        """The own grid of a small plan, computed at once; None when that is left to the background."""
+        """Compute the own grid of a small plan at once; None leaves it to the background."""
         if self._estimate(plan) > self._settings.grids.inline_grid_poses or not self._inline.acquire(
             timeout=_INLINE_WAIT_S
         ):
@@ -159,31 +161,31 @@ class GridProvider:
             prototypes = SortedPrototypes.of_grid(grid, plan)
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
-            # The background fails at it as well, and records it with the plan.
-            logging.getLogger(LOGGER_NAME).exception("latent grid failed")
+            # The background will fail as well, and store the error with the plan.
+            logging.getLogger(LOGGER_NAME).exception("pose grid failed")
             return None
         finally:
             self._inline.release()
 
     def on_plan_stored(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
-        """After a plan was stored: keep the grid that was stored with it at hand, or have it computed."""
+        """Cache the grid that was stored with a plan, or queue its computation."""
         if prepared is not None:
             self._cache.put(prepared.key(record.revision_id), prepared.grid)
             return
-        # What cannot be queued now is queued later, here or by another replica.
+        # A grid that cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):
             self.compute(record, record.plan.camera_height_m)
 
     def find(self, key: GridKey) -> PoseGrid | None:
-        """A grid that has been computed before, from memory or from the store.
+        """Return a computed grid from memory or from the store.
 
         Raises:
-            StoreUnavailableError: it is not in memory, and the database is away.
+            StoreUnavailableError: the grid is not in memory, and the database is unavailable.
         """
         return self._cache.find(key)
 
     def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
-        """Make and store the prototypes of a grid that was stored without; None when it is gone."""
+        """Make and store the prototypes of a grid that was stored without; None if the grid was deleted."""
         grid, record = self.find(key), self._store.plans.get_by_revision(key.revision_id)
         if grid is None or record is None:
             return None
@@ -192,18 +194,18 @@ class GridProvider:
         return prototypes
 
     def cached(self, key: GridKey) -> PoseGrid | None:
-        """A grid that is in memory."""
+        """Return a grid from memory."""
         return self._cache.cached(key)
 
     def compute(self, record: PlanRecord, camera_height_m: float) -> Future[PoseGrid]:
-        """Compute a grid in the background; asking again while that runs gives the same future.
+        """Compute a grid in the background; a second call during the computation returns the same future.
 
-        The future raises UnknownFloorPlanError when the plan is deleted meanwhile, PlanNotReadyError when it gets a
-        new revision, StoppingError when the service stops, StoreUnavailableError when the database goes away;
-        cancelling it has no effect, others may be waiting for it too.
+        The future raises `UnknownFloorPlanError` if the plan is deleted, `PlanNotReadyError` if it gets a new revision,
+        `StoppingError` if the service stops, and `StoreUnavailableError` if the database fails. It cannot be
+        cancelled, because other queries can wait for it.
 
         Raises:
-            OverloadedError: too many grids are waiting already.
+            OverloadedError: too many grids wait already.
             StoppingError: the service stops.
         """
         key = self.key(record.revision_id, camera_height_m)
@@ -211,26 +213,26 @@ class GridProvider:
         return self._jobs.add(key, plan_id=record.id, poses=self._estimate(record.plan), on_demand=on_demand).future
 
     def progress(self, key: GridKey) -> float:
-        """Share of a grid that is computed, 0 to 1; 0 also for one that nobody computes."""
+        """Return the computed share of a grid, 0 to 1; 0 for one that is not computed here."""
         job = self._jobs.get(key)
         return job.progress if job else 0.0
 
     def forget(self, revision_ids: set[str]) -> None:
-        """Drop the grids of revisions that are gone from memory, and stop computing them."""
+        """Drop grids of deleted revisions from memory, and cancel their computation."""
         self._cache.drop(lambda key, _: key.revision_id in revision_ids)
         for revision_id in revision_ids:
             self._jobs.cancel(revision_id)
 
     def cancel(self, revision_id: str) -> None:
-        """Stop computing the grids of a revision that is gone, or no longer its plan's."""
+        """Cancel the grids of a revision that was deleted or replaced."""
         self._jobs.cancel(revision_id)
 
     def revisions(self) -> set[str]:
-        """The revisions with grids in memory, or with grids that are to be computed."""
+        """Return the revisions with grids in memory or in the queue."""
         return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
     def queue_missing(self) -> bool:
-        """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether more may be left."""
+        """Queue the oldest grids that no replica computes, unless the queue is long; tell whether more can be missing."""
         if len(self._jobs) >= _BATCH:
             return True
         model = (self._model_sha256, self._settings.grids.grid_step_m)
@@ -244,7 +246,7 @@ class GridProvider:
         return len(missing) == _BATCH
 
     def poll_remote(self) -> None:
-        """Note how far other replicas are, and look after grids that they finished or gave up."""
+        """Read the progress of other replicas, and queue jobs whose lease ended again."""
         jobs = self._jobs.remote()
         if not jobs:
             return
@@ -258,7 +260,7 @@ class GridProvider:
                 job.progress = progress
 
     def close(self) -> None:
-        """Stop computing; what was not finished is left to another replica, or at the next start."""
+        """Stop computing; unfinished grids are left to another replica or to the next start."""
         self._jobs.close()
 
     def _estimate(self, plan: FloorPlan) -> int:

@@ -1,4 +1,4 @@
-"""Looks after what other replicas do: plans that are gone, grids that they compute, and grids that nobody does."""
+"""Periodic reaction to other replicas: deleted plans, grids that they compute, and grids that no replica computes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from service.grids.grid_provider import GridProvider
 from service.storage import Store
 from service.telemetry import LOGGER_NAME
 
-# Revisions that one query asks about.
+# Revisions per query.
 _BATCH_SIZE = 500
 _POLL_S = 0.5
 _PURGE_EVERY_S = 3600.0
 
 
 class Sweeper:
-    """A thread with a few cheap queries every now and then; a database that is away is tried again."""
+    """Thread with a few cheap queries per period; failures of the database are retried."""
 
     def __init__(self, store: Store, grids: GridProvider, *, sweep_s: float, keep_answers_s: float) -> None:
         self._store = store
@@ -29,26 +29,23 @@ class Sweeper:
         self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
 
     def start(self) -> None:
-        """Try once more what failed under an earlier start, then look after things until `close`."""
+        """Clear the failures of earlier runs, so that these grids are tried again, and start the thread."""
         self._store.plans.clear_failures()
         self._grids.queue_missing()
         self._thread.start()
 
     def close(self) -> None:
-        """Stop."""
+        """Stop the thread."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def sweep(self) -> None:
-        """Forget plans and grids in memory whose revisions are gone, on whichever replica they were deleted.
-
-        Grids of theirs that are being computed, or wait for it, are not any more.
-        """
+        """Drop plans and grids from memory, and cancel their computation, if any replica deleted their revisions."""
         in_memory = sorted(self._grids.revisions() | self._store.plan_cache.revisions())
         for first in range(0, len(in_memory), _BATCH_SIZE):
-            asked = in_memory[first : first + _BATCH_SIZE]
-            gone = set(asked) - self._store.plans.current_revisions(asked)
+            batch = in_memory[first : first + _BATCH_SIZE]
+            gone = set(batch) - self._store.plans.current_revisions(batch)
             if gone:
                 self._grids.forget(gone)
                 self._store.plan_cache.forget_revisions(gone)
@@ -63,7 +60,7 @@ class Sweeper:
                 if due:
                     sweep_at = monotonic() + self._sweep_s
                     self.sweep()
-                # A backlog, as after a new model, goes on as soon as what was queued is done.
+                # A backlog, as after a new model, continues as soon as the queued grids are done.
                 if due or (more and self._grids.pending == 0):
                     more = self._grids.queue_missing()
                 if monotonic() >= purge_at:
@@ -73,4 +70,4 @@ class Sweeper:
             except StoreUnavailableError:
                 continue
             except Exception:
-                logging.getLogger(LOGGER_NAME).exception("looking after grids failed")
+                logging.getLogger(LOGGER_NAME).exception("sweeping grids failed")

@@ -1,4 +1,4 @@
-"""How work in the background makes way for queries."""
+"""Priority of queries over background work."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# While queries keep coming, the background has a fifth of its thread's time; then it goes on, however slowly.
+# Under constant load the background gets a fifth of its thread's time.
 _PAUSE_PER_WORK = 4.0
 _MAX_PAUSE_S = 1.0
 
 
 class BackgroundThrottle:
-    """Counts the queries that compute at this moment; those that wait for something are not in the way."""
+    """Counter of the queries that compute at the moment; waiting queries do not count."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -22,7 +22,7 @@ class BackgroundThrottle:
 
     @contextmanager
     def query(self) -> Iterator[None]:
-        """A query computes inside the block."""
+        """Count a query that computes inside the block."""
         with self._lock:
             self._count += 1
             self._none.clear()
@@ -35,9 +35,9 @@ class BackgroundThrottle:
                     self._none.set()
 
     def pause(self, worked_s: float) -> None:
-        """Pause until no query computes, but no longer than a few times what was last worked.
+        """Pause until no query computes, at most a few times as long as the last work took (s).
 
-        Between two chunks of a grid, so that a query finds at most one chunk in its way, and a grid gets done also
-        when there is always a query.
+        Called between two chunks of a grid, so that a query waits for at most one chunk, and a grid is finished even
+        under constant load.
         """
         self._none.wait(min(worked_s * _PAUSE_PER_WORK, _MAX_PAUSE_S))

@@ -1,4 +1,4 @@
-"""API keys; the store sees only hashes of them."""
+"""API keys, stored as hashes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.storage.tables import API_KEYS
 
 
 class ApiKeys:
-    """Keys of all tenants, revoked ones included."""
+    """API keys of all tenants, including revoked ones."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -37,7 +37,7 @@ class ApiKeys:
             return _key(connection.execute(API_KEYS.insert().values(**values).returning(API_KEYS)).one())
 
     def list_keys(self, tenant: str | None = None) -> list[ApiKey]:
-        """Keys, oldest first; of one tenant or of all."""
+        """Return the keys of one tenant or of all, oldest first."""
         query = select(API_KEYS).order_by(API_KEYS.c.created_at, API_KEYS.c.id)
         if tenant is not None:
             query = query.where(API_KEYS.c.tenant == tenant)
@@ -45,20 +45,20 @@ class ApiKeys:
             return [_key(row) for row in connection.execute(query)]
 
     def revoke(self, key_id: str) -> bool:
-        """End a key for good; False when there is no such key, or it has ended already."""
+        """Revoke a key for good; False if it does not exist or was revoked before."""
         statement = update(API_KEYS).where(API_KEYS.c.id == key_id, API_KEYS.c.revoked_at.is_(None))
         with self._database.writing() as connection:
             return connection.execute(statement.values(revoked_at=datetime.now(UTC))).rowcount == 1
 
     def find(self, key_hash: str) -> ApiKey | None:
-        """The key with this hash, unless it was revoked."""
+        """Return the key with this hash, unless it was revoked."""
         query = select(API_KEYS).where(API_KEYS.c.hash == key_hash, API_KEYS.c.revoked_at.is_(None))
         with self._database.reading() as connection:
             row = connection.execute(query).one_or_none()
         return None if row is None else _key(row)
 
     def touch(self, key_id: str) -> None:
-        """Note that a key was used now; callers do so now and then, not for every request."""
+        """Record that a key is in use; callers do so at intervals, not for every request."""
         statement = update(API_KEYS).where(API_KEYS.c.id == key_id).values(last_used_at=datetime.now(UTC))
         with self._database.writing() as connection:
             connection.execute(statement)

@@ -1,21 +1,19 @@
-"""What keeps calls that can do without the database from waiting for it, one after the other, while it is away."""
+"""Circuit breaker, which saves calls that have an alternative from waiting for an unavailable database."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-# After a failure the database is left alone for so long.
+# Duration (s) without calls after a failure.
 _OPEN_S = 1.0
 
 
 class CircuitBreaker:
-    """Open for a moment after the database failed; safe to share between threads."""
+    """Switch that is open for a moment after the database failed; safe to share between threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Args:
-        clock: seconds.
-        """
+        """Create a closed circuit breaker with a clock (s)."""
         self._clock = clock
         self._open_until_s = -float("inf")
 
@@ -25,5 +23,5 @@ class CircuitBreaker:
         return self._clock() < self._open_until_s
 
     def trip(self) -> None:
-        """Note that the database does not answer."""
+        """Open the circuit breaker, because the database failed."""
         self._open_until_s = self._clock() + _OPEN_S

@@ -1,8 +1,8 @@
 """Connections and transactions: SQLite with a write-ahead log, or PostgreSQL through psycopg.
 
-What survives: a transaction that was answered for survives the end of the process, however it ends. On SQLite
-(`synchronous=NORMAL`) a power failure or a crash of the operating system may take the last transactions back, whole;
-the file stays sound. PostgreSQL keeps them too, unless it is told otherwise.
+Durability: a committed transaction survives the end of the process. On SQLite (`synchronous=NORMAL`) a power failure or
+a crash of the operating system can undo the last transactions as a whole; the file stays consistent. PostgreSQL keeps
+them, unless it is configured otherwise.
 """
 
 from __future__ import annotations
@@ -40,28 +40,29 @@ from service.telemetry import LOGGER_NAME
 
 _WRITER = "lalaloc_writer"
 _SQLITE_WAIT_MS = 5000
-# The server ends what takes longer, so that a stuck statement or lock never holds a connection for good.
+# Time limits of the server, so that a stuck statement or lock never holds a connection for good.
 _STATEMENT_MS, _LOCK_MS, _IDLE_MS = 30_000, 10_000, 60_000
-# How far apart two looks at the clock may be, of whom one waits for a lock in between, or sets the clock right.
+# Tolerance (s) between two readings of the clock, for waiting on a lock or a corrected clock in between.
 _CLOCK_SLACK_S = 10.0
-# What PostgreSQL calls it.
+# SQLSTATE of PostgreSQL for a full disk.
 _DISK_FULL = "53100"
-# A server that does not answer any more counts as gone after this.
+# Silence (ms) after which a connection counts as broken.
 _SILENCE_MS = 5000
 
 
 class Database:
-    """A bounded pool of connections; safe to share between threads."""
+    """Bounded pool of connections; safe to share between threads."""
 
     def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
-        """Prepare the pool; connects on first use.
+        """Prepare the pool, which connects on first use.
 
         Args:
-            connections: most connections that are open at a time.
-            wait_s: longest wait for one of them to become free, and to be made.
+            url: URL of the database.
+            connections: maximum number of open connections.
+            wait_s: time limit (s) of waiting for a free connection, and of making one.
 
         Raises:
-            ConfigError: not the URL of an SQLite file or of PostgreSQL.
+            ConfigError: the URL is not that of an SQLite file or of PostgreSQL.
         """
         parsed = _parsed(url)
         self.is_postgresql = parsed.get_backend_name() == "postgresql"
@@ -70,89 +71,84 @@ class Database:
             pool_size=connections,
             max_overflow=0,
             pool_timeout=wait_s,
-            # After the server was away, dead connections are replaced instead of failing one request each.
+            # Replaces dead connections after an outage, instead of failing one request each.
             pool_pre_ping=self.is_postgresql,
             connect_args=_postgresql_arguments(parsed, wait_s) if self.is_postgresql else {},
         )
         self._path = None if self.is_postgresql else parsed.database
-        # Which file that was when it was opened first.
+        # Identity of the file when it was first opened.
         self._file: tuple[int, int] | None = None
         if not self.is_postgresql:
             event.listen(self._engine, "connect", _prepare_sqlite)
             event.listen(self._engine, "connect", self._note_file)
             event.listen(self._engine, "begin", _begin_sqlite)
         self.engine_for_writing: Engine = self._engine.execution_options(**{_WRITER: True})
-        # What is read in one transaction belongs together; on SQLite it does so anyway.
+        # Reads in one transaction see one snapshot; on SQLite they do so anyway.
         snapshot = {"isolation_level": "REPEATABLE READ"} if self.is_postgresql else {}
         self._engine_for_reading: Engine = self._engine.execution_options(**snapshot)
         self._answered_s = -float("inf")
 
     def close(self) -> None:
-        """Give all connections back."""
+        """Close all connections."""
         self._engine.dispose()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A transaction that only reads, and sees the database as it is at its first statement.
+        """Run a read-only transaction, which sees the database as of its first statement.
 
         Raises:
             StoreUnavailableError: the database cannot be reached, or did not answer in time.
-            StoreBusyError: it answers, but no connection became free in time.
+            StoreBusyError: the database answers, but no connection was free in time.
         """
         with self._transaction(self._engine_for_reading) as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """A transaction that writes; on SQLite it waits for other writers when it begins, not half-way through.
+        """Run a writing transaction; on SQLite it waits for other writers when it begins, not half-way through.
 
         Raises:
-            StoreUnavailableError, StoreBusyError: as for `reading`.
+            StoreUnavailableError, StoreBusyError: see `reading`.
         """
         with self._transaction(self.engine_for_writing) as connection:
             yield connection
 
     def now_s(self) -> ColumnElement[float]:
-        """Seconds since 1970 by the one clock that all owners of leases share: that of the PostgreSQL server.
-
-        SQLite has no other clock than that of its machine.
-        """
+        """Return the seconds since 1970 by the clock that all replicas share: PostgreSQL's, or this machine's."""
         if self.is_postgresql:
             return cast(extract("epoch", func.clock_timestamp()), Double)
         return literal(time.time())
 
     def is_live(self, until_s: Column[float], length_s: Column[float]) -> ColumnElement[bool]:
-        """Whether a lease holds: one that ends later than if it began now was taken by a clock that was ahead.
+        """Return the condition that a lease holds; an end too far in the future comes from a clock that was ahead.
 
         Args:
-            until_s: column of the moment that it ends at, by `now_s`.
-            length_s: column of how long it is; where that is not known, nothing is too late.
+            until_s: column of the lease's end, by `now_s`.
+            length_s: column of the lease's length (s); where it is NULL, no end is too far.
         """
         now_s = self.now_s()
         return and_(until_s > now_s, or_(length_s.is_(None), until_s <= now_s + length_s + _CLOCK_SLACK_S))
 
     def answered_since(self, moment_s: float) -> bool:
-        """Whether a transaction was completed after a moment (`monotonic`)."""
+        """Tell whether a transaction was completed after a moment (`monotonic`)."""
         return self._answered_s >= moment_s
 
     def insert(self, table: Any) -> Any:
-        """An INSERT that knows `ON CONFLICT`; both databases have it, in the same words."""
+        """Return an INSERT with `ON CONFLICT`, which both databases write alike."""
         return postgresql.insert(table) if self.is_postgresql else sqlite.insert(table)
 
     def _note_file(self, _connection: Any, _record: Any) -> None:
         self._file = self._file or _identity(self._path)
 
     def _check_file(self) -> None:
-        """Raises:
-        StoreUnavailableError: the file is gone, and what is written to it with it, although SQLite would go on.
+        """Check that the database file still exists, because SQLite would go on writing to a deleted one.
+
+        Raises:
+            StoreUnavailableError: the file was removed or replaced.
         """
         if self._file is not None and _identity(self._path) != self._file:
-            logging.getLogger(LOGGER_NAME).error(
-                "the file of the database is gone", extra={"fields": {"file": self._path}}
-            )
-            raise StoreUnavailableError(
-                "the file of the database was removed or replaced, the service must be restarted"
-            )
+            logging.getLogger(LOGGER_NAME).error("the database file is gone", extra={"fields": {"file": self._path}})
+            raise StoreUnavailableError("the database file was removed or replaced: restart the service")
 
     @contextmanager
     def _transaction(self, engine: Engine) -> Iterator[Connection]:
@@ -163,7 +159,7 @@ class Database:
                 yield connection
             self._answered_s = time.monotonic()
         except PoolTimeoutError as error:
-            # Others were answered meanwhile; or it is gone, and those who asked first still wait for it.
+            # Busy if the database answered another caller meanwhile; else unavailable.
             if self.answered_since(begin_s):
                 raise StoreBusyError() from error
             raise _unavailable(error) from error
@@ -180,9 +176,11 @@ def _parsed(url: str) -> URL:
     if parsed.drivername in ("postgresql", "postgres", "postgresql+psycopg"):
         return parsed.set(drivername="postgresql+psycopg")
     if parsed.get_backend_name() != "sqlite":
-        raise ConfigError(f"the database must be sqlite or postgresql, not '{parsed.drivername}'")
+        raise ConfigError(
+            f"the database is '{parsed.drivername}'; it must be sqlite or postgresql (LALALOC_DATABASE_URL)"
+        )
     if not parsed.database or parsed.database == ":memory:":
-        raise ConfigError("the database must be a file, SQLite in memory is not shared between connections")
+        raise ConfigError("SQLite in memory is not shared between connections: name a file (LALALOC_DATABASE_URL)")
     return parsed
 
 
@@ -194,15 +192,15 @@ def _postgresql_arguments(url: URL, wait_s: float) -> dict[str, Any]:
         "options": f"-c statement_timeout={_STATEMENT_MS} -c lock_timeout={_LOCK_MS} "
         f"-c idle_in_transaction_session_timeout={_IDLE_MS}",
     }
-    # What the URL says itself goes before.
+    # Parameters in the URL take precedence.
     return {name: value for name, value in arguments.items() if name not in url.query}
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
-    # The driver would begin transactions on its own, and only at the first write; see `_begin_sqlite`.
+    # Otherwise the driver begins transactions itself, only at the first write; see `_begin_sqlite`.
     connection.isolation_level = None
     cursor = connection.cursor()
-    # WAL lets readers go on while a grid is written; foreign keys are off in SQLite unless asked for.
+    # WAL lets readers continue while a grid is written; SQLite has foreign keys off by default.
     pragmas = (f"busy_timeout={_SQLITE_WAIT_MS}", "journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL")
     for pragma in pragmas:
         cursor.execute(f"PRAGMA {pragma}")
@@ -210,13 +208,13 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    # A reader that becomes a writer fails at once when another one was faster; a writer from the start waits its turn.
+    # A reader that becomes a writer fails if another was faster; a transaction that begins as a writer waits its turn.
     writer = connection.get_execution_options().get(_WRITER, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writer else "BEGIN")
 
 
 def _identity(path: str | None) -> tuple[int, int] | None:
-    """Which file there is under a path, None for none."""
+    """Return device and inode of a file; None without one."""
     try:
         found = os.stat(path or "")
     except OSError:

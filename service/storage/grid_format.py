@@ -1,11 +1,11 @@
-"""A latent grid as one blob: a header, then its arrays as they lie in memory, so that reading copies nothing.
+"""Pose grid as one blob: a header, then its arrays in memory layout, so that reading copies nothing.
 
 4 bytes "LLG1", then the numbers of poses, latent values and profile columns as little-endian uint32;
 positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n). "LLG2" is the same
 without latents, d = 0, and with profiles in half precision (float16).
 
-The prototypes of a plan likewise: "LLP3", the version of the cells that they are sorted into, their number, and rows of
-`prototypes.ROW`. What earlier versions of the service stored is not read: "LLP1" has no openings, "LLP2" fewer poses.
+Prototypes of a plan: "LLP3", the version of their cells, their number, and rows of `prototypes.ROW`. Prototypes of
+earlier versions of the service are not read: "LLP1" lacks openings, "LLP2" has fewer poses.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _POSE_BYTES, _LATENT_BYTES, _ROOM_BYTES = 16, 4, 4
 
 @dataclass(frozen=True, eq=False)
 class SortedPrototypes:
-    """Prototypes of a plan, rows of `prototypes.ROW`, sorted into cells of a version."""
+    """Prototypes of a plan, rows of `prototypes.ROW`, sorted into the cells of a version."""
 
     rows: np.ndarray
     version: int
 
     @classmethod
     def of(cls, prototypes: Prototypes, cells: Cells) -> SortedPrototypes:
-        """Sort prototypes."""
+        """Sort prototypes into cells."""
         rows = prototypes.rows.copy()
         rows["cell"] = cells.sort(rows)
         return cls(rows, cells.version)
@@ -49,14 +49,14 @@ class SortedPrototypes:
         return cls.of(prototypes_of(grid, plan), shipped_cells())
 
     def in_shipped_cells(self) -> np.ndarray:
-        """The rows, sorted anew where that was into other cells."""
+        """Return the rows, sorted into the shipped cells again if their version differs."""
         cells = shipped_cells()
         return self.rows if self.version == cells.version else self.of(Prototypes(self.rows, 0.0), cells).rows
 
 
 @dataclass(frozen=True)
 class PackedGrid:
-    """A grid as a blob, with the number of its poses, the digest of the blob, and perhaps its prototypes as another."""
+    """Grid as a blob, with its number of poses, the blob's digest, and optionally its prototypes as another blob."""
 
     poses: int
     content: bytes
@@ -65,7 +65,7 @@ class PackedGrid:
 
 
 def pack(grid: PoseGrid, prototypes: SortedPrototypes | None = None) -> PackedGrid:
-    """The blob of a grid."""
+    """Return the blob of a grid."""
     count, columns = grid.profile_m.shape
     latents = np.empty((count, 0)) if grid.latents is None else grid.latents
     magic, profiles = (_MAGIC_WITHOUT_LATENTS, "<f2") if grid.latents is None else (_MAGIC, "<f4")
@@ -81,13 +81,13 @@ def pack(grid: PoseGrid, prototypes: SortedPrototypes | None = None) -> PackedGr
 
 
 def pack_prototypes(prototypes: SortedPrototypes) -> bytes:
-    """The blob of a plan's prototypes."""
+    """Return the blob of a plan's prototypes."""
     rows = prototypes.rows
     return _PROTOTYPES_HEADER.pack(_PROTOTYPES_MAGIC, prototypes.version, len(rows)) + rows.tobytes()
 
 
 def unpack_prototypes(content: bytes) -> SortedPrototypes | None:
-    """The prototypes in a blob, as read-only views of it; None when it is none, or has numbers that are none."""
+    """Return the prototypes in a blob, as read-only views; None if the blob is damaged or has non-finite values."""
     if len(content) < _PROTOTYPES_HEADER.size:
         return None
     magic, version, count = _PROTOTYPES_HEADER.unpack_from(content)
@@ -100,12 +100,12 @@ def unpack_prototypes(content: bytes) -> SortedPrototypes | None:
 
 
 def digest_of(content: bytes | bytearray) -> str:
-    """The digest of a blob, as it is stored."""
+    """Return the SHA-256 of a blob in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
 def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float) -> PoseGrid | None:
-    """The grid in a blob, as read-only views of it; None when the blob is not one, or has numbers that are none."""
+    """Return the grid in a blob, as read-only views of it; None if the blob is damaged or has non-finite values."""
     if len(content) < _HEADER.size:
         return None
     magic, count, latent_size, columns = _HEADER.unpack_from(content)

@@ -1,4 +1,4 @@
-"""Requests that may be sent twice and are carried out once: the answer is kept under the caller's key."""
+"""Idempotency keys: a request that is sent twice is carried out once, and its stored answer is returned again."""
 
 from __future__ import annotations
 
@@ -14,27 +14,32 @@ from service.storage.records import Claim, Claimed, Conflict, InProgress, Stored
 from service.storage.tables import IDEMPOTENCY
 
 KEPT_FOR = timedelta(hours=24)
-# After a crash, callers wait for as long at least.
+# Minimum time (s) that callers wait after a crash.
 MIN_LEASE_S = 15.0
 _COLUMNS = IDEMPOTENCY.c
 
 
 class IdempotencyKeys:
-    """Answers by (tenant, route, key), for a day."""
+    """Answers by (tenant, route, key), kept for a day."""
 
     def __init__(self, database: Database, lease_s: float = MIN_LEASE_S) -> None:
-        """Args:
-        lease_s: how long a request may take; after that its owner counts as dead, and the next one takes over. An
-            owner that lives is overtaken under its own token: work is done twice, and nothing stored twice.
+        """Create the access to the table.
+
+        Args:
+            database: the database.
+            lease_s: time limit (s) of a request, after which the next attempt takes over. If the first one is still
+                alive,
+                both work under the same token: work is done twice, nothing is stored twice.
         """
         self._database = database
         self._lease_s = lease_s
 
     def begin(self, tenant: str, route: str, key: str, body_sha256: str) -> Claim:
-        """Say that a request is about to be carried out.
+        """Claim a request.
 
         Returns:
-            Claimed to whoever is to carry it out, and then calls `finish` or `abandon`; else why not to.
+            `Claimed` if the caller is to carry out the request and then call `finish` or `abandon`; else the reason
+            not to.
         """
         own = _where(tenant, route, key)
         token, now = uuid.uuid4().hex, datetime.now(UTC)
@@ -57,23 +62,23 @@ class IdempotencyKeys:
             return self._repeated(connection, own, body_sha256, until_s)
 
     def finish(self, tenant: str, route: str, key: str, token: str, answer: StoredAnswer) -> None:
-        """Keep the answer, unless one is kept already; whoever sends the same request again gets it."""
+        """Store the answer, unless one is stored already; later attempts get it."""
         values = {"status": answer.status, "headers": json.dumps(answer.headers), "body": answer.body}
         own = (*_where(tenant, route, key), _COLUMNS.token == token, _COLUMNS.status.is_(None))
         with self._database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).where(*own).values(**values))
 
     def abandon(self, tenant: str, route: str, key: str, token: str) -> None:
-        """Say that the request was not seen through; the next one is, at once and under the same token.
+        """Release a request that was not finished; the next attempt takes over at once, under the same token.
 
-        The token stays because something may have been stored under it, whatever its owner believes.
+        The token is kept, because the failed attempt may have stored something under it.
         """
         own = (*_where(tenant, route, key), _COLUMNS.token == token, _COLUMNS.status.is_(None))
         with self._database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).where(*own).values(lease_until_s=0.0))
 
     def purge(self) -> int:
-        """Drop what is older than a day; returns how many."""
+        """Delete keys older than a day, and return their number."""
         statement = delete(IDEMPOTENCY).where(_COLUMNS.created_at < datetime.now(UTC) - KEPT_FOR)
         with self._database.writing() as connection:
             return connection.execute(statement).rowcount
@@ -83,15 +88,15 @@ class IdempotencyKeys:
     ) -> Claim:
         row = connection.execute(select(IDEMPOTENCY).where(*own).with_for_update()).one_or_none()
         if row is None:
-            # Purged between two statements: as good as still in work, the caller tries again.
+            # Purged between two statements; the caller tries again.
             return InProgress()
         if row.body_sha256 != body_sha256:
             return Conflict()
         if row.status is not None:
             return StoredAnswer(row.status, json.loads(row.headers), row.body)
-        ran_out = ~self._database.is_live(_COLUMNS.lease_until_s, _COLUMNS.lease_s)
+        expired_lease = ~self._database.is_live(_COLUMNS.lease_until_s, _COLUMNS.lease_s)
         values = {"lease_until_s": until_s, "lease_s": self._lease_s}
-        taken = connection.execute(update(IDEMPOTENCY).where(*own, ran_out).values(**values))
+        taken = connection.execute(update(IDEMPOTENCY).where(*own, expired_lease).values(**values))
         return Claimed(row.token) if taken.rowcount == 1 else InProgress()
 
 

@@ -1,4 +1,4 @@
-"""Answers that are kept for a while, so that a link opens them again; never the panorama that they are about."""
+"""Answers that are kept for a while, so that a link opens them again; the panoramas are never stored."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ _COLUMNS = KEPT_ANSWERS.c
 
 
 class KeptAnswers:
-    """Answers by their ids; another tenant's answer is one that does not exist, and one of a deleted plan is gone."""
+    """Kept answers of all tenants, each visible to its own tenant; answers are deleted with their plan."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def add(self, tenant: str, plan_id: str, content_of: Callable[[str], str], *, limit: int) -> str | None:
-        """Keep an answer.
+        """Keep an answer, and delete the tenant's oldest ones beyond `limit`.
 
         Args:
-            content_of: gives the answer's text, in which its id stands.
-            limit: most answers of the tenant; the oldest make room.
+            tenant: owner of the answer.
+            plan_id: plan of the answer.
+            content_of: function from the answer's id to its text, which contains the id.
+            limit: maximum number of answers of the tenant.
 
         Returns:
-            its id; None where the plan is gone by now.
+            The answer's id; None if the plan was deleted meanwhile.
         """
         answer_id, now = uuid.uuid4().hex, datetime.now(UTC)
         own = _COLUMNS.tenant == tenant
         with self._database.writing() as connection:
-            # Held until the answer is stored: a plan that is deleted meanwhile takes it along.
+            # Locked until the answer is stored, so that deleting the plan deletes the answer too.
             plan = select(FLOORPLANS.c.id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             if connection.scalar(plan.with_for_update(read=True)) is None:
                 return None
@@ -46,20 +48,20 @@ class KeptAnswers:
         return answer_id
 
     def get(self, tenant: str, answer_id: str, *, kept_s: float) -> str | None:
-        """The text of an answer that is no older than `kept_s`; None where there is none."""
+        """Return the text of an answer that is no older than `kept_s` (s); None without one."""
         oldest = datetime.now(UTC) - timedelta(seconds=kept_s)
         wanted = (_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id, _COLUMNS.created_at >= oldest)
         with self._database.reading() as connection:
             return connection.scalar(select(_COLUMNS.content).where(*wanted))
 
     def delete(self, tenant: str, answer_id: str) -> bool:
-        """Forget an answer; false where there is none."""
+        """Delete an answer; False without one."""
         statement = delete(KEPT_ANSWERS).where(_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id)
         with self._database.writing() as connection:
             return connection.execute(statement).rowcount > 0
 
     def purge(self, *, kept_s: float) -> int:
-        """Drop what is older than `kept_s`; returns how many."""
+        """Delete answers older than `kept_s` (s), and return their number."""
         statement = delete(KEPT_ANSWERS).where(_COLUMNS.created_at < datetime.now(UTC) - timedelta(seconds=kept_s))
         with self._database.writing() as connection:
             return connection.execute(statement).rowcount

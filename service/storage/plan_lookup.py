@@ -1,4 +1,4 @@
-"""Plans as queries need them: as the database has them, and from memory while it is away or silent."""
+"""Plans for queries, from the database, or from memory while the database does not answer."""
 
 from __future__ import annotations
 
@@ -12,38 +12,46 @@ from service.threads import BoundedReads
 
 
 class PlanLookup:
-    """Finds plans for queries; safe to share between threads."""
+    """Lookup of plans for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
-        """Args:
-        max_age_s: how long after it was last read, or stored from here, a plan in memory counts as known.
+        """Create the lookup.
+
+        Args:
+            store: the store.
+            max_age_s: maximum age (s) of a plan in memory since it was last read or stored.
         """
         self._store = store
         self._max_age_s = max_age_s
         self._breaker = CircuitBreaker()
 
     def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """A plan at its current revision; while the database is away, at the one that it last had.
+        """Return a plan at its current revision, or at the last known one while the database is unavailable.
 
         Raises:
-            StoreUnavailableError: the database is away, and the plan was not read lately.
-            StoreBusyError: too many use it.
+            StoreUnavailableError: the database is unavailable, and the plan was not read recently.
+            StoreBusyError: all connections are in use.
         """
         if (known := self._during_outage(tenant, plan_id)) is not None:
             return known
         try:
             return self._store.plans.get(tenant, plan_id)
         except StoreBusyError:
-            # It is there, and the plan may be gone.
+            # The database answers, so the plan may have been deleted.
             raise
         except StoreUnavailableError as error:
             return self._despite(error, tenant, plan_id)
 
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
-        """As `get`, for whoever must not wait for a database that is silent instead of failing.
+        """Return a plan as `get` does, without blocking on a silent database.
 
         Args:
-            reads: where the database is asked.
+            tenant: owner of the plan.
+            plan_id: id of the plan.
+            reads: threads for reads of the database.
+
+        Raises:
+            StoreUnavailableError: see `get`; or too many reads wait already.
         """
         if (known := self._during_outage(tenant, plan_id)) is not None:
             return known
@@ -52,19 +60,19 @@ class PlanLookup:
             return await reads.run(self.get, tenant, plan_id)
         except StoreUnavailableError as error:
             if self._store.answered_since(begin_s):
-                # It is there, and the plan may be gone.
+                # The database answers, so the plan may have been deleted.
                 raise
             return self._despite(error, tenant, plan_id)
 
     def _during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
+        """Return a recently read plan from memory if the database failed a moment ago."""
         return self._recent(tenant, plan_id) if self._breaker.is_open else None
 
     def _despite(self, error: StoreUnavailableError, tenant: str, plan_id: str) -> PlanRecord:
-        """A plan that was read lately, as the database is away.
+        """Return a recently read plan, because the database failed.
 
         Raises:
-            StoreUnavailableError: it was not.
+            StoreUnavailableError: the plan was not read recently.
         """
         self._breaker.trip()
         if (known := self._recent(tenant, plan_id)) is None:

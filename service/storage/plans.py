@@ -1,4 +1,4 @@
-"""Floor plans with their revisions and originals; every call says whose plans it is about."""
+"""Floor plans with their revisions and originals. Every call names the tenant, except where noted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, RE
 from service.storage.venues import remove_from_venues
 from service.telemetry import LOGGER_NAME
 
-# Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
+# Advisory lock on PostgreSQL for exact numbers of plans; differs from the other locks.
 _COUNT_LOCK = 5_210_002
 
 
@@ -64,7 +64,7 @@ class PlanDocument:
 
 @dataclass(frozen=True)
 class _Content:
-    """What is stored of a revision besides its row, made before the transaction that stores it."""
+    """Stored content of a revision besides its columns, prepared before the transaction."""
 
     document: PlanDocument
     original: Original
@@ -79,18 +79,21 @@ class _Content:
 
 @dataclass(frozen=True)
 class _Found:
-    """A plan as the database has it, with the plan itself where it is in memory, else with its document."""
+    """Row of a plan, with the plan itself if it is in memory, else with its document."""
 
     row: Row[Any]
     plan: FloorPlan | PlanDocument
 
 
 class Plans:
-    """Plans of all tenants; another tenant's plan is one that does not exist."""
+    """Plans of all tenants; a plan of another tenant counts as missing."""
 
     def __init__(self, database: Database, cache: PlanCache) -> None:
-        """Args:
-        cache: is told of every plan that is read or stored at its current revision.
+        """Create the access to the tables.
+
+        Args:
+            database: the database.
+            cache: receives every plan that is read or stored at its current revision.
         """
         self._database = database
         self._cache = cache
@@ -105,16 +108,20 @@ class Plans:
         limit: int,
         grid: ComputedGrid | None = None,
     ) -> PlanRecord:
-        """Store a plan, the file it was uploaded as, and its grid if that is there already.
+        """Store a plan, its uploaded file, and its grid if it is computed already.
 
-        A plan that has the id already is the one: an upload that was stored, and whose answer got lost.
+        If the id exists already, a previous attempt of the upload was stored and its answer was lost.
 
         Args:
-            plan_id: a new one, or that of an upload that is repeated; never a caller's choice.
-            limit: most plans that the tenant may have.
+            tenant: owner of the plan.
+            plan_id: a new id, or that of a repeated upload; never chosen by a caller.
+            plan: the plan.
+            original: the uploaded file.
+            limit: maximum number of the tenant's plans.
+            grid: the plan's own grid.
 
         Raises:
-            TooManyFloorPlansError: there are `limit` already.
+            TooManyFloorPlansError: the tenant has `limit` plans already.
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
@@ -146,16 +153,22 @@ class Plans:
         expected: str | None = None,
         grid: ComputedGrid | None = None,
     ) -> PlanRecord:
-        """Store a plan anew under its id; the revisions before it stay readable, up to `keep` in all.
+        """Store a new revision of a plan, and delete revisions beyond `keep`.
 
-        Grids stay of the new revision and the one before it, which queries in work may still need.
+        Grids of the new and the previous revision are kept, because running queries may need them.
 
         Args:
-            expected: id of the revision that this one is to follow; None for any.
+            tenant: owner of the plan.
+            plan_id: id of the plan.
+            plan: the new plan.
+            original: the uploaded file.
+            keep: maximum number of revisions.
+            expected: id of the revision that the plan must have; None for any.
+            grid: the plan's own grid.
 
         Raises:
             UnknownFloorPlanError: the tenant has no such plan.
-            RevisionMismatchError: it has another revision than the one expected.
+            RevisionMismatchError: the plan has another revision.
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
@@ -179,7 +192,7 @@ class Plans:
         return record
 
     def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """A plan at its current revision."""
+        """Return a plan at its current revision."""
         record = self._get(_select_current(tenant, plan_id))
         if record is None:
             self._cache.forget(tenant, plan_id)
@@ -188,29 +201,29 @@ class Plans:
         return record
 
     def get_revision(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
-        """A plan at any revision that is kept."""
+        """Return a plan at any stored revision."""
         query = _select_heads(current=False).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         return self._get(query.where(REVISIONS.c.id == revision_id))
 
     def get_by_revision(self, revision_id: str) -> PlanRecord | None:
-        """A plan at some revision, whoever's it is: for work on grids, which knows no tenants."""
+        """Return a plan at a revision, regardless of tenant, for work on grids."""
         return self._get(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
 
     def has_revision(self, revision_id: str) -> bool:
-        """Whether there is a revision, whosever it is."""
+        """Tell whether a revision exists, regardless of tenant."""
         with self._database.reading() as connection:
             return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
 
     def summary(self, tenant: str, plan_id: str) -> PlanSummary | None:
-        """A plan at its current revision without its rooms, which may be damaged."""
+        """Return a plan at its current revision without its document, which may be damaged."""
         query = select_summaries().where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         return next(iter(self._summaries(query)), None)
 
     def original(self, tenant: str, plan_id: str) -> Original | None:
-        """The file that the current revision of a plan was uploaded as.
+        """Return the uploaded file of a plan's current revision.
 
         Raises:
-            DamagedDataError: what is stored are others.
+            DamagedDataError: the stored file has another digest.
         """
         query = (
             select(REVISIONS.c.id, REVISIONS.c.original_sha256, REVISIONS.c.original_media_type, REVISIONS.c.report)
@@ -229,27 +242,31 @@ class Plans:
     def list_plans(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[PlanSummary]:
-        """Plans, newest first.
+        """Return plans, newest first.
 
         Args:
-            after: the last plan of the page before.
-            name: only plans with this in their name, whatever the case of letters.
+            tenant: owner of the plans.
+            limit: maximum number of plans.
+            after: the last plan of the previous page.
+            name: part of the name, case-insensitive.
         """
         query = select_summaries().where(FLOORPLANS.c.tenant == tenant)
         return self._summaries(newest_first(query, FLOORPLANS, limit=limit, after=after, name=name))
 
     def summaries(self, plan_ids: Collection[str]) -> list[PlanSummary]:
-        """Those of some plans that there are, whoever's they are: for callers that were let at them before."""
+        """Return the plans that exist among `plan_ids`, regardless of tenant. Callers check access first."""
         return self._summaries(select_summaries().where(FLOORPLANS.c.id.in_(plan_ids)))
 
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
-        """Delete a plan with all its revisions, originals and grids, and take it out of its venues; False without one.
+        """Delete a plan with its revisions, originals and grids, and remove it from its venues; False without one.
 
         Args:
-            expected: id of the revision that it must have; None for any.
+            tenant: owner of the plan.
+            plan_id: id of the plan.
+            expected: id of the revision that the plan must have; None for any.
 
         Raises:
-            RevisionMismatchError: it has another one.
+            RevisionMismatchError: the plan has another revision.
         """
         own = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         with self._database.writing() as connection:
@@ -264,17 +281,17 @@ class Plans:
         return deleted
 
     def set_failure(self, revision_id: str, reason: str) -> None:
-        """Record why a revision's latent grid could not be computed."""
+        """Store the error of the computation of a revision's own grid."""
         with self._database.writing() as connection:
             connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
 
     def clear_failures(self) -> None:
-        """Forget all of them, so that those grids are tried again."""
+        """Delete all errors, so that these grids are tried again."""
         with self._database.writing() as connection:
             connection.execute(update(REVISIONS).where(REVISIONS.c.failure.is_not(None)).values(failure=None))
 
     def current_revisions(self, revision_ids: Collection[str]) -> set[str]:
-        """Those among some revisions that are the current ones of their plans."""
+        """Return the revisions among `revision_ids` that are the current ones of their plans."""
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
             return set(connection.scalars(query))
@@ -289,7 +306,7 @@ class Plans:
         return None if found is None else self._record(found)
 
     def _find(self, connection: Connection, query: Any) -> _Found | None:
-        """What there is of a plan; its document, which is long, only where the plan is not in memory."""
+        """Return a plan's row, with its document, which is long, only if the plan is not in memory."""
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
@@ -300,10 +317,10 @@ class Plans:
         return _Found(row, PlanDocument(**connection.execute(query).one()._mapping))
 
     def _record(self, found: _Found) -> PlanRecord:
-        """Read a plan; outside of transactions, as that takes a while.
+        """Parse a plan; outside of transactions, because it takes a while.
 
         Raises:
-            DamagedDataError: the document is not what was stored.
+            DamagedDataError: the document is damaged.
         """
         row, plan = found.row, found.plan
         if isinstance(plan, PlanDocument):
@@ -341,7 +358,7 @@ def _record(
 
 
 def _revision_values(record: PlanRecord) -> dict[str, Any]:
-    """What changes in the table of plans with a revision."""
+    """Return the columns of `floorplans` that change with a revision."""
     name = record.plan.name
     return {
         "name": name,
@@ -381,7 +398,7 @@ def _insert_revision(connection: Connection, record: PlanRecord, content: _Conte
 
 
 def _height_std_m(plan: FloorPlan) -> float | None:
-    """How far off the camera height of a plan may be; None where it is any."""
+    """Return the standard deviation (m) of a plan's camera height; None for an unknown height."""
     if plan.camera_height_std_m is not None:
         return plan.camera_height_std_m
     return DEFAULT_STD_M if plan.states_camera_height else None
@@ -392,7 +409,7 @@ def _select_current(tenant: str, plan_id: str) -> Any:
 
 
 def _select_heads(*, current: bool) -> Any:
-    """A query for the columns of `PlanRecord` but for the plan itself."""
+    """Return a query for the columns of `PlanRecord`, without the plan itself."""
     link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
     return select(
         FLOORPLANS.c.id,

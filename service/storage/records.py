@@ -1,4 +1,4 @@
-"""What the store takes and answers: plain values, no rows and no connections."""
+"""Values that the store takes and returns, without rows or connections."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.poses import PoseGrid
 from service.storage.grid_format import SortedPrototypes
 
-# Whose plans are whose without API keys.
+# Tenant of all callers without API keys.
 DEFAULT_TENANT = "default"
-# What earlier versions of the service stored was all of this type.
+# Media type of all files that earlier versions of the service stored.
 JSON = "application/json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridKey:
-    """Which latent grid: of one revision of a plan, for one model, grid step and camera height."""
+    """Key of a pose grid: plan revision, model, grid step and camera height."""
 
     revision_id: str
     model_sha256: str
@@ -33,14 +33,14 @@ class GridKey:
 
 @dataclass(frozen=True, kw_only=True)
 class ComputedGrid:
-    """A grid that is stored along with its plan; the revision it belongs to is only made then."""
+    """Pose grid that is stored along with its plan, before the revision has an id."""
 
     model_sha256: str
     grid: PoseGrid
     prototypes: SortedPrototypes | None = None
 
     def key(self, revision_id: str) -> GridKey:
-        """Its key, once the revision is known."""
+        """Return the grid's key for a revision."""
         return GridKey(
             revision_id=revision_id,
             model_sha256=self.model_sha256,
@@ -51,11 +51,12 @@ class ComputedGrid:
 
 @dataclass(frozen=True)
 class Original:
-    """The file that a revision of a plan was uploaded as.
+    """Uploaded file of a plan's revision.
 
     Attributes:
-        media_type: by its content.
-        report: what was told of reading it, as JSON text; None for plans of an earlier version of the service.
+        content: the file.
+        media_type: media type, detected from the content.
+        report: import report as JSON text; None for plans of an earlier version of the service.
     """
 
     content: bytes
@@ -65,16 +66,18 @@ class Original:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRecord:
-    """A stored floor plan at one of its revisions.
+    """Stored floor plan at one of its revisions.
 
     Attributes:
-        revision_id: names plan and revision; it never stands for anything else.
+        id: id of the plan.
+        tenant: owner of the plan.
+        revision_id: id of the revision, unique among all plans.
         revision: number of the revision, from 1.
-        created_at: when the plan was first stored.
-        updated_at: when the revision was.
-        failure: why its latent grid could not be computed last time, None when that did not happen.
-        report: what was told of reading the file that it was uploaded as, as JSON text; None for plans of an earlier
-            version of the service.
+        created_at: time when the plan was first stored.
+        updated_at: time when the revision was stored.
+        plan: the plan.
+        failure: error of the last computation of its pose grid, if it failed.
+        report: import report as JSON text; None for plans of an earlier version of the service.
     """
 
     id: str
@@ -90,7 +93,7 @@ class PlanRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSummary:
-    """A stored floor plan without its rooms; what `PlanRecord` says, and what listings need."""
+    """Stored floor plan without its rooms, for listings; attributes as of `PlanRecord`."""
 
     id: str
     revision_id: str
@@ -106,7 +109,7 @@ class PlanSummary:
 
 @dataclass(frozen=True)
 class VenueMember:
-    """A plan of a venue: its level, and what it is called there, None for the plan's own name."""
+    """Plan of a venue with its level, and its name there; None for the plan's own name."""
 
     plan_id: str
     level: float = 0.0
@@ -115,15 +118,18 @@ class VenueMember:
 
 @dataclass(frozen=True, kw_only=True)
 class VenueRecord:
-    """A stored venue.
+    """Stored venue.
 
     Attributes:
-        revision_id: changes with its name, its anchor and its plans.
-        anchor: of its plans that have none, which are then drawn in one frame.
+        id: id of the venue.
+        tenant: owner of the venue.
+        revision_id: id of the revision, which changes with name, anchor and plans.
         revision: number of the revision, from 1.
-        plans: how many it has.
-        created_at: when the venue was first stored.
-        updated_at: when the revision was.
+        name: name of the venue.
+        anchor: anchor of plans without their own, which then share one frame.
+        plans: number of plans.
+        created_at: time when the venue was first stored.
+        updated_at: time when the revision was stored.
     """
 
     id: str
@@ -139,7 +145,7 @@ class VenueRecord:
 
 @dataclass(frozen=True)
 class VenueCounts:
-    """How many plans a venue has, and how many of them can be asked about, or never will."""
+    """Numbers of a venue's plans: all, ready for queries, and failed."""
 
     plans: int
     ready: int
@@ -148,16 +154,18 @@ class VenueCounts:
 
 @dataclass(frozen=True)
 class VenueState:
-    """What changes whenever a query about a venue would be told something else of its plans.
+    """Fingerprint of the plans of a venue as queries see them.
 
-    Plans come and go with the venue's revision, and a plan that is replaced makes the sum of the revisions' numbers
-    greater; where nothing of that happened, grids can only have come or gone.
+    Plans come and go with the venue's revision, and replacing a plan increases the sum of revision numbers. With both
+    unchanged, grids can only have come or gone.
 
     Attributes:
-        revision_id: of the venue; None where there is no venue.
-        plans, ready, failed: how many there are.
-        revisions: the sum of the numbers of the plans' revisions.
-        grids: the sum of the ids of the grids of those that are ready.
+        revision_id: revision of the venue; None without a venue.
+        plans: number of plans.
+        ready: number of plans that are ready.
+        failed: number of plans that failed.
+        revisions: sum of the numbers of the plans' revisions.
+        grids: sum of the ids of the grids of plans that are ready.
     """
 
     revision_id: str | None
@@ -170,7 +178,7 @@ class VenueState:
 
 @dataclass(frozen=True)
 class VenuePlace:
-    """A place in the list of a venue's plans: after this one."""
+    """Position in the list of a venue's plans, after this plan."""
 
     level: float
     plan_id: str
@@ -178,7 +186,7 @@ class VenuePlace:
 
 @dataclass(frozen=True)
 class Cursor:
-    """A place in a listing: after this plan."""
+    """Position in a listing, after this plan or venue."""
 
     created_at: datetime
     id: str
@@ -186,11 +194,17 @@ class Cursor:
 
 @dataclass(frozen=True, kw_only=True)
 class ApiKey:
-    """An API key; what the caller presents is not stored, only its hash.
+    """API key, without its secret, of which only a hash is stored.
 
     Attributes:
-        scopes: what it is good for.
-        rate_per_minute: requests that it may send; 0 for any number, None for as many as the settings say.
+        id: id of the key.
+        tenant: tenant of its callers.
+        name: name of the key.
+        scopes: permissions of the key.
+        rate_per_minute: limit of requests per minute; 0 for none, None for the limit in the settings.
+        created_at: time of creation.
+        revoked_at: time of revocation.
+        last_used_at: approximate time of the last request.
     """
 
     id: str
@@ -205,7 +219,7 @@ class ApiKey:
 
 @dataclass(frozen=True)
 class StoredAnswer:
-    """What a request with an idempotency key was answered with."""
+    """Stored answer to a request with an idempotency key."""
 
     status: int
     headers: dict[str, str]
@@ -214,11 +228,11 @@ class StoredAnswer:
 
 @dataclass(frozen=True)
 class Claimed:
-    """The request is to be carried out.
+    """The caller carries out the request.
 
     Attributes:
-        token: 32 hexadecimal digits that stay the same when the request is taken over from an attempt that failed or
-            whose process died half-way: what is made under this id is made once.
+        token: 32 hexadecimal digits, the same for every attempt of the request, so that an object that is stored under
+            this id is stored once.
     """
 
     token: str
@@ -231,12 +245,12 @@ class Conflict:
 
 @dataclass(frozen=True)
 class InProgress:
-    """The same request is being carried out at this moment."""
+    """Another attempt is carrying out the request."""
 
 
 Claim = StoredAnswer | Claimed | Conflict | InProgress
 
 
 def millimetres(height_m: float) -> int:
-    """A height (m) in whole millimetres, as keys have it."""
+    """Return a height (m) in whole millimetres, as in grid keys."""
     return round(height_m * 1000.0)

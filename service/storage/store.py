@@ -1,4 +1,4 @@
-"""The store: one object per group of tables, over one database."""
+"""Store: one object per group of tables over one database, and the migrations that run when it opens."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _MIGRATION_LOCK = 5_210_001
 
 
 class Store:
-    """Everything that persists; safe to share between threads and between processes.
+    """All stored data; safe to share between threads and between processes.
 
-    Every call of its parts may raise StoreUnavailableError; the next one connects again by itself.
+    Every call of its parts can raise `StoreUnavailableError`; the next call reconnects.
 
     Attributes:
         plans: floor plans with revisions and originals.
-        plan_cache: of these, those in memory.
-        venues: which of them belong together.
-        grids: their latent grids.
-        leases: who computes which grid.
-        idempotency_keys: answers to requests that may be sent twice.
+        plan_cache: plans in memory.
+        venues: venues.
+        grids: pose grids.
+        leases: leases on the computation of grids.
+        idempotency_keys: answers by idempotency key.
         keys: API keys.
-        answers: answers that are kept for a while.
+        answers: kept answers.
     """
 
     def __init__(
@@ -54,22 +54,23 @@ class Store:
         claim_s: float = MIN_LEASE_S,
         plan_cache_bytes: int = 64 * 2**20,
     ) -> None:
-        """Connect, and bring the schema up to date.
+        """Connect, and migrate the schema.
 
         Args:
-            connections: most connections that are open at a time.
-            wait_s: longest wait for one of them.
-            claim_s: longest that a request with an idempotency key may take.
-            plan_cache_bytes: about how much memory parsed plans may take; 0: none is kept.
+            url: URL of the database.
+            connections: maximum number of open connections.
+            wait_s: time limit (s) of waiting for a free connection.
+            claim_s: time limit (s) of a request with an idempotency key.
+            plan_cache_bytes: approximate memory limit of parsed plans; 0 keeps none.
 
         Raises:
-            ConfigError: not a usable database URL, or the database cannot be opened.
+            ConfigError: the URL is invalid, or the database cannot be opened.
         """
         try:
             database = Database(url, connections=connections, wait_s=wait_s)
             _migrate(database)
         except (ArgumentError, CommandError, RevisionError, ImportError, OSError, SQLAlchemyError) as error:
-            raise ConfigError(f"cannot open the database: {error}") from error
+            raise ConfigError(f"cannot open the database (LALALOC_DATABASE_URL): {error}") from error
         self._database = database
         self.plan_cache = PlanCache(plan_cache_bytes)
         self.plans = Plans(database, self.plan_cache)
@@ -81,16 +82,16 @@ class Store:
         self.answers = KeptAnswers(database)
 
     def answered_since(self, moment_s: float) -> bool:
-        """Whether the database answered anybody after a moment (`monotonic`); who waits since then finds it busy."""
+        """Tell whether the database completed a transaction after a moment (`monotonic`)."""
         return self._database.answered_since(moment_s)
 
     def close(self) -> None:
-        """Give all connections back."""
+        """Close all connections."""
         self._database.close()
 
 
 def open_store(settings: Settings) -> Store:
-    """Open the database that the settings name; the data folder of SQLite is made when it is missing.
+    """Open the database of the settings; the data folder of SQLite is created if it is missing.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
@@ -104,7 +105,7 @@ def open_store(settings: Settings) -> Store:
         settings.database_url,
         connections=settings.database.connections,
         wait_s=settings.database.wait_s,
-        # A query that is computed still must not be computed once more.
+        # Longer than a query, so that a running query is not started again.
         claim_s=max(MIN_LEASE_S, settings.requests.request_deadline_s + _CLAIM_MARGIN_S),
         plan_cache_bytes=settings.storage.plan_cache_bytes,
     )

@@ -1,4 +1,4 @@
-"""Latent grids and the leases of those that compute them."""
+"""Pose grids, and the leases of the replicas that compute them."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from service.storage.statements import (
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
 from service.telemetry import LOGGER_NAME
 
-# Grids in one statement.
+# Grids per statement.
 _BATCH_SIZE = 1000
 
 
 class StoredGrids:
-    """Grids, whole or not at all."""
+    """Stored pose grids; a grid is stored completely or not at all."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def get(self, key: GridKey) -> PoseGrid | None:
-        """A grid, None when it is not stored (or not as it was computed, then it has to be computed again)."""
+        """Return a grid; None if it is not stored, or damaged and to be computed again."""
         columns = LATENT_GRIDS.c
         with self._database.reading() as connection:
             query = select(columns.id, columns.size_bytes, columns.sha256).where(
@@ -62,7 +62,7 @@ class StoredGrids:
         return grid
 
     def prototypes(self, grid_ids: Sequence[int]) -> dict[int, SortedPrototypes]:
-        """Prototypes of stored grids by the grids' ids, those that there are."""
+        """Return the stored prototypes by the ids of their grids."""
         found: dict[int, SortedPrototypes] = {}
         columns = LATENT_GRIDS.c
         for first in range(0, len(grid_ids), _BATCH_SIZE):
@@ -85,7 +85,7 @@ class StoredGrids:
     def poses(
         self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None
     ) -> dict[tuple[str, int], int]:
-        """Poses of the stored grids of a model, by revision and camera height (mm); of all revisions, or some."""
+        """Return numbers of poses of a model's grids by (revision, camera height in mm), of all revisions or some."""
         columns = LATENT_GRIDS.c
         query = select(columns.revision_id, columns.camera_height_mm, columns.poses).where(
             columns.model_sha256 == model_sha256, columns.step_m == step_m, is_complete_grid()
@@ -104,21 +104,25 @@ class StoredGrids:
         always_keep_mm: int,
         prototypes: SortedPrototypes | None = None,
     ) -> bool:
-        """Store a grid, drop the oldest of its revision beyond `keep`, and end the lease on it.
+        """Store a grid, delete the oldest of its revision beyond `keep`, and end its lease.
 
-        Grids for one other model or grid step stay, the latest: while a model is replaced, replicas with the old one
-        and with the new one serve the same plans, and must not take each other's grids away.
+        The latest grids for one other model or grid step are kept: while a model is replaced, replicas with the old
+            and the
+        new one serve the same plans.
 
         Args:
-            always_keep_mm: the camera height (mm) that is never dropped to make room.
-            prototypes: those of the plan; None leaves them to whoever asks for them first.
+            key: key of the grid.
+            grid: the grid.
+            keep: maximum number of grids of the revision.
+            always_keep_mm: camera height (mm) of the grid that is never deleted.
+            prototypes: prototypes of the plan; None if they are made on demand.
 
         Returns:
-            False when the revision is gone, then nothing is stored.
+            False if the revision was deleted; the grid is then not stored.
         """
         packed = pack(grid, prototypes)
         with self._database.writing() as connection:
-            # Whoever stores grids of one revision takes turns.
+            # Replicas that store grids of one revision take turns.
             lock = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id).with_for_update(key_share=True)
             if connection.scalar(lock) is None:
                 return False
@@ -130,7 +134,7 @@ class StoredGrids:
         return True
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
-        """Plans, oldest first, whose own grid is neither stored, nor computed by anyone, nor failed before."""
+        """Return plans, oldest first, without an own grid, a live lease on it, or a failure."""
         leased = (
             GRID_LEASES.c.revision_id == REVISIONS.c.id,
             GRID_LEASES.c.model_sha256 == model_sha256,
@@ -144,24 +148,24 @@ class StoredGrids:
             return [PlanSummary(**row._mapping) for row in connection.execute(query)]
 
     def count_unprepared(self, model_sha256: str, step_m: float) -> int:
-        """How many plans have no grid of their own yet, computed by anyone or not, and did not fail."""
+        """Return the number of plans without an own grid or a failure."""
         query = select_summaries().where(*_unprepared(model_sha256, step_m))
         with self._database.reading() as connection:
             return connection.scalar(select(func.count()).select_from(query.subquery())) or 0
 
 
 class GridLeases:
-    """Who computes which grid. A lease that is not renewed runs out; one of a revision that is gone is gone as well."""
+    """Leases on the computation of grids; a lease expires unless it is renewed, and is deleted with its revision."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def claim(self, key: GridKey, owner: str, lease_s: float) -> int | None:
-        """Take the lease on a grid, if nobody has it or it has run out.
+        """Take the lease on a grid if it is free or has expired.
 
         Returns:
-            how often the lease was taken, this time included, since somebody finished the grid or gave the lease back;
-            None when another owner has it, or the revision is gone.
+            The number of claims, this one included, since the grid was finished or the lease released; None if another
+            owner holds the lease, or the revision was deleted.
         """
         columns = GRID_LEASES.c
         until_s = self._database.now_s() + lease_s
@@ -179,7 +183,7 @@ class GridLeases:
             return None
 
     def renew(self, key: GridKey, owner: str, lease_s: float, progress: float) -> bool:
-        """Keep a lease and say how far the grid is; False when it is no longer the owner's, or the revision is gone."""
+        """Renew a lease and store the progress; False if the owner lost it, or the revision was deleted."""
         statement = (
             update(GRID_LEASES)
             .where(*_where(GRID_LEASES, key), GRID_LEASES.c.owner == owner)
@@ -189,12 +193,12 @@ class GridLeases:
             return connection.execute(statement).rowcount == 1
 
     def release(self, key: GridKey, owner: str) -> None:
-        """Give a lease back without having finished."""
+        """Release a lease without a finished grid."""
         with self._database.writing() as connection:
             connection.execute(delete(GRID_LEASES).where(*_where(GRID_LEASES, key), GRID_LEASES.c.owner == owner))
 
     def progress(self, model_sha256: str, step_m: float, revision_ids: Sequence[str]) -> dict[tuple[str, int], float]:
-        """Share computed of the grids under live leases, by revision and camera height (mm)."""
+        """Return the progress of grids under live leases by (revision, camera height in mm)."""
         columns = GRID_LEASES.c
         query = select(columns.revision_id, columns.camera_height_mm, columns.progress).where(
             columns.model_sha256 == model_sha256,
@@ -207,7 +211,7 @@ class GridLeases:
 
 
 def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> None:
-    """Write a packed grid within a transaction."""
+    """Insert a packed grid within a transaction."""
     values = {
         **_columns(key),
         "poses": packed.poses,
@@ -235,12 +239,12 @@ def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
 def _drop_older_models(connection: Connection, key: GridKey) -> None:
     columns = LATENT_GRIDS.c
     own = columns.revision_id == key.revision_id
-    of_key = and_(columns.model_sha256 == key.model_sha256, columns.step_m == key.step_m)
-    query = select(columns.model_sha256, columns.step_m).where(own, ~of_key).order_by(columns.id.desc()).limit(1)
+    same_model = and_(columns.model_sha256 == key.model_sha256, columns.step_m == key.step_m)
+    query = select(columns.model_sha256, columns.step_m).where(own, ~same_model).order_by(columns.id.desc()).limit(1)
     latest = connection.execute(query).one_or_none()
     if latest is not None:
-        of_latest = and_(columns.model_sha256 == latest.model_sha256, columns.step_m == latest.step_m)
-        connection.execute(delete(LATENT_GRIDS).where(own, ~of_key, ~of_latest))
+        latest_model = and_(columns.model_sha256 == latest.model_sha256, columns.step_m == latest.step_m)
+        connection.execute(delete(LATENT_GRIDS).where(own, ~same_model, ~latest_model))
 
 
 def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_mm: int) -> None:
@@ -253,7 +257,7 @@ def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_m
         columns.step_m == key.step_m,
         columns.camera_height_mm != always_keep_mm,
     )
-    # Two are not among them: the plan's own, and the one that is about to be stored.
+    # Two grids are not among them: the plan's own, and the one about to be stored.
     surplus = connection.scalars(on_demand.order_by(columns.id.desc()).offset(max(keep - 2, 0))).all()
     connection.execute(delete(LATENT_GRIDS).where(columns.id.in_(surplus)))
 

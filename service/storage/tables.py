@@ -1,4 +1,4 @@
-"""The tables as they are now; `migrations` says how they came to be, and a test compares the two."""
+"""Current schema of the tables; `migrations` creates it, and a test compares the two."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ METADATA = MetaData()
 
 
 class UtcDateTime(TypeDecorator[datetime]):
-    """A time in UTC. SQLite forgets the time zone, PostgreSQL may answer in another one."""
+    """Time in UTC; SQLite drops the time zone, and PostgreSQL can return another one."""
 
     impl = DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """To the database."""
+        """Convert a time for the database."""
         return None if value is None else value.astimezone(UTC)
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """From the database."""
+        """Convert a time from the database."""
         if value is None:
             return None
         return value.astimezone(UTC) if value.tzinfo else value.replace(tzinfo=UTC)
@@ -52,17 +52,17 @@ FLOORPLANS = Table(
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
     Column("name", Text, nullable=False),
-    # The name as it is searched: without the case of its letters, which databases fold in different ways.
+    # Case-folded name for searches, because databases fold cases differently.
     Column("folded_name", Text, nullable=False),
-    # The current revision; no foreign key, as revisions already refer to their plan.
+    # Current revision; no foreign key, because revisions already refer to their plan.
     Column("revision_id", String(32), nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("updated_at", UtcDateTime, nullable=False),
-    # The circle around the plan, in its own frame; nothing where an earlier version stored what cannot be read now.
+    # Circle around the plan, in its own frame; NULL if an earlier version stored a plan that cannot be read.
     Column("centre_x_m", Double),
     Column("centre_y_m", Double),
     Column("reach_m", Double),
-    # Its centre on Earth; nothing for a plan without an anchor.
+    # Centre of the circle on Earth; NULL for a plan without an anchor.
     Column("latitude", Double),
     Column("longitude", Double),
     Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
@@ -78,17 +78,17 @@ REVISIONS = Table(
     Column("number", Integer, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("document", Text, nullable=False),
-    # Nothing where an earlier version of the service stored the plan.
+    # NULL in rows of earlier versions of the service.
     Column("document_sha256", String(64)),
     Column("warnings", Text),
     Column("original_sha256", String(64), nullable=False),
-    # Nothing where an earlier version of the service stored the plan: JSON in the native format, without a report.
+    # NULL in rows of earlier versions of the service: JSON in the native format, without a report.
     Column("original_media_type", String(64)),
     Column("report", Text),
     Column("room_count", Integer, nullable=False),
     Column("area_m2", Double, nullable=False),
     Column("camera_height_m", Double, nullable=False),
-    # Nothing where cameras may stand at any height, or an earlier version of the service stored the plan.
+    # NULL for an unknown camera height, and in rows of earlier versions of the service.
     Column("camera_height_std_m", Double),
     Column("failure", Text),
     UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
@@ -112,9 +112,9 @@ LATENT_GRIDS = Table(
     Column("camera_height_mm", Integer, nullable=False),
     Column("poses", Integer, nullable=False),
     Column("size_bytes", Integer, nullable=False),
-    # Nothing where an earlier version of the service stored it, beside this one: then it does not count as stored.
+    # NULL in rows of earlier versions of the service, which do not count as stored.
     Column("sha256", String(64)),
-    # What the first look at a venue goes by; nothing where an earlier version stored the grid.
+    # Input of the choice among a venue's plans; NULL in rows of earlier versions of the service.
     Column("prototypes", LargeBinary),
     UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
@@ -135,12 +135,12 @@ GRID_LEASES = Table(
     Column("step_m", Double, primary_key=True),
     Column("camera_height_mm", Integer, primary_key=True, autoincrement=False),
     Column("owner", String(32), nullable=False),
-    # Seconds since 1970 by the clock that all owners share, see `Database.now_s`.
+    # Seconds since 1970 by `Database.now_s`, the clock that all owners share.
     Column("lease_until_s", Double, nullable=False),
-    # Nothing where an earlier version of the service took it, beside this one.
+    # NULL in rows of earlier versions of the service.
     Column("length_s", Double),
     Column("progress", Double, nullable=False),
-    # How often the grid was begun, since it was last finished or given up.
+    # Number of attempts since the grid was last finished or abandoned.
     Column("attempts", Integer, nullable=False, server_default="1"),
 )
 
@@ -150,11 +150,11 @@ VENUES = Table(
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
     Column("name", Text, nullable=False),
-    # As of floor plans.
+    # As in `floorplans`.
     Column("folded_name", Text, nullable=False),
     Column("revision_id", String(32), nullable=False),
     Column("number", Integer, nullable=False),
-    # The anchor, all of it or nothing but for the altitude.
+    # Anchor; all columns are NULL without one, and `altitude_m` is optional.
     Column("latitude", Double),
     Column("longitude", Double),
     Column("altitude_m", Double),
@@ -170,7 +170,7 @@ VENUE_PLANS = Table(
     Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
     Column("level", Double, nullable=False),
-    # Nothing where the plan is called by its own name.
+    # NULL for the plan's own name.
     Column("name", Text),
     Index("venue_plans_by_plan", "plan_id"),
     Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
@@ -212,7 +212,7 @@ IDEMPOTENCY = Table(
     Column("body_sha256", String(64), nullable=False),
     Column("token", String(32), nullable=False),
     Column("lease_until_s", Double, nullable=False),
-    # Nothing where an earlier version of the service took it.
+    # NULL in rows of earlier versions of the service.
     Column("lease_s", Double),
     Column("created_at", UtcDateTime, nullable=False),
     Column("status", Integer),

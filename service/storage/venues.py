@@ -1,7 +1,7 @@
-"""Venues: which floor plans belong together, on which levels; every call says whose venues it is about.
+"""Venues: sets of floor plans with their levels. Every call names the tenant, except where noted.
 
-A venue has one revision at a time, which changes with its name, its anchor and its plans, also where a plan leaves it
-by being deleted. Plans that get new revisions stay in it as they are.
+The revision of a venue changes with its name, its anchor and its plans, also when one of its plans is deleted. It does
+not change when a plan of it gets a new revision.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from service.storage.records import (
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
 
-# Whoever makes venues takes turns on PostgreSQL, so that their number is exact; differs from the other locks.
+# Advisory lock on PostgreSQL for exact numbers of venues; differs from the other locks.
 _COUNT_LOCK = 5_210_003
-# Ids in one statement.
+# Ids per statement.
 _BATCH_SIZE = 1000
-# Ids in one refusal.
+# Ids listed in an error message.
 _NAMED = 5
-# What a query needs to know of a plan, but for its level and its name.
+# Columns of a plan that a query needs, besides level and name.
 _SEARCH_COLUMNS = (
     FLOORPLANS.c.id.label("plan_id"),
     FLOORPLANS.c.revision_id,
@@ -68,7 +68,7 @@ _SEARCH_COLUMNS = (
 
 
 class Venues:
-    """Venues of all tenants; another tenant's venue is one that does not exist."""
+    """Venues of all tenants; a venue of another tenant counts as missing."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -83,14 +83,19 @@ class Venues:
         *,
         limit: int,
     ) -> VenueRecord:
-        """Store a venue; one that has the id already is the one, whose answer got lost.
+        """Store a venue; if the id exists already, its first request was stored and the answer was lost.
 
         Args:
-            limit: most venues that the tenant may have.
+            tenant: owner of the venue.
+            venue_id: id of the venue.
+            name: name of the venue.
+            anchor: anchor of the venue.
+            members: plans of the venue.
+            limit: maximum number of the tenant's venues.
 
         Raises:
-            TooManyVenuesError: there are `limit` already.
-            InvalidRequestError: the tenant has not all of the plans.
+            TooManyVenuesError: the tenant has `limit` venues already.
+            InvalidRequestError: a plan is not the tenant's.
         """
         now = datetime.now(UTC)
         with self._database.writing() as connection:
@@ -102,7 +107,7 @@ class Venues:
                     raise TooManyVenuesError(limit)
                 _check_plans(connection, tenant, [member.plan_id for member in members])
                 values = {"id": venue_id, "tenant": tenant, "number": 1, "created_at": now}
-                connection.execute(VENUES.insert(), values | _head(name, anchor, now))
+                connection.execute(VENUES.insert(), values | _revision_values(name, anchor, now))
                 _insert(connection, venue_id, members)
                 stored = _find(connection, tenant, venue_id)
         assert stored is not None
@@ -122,25 +127,29 @@ class Venues:
         max_plans: int,
         expected: str | None = None,
     ) -> VenueRecord:
-        """Give a venue another revision.
+        """Store a new revision of a venue.
 
         Args:
-            name, anchor: None leaves them as they are.
-            drop_anchor: from now on it has none.
-            members: plans that come in, or change their level or name.
-            removed: ids of plans that leave it.
-            replace_members: `members` are all that it has.
-            max_plans: most plans that it may have.
-            expected: id of the revision that it must have; None for any.
+            tenant: owner of the venue.
+            venue_id: id of the venue.
+            name: new name; None keeps the old one.
+            anchor: new anchor; None keeps the old one.
+            drop_anchor: remove the anchor.
+            members: plans that are added, or change level or name.
+            removed: ids of plans that are removed.
+            replace_members: `members` replace all plans.
+            max_plans: maximum number of plans.
+            expected: id of the revision that the venue must have; None for any.
 
         Raises:
             UnknownVenueError: the tenant has no such venue.
-            RevisionMismatchError: it has another revision.
-            InvalidRequestError: the tenant has not all of `members`, `removed` are not all in it, or it has too many.
+            RevisionMismatchError: the venue has another revision.
+            InvalidRequestError: a plan of `members` is not the tenant's, one of `removed` is not in the venue, or the
+                venue has too many plans.
         """
         now = datetime.now(UTC)
         with self._database.writing() as connection:
-            # Plans before their venues, as where a plan is deleted: otherwise the two could wait for each other.
+            # Plans are locked before venues, as in the deletion of a plan, to avoid a deadlock.
             _check_plans(connection, tenant, [member.plan_id for member in members])
             row = _locked(connection, tenant, venue_id, expected)
             if replace_members:
@@ -150,17 +159,17 @@ class Venues:
             _insert(connection, venue_id, members)
             count = _count(connection, venue_id)
             if count > max_plans:
-                fault = f"the venue would have {count} plans, at most {max_plans} are allowed (max_venue_plans)"
+                fault = f"the venue would have {count} plans; the limit is {max_plans} (LALALOC_MAX_VENUE_PLANS)"
                 raise InvalidRequestError([("plans", fault)])
             kept = None if drop_anchor else _record(row).anchor if anchor is None else anchor
-            values = _head(row.name if name is None else name, kept, now) | {"number": row.number + 1}
+            values = _revision_values(row.name if name is None else name, kept, now) | {"number": row.number + 1}
             connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
             found = _find(connection, tenant, venue_id)
         assert found is not None
         return _record(found)
 
     def get(self, tenant: str, venue_id: str) -> VenueRecord | None:
-        """A venue."""
+        """Return a venue."""
         with self._database.reading() as connection:
             row = _find(connection, tenant, venue_id)
         return None if row is None else _record(row)
@@ -168,11 +177,13 @@ class Venues:
     def list_venues(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[VenueRecord]:
-        """Venues, newest first.
+        """Return venues, newest first.
 
         Args:
-            after: the last venue of the page before.
-            name: only venues with this in their name, whatever the case of letters.
+            tenant: owner of the venues.
+            limit: maximum number of venues.
+            after: the last venue of the previous page.
+            name: part of the name, case-insensitive.
         """
         page = newest_first(_select(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
         with self._database.reading() as connection:
@@ -181,11 +192,13 @@ class Venues:
     def plans(
         self, venue_id: str, *, limit: int, after: VenuePlace | None = None, level: float | None = None
     ) -> list[VenueMember]:
-        """Plans of a venue by level, for callers that were let at it before.
+        """Return the plans of a venue by level, regardless of tenant. Callers check access first.
 
         Args:
-            after: the last one of the page before.
-            level: only plans of this one.
+            venue_id: id of the venue.
+            limit: maximum number of plans.
+            after: the last plan of the previous page.
+            level: level of the plans; None for all.
         """
         own_level, plan_id = VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id
         query = select(plan_id, own_level, VENUE_PLANS.c.name).where(VENUE_PLANS.c.venue_id == venue_id)
@@ -198,7 +211,7 @@ class Venues:
             return [VenueMember(**row._mapping) for row in rows]
 
     def counts(self, venue_id: str, model_sha256: str, step_m: float) -> VenueCounts:
-        """How many plans of a venue can be asked about, for a model and a grid step."""
+        """Return the numbers of a venue's plans, for a model and a grid step."""
         plan, grid, failure = VENUE_PLANS.c.plan_id, LATENT_GRIDS.c.id, REVISIONS.c.failure
         ready = case((grid.is_not(None), plan))
         failed = case((and_(grid.is_(None), failure.is_not(None)), plan))
@@ -208,7 +221,7 @@ class Venues:
             return VenueCounts(*connection.execute(query).one())
 
     def state(self, venue_id: str, model_sha256: str, step_m: float) -> VenueState:
-        """What tells whether `searched` would answer as it did: a look at indices, without the rows themselves."""
+        """Return the fingerprint of `searchable_plans`, from indices only."""
         grid, own_revision = LATENT_GRIDS.c.id, VENUES.c.revision_id
         failed = case((and_(grid.is_(None), REVISIONS.c.failure.is_not(None)), 1))
         sums = (func.coalesce(func.sum(summed), 0) for summed in (REVISIONS.c.number, grid))
@@ -217,16 +230,16 @@ class Venues:
         with self._database.reading() as connection:
             revision_id = connection.scalar(select(own_revision).where(VENUES.c.id == venue_id))
             counted = connection.execute(query).one()
-        # PostgreSQL sums up to decimals.
+        # PostgreSQL returns sums as decimals.
         return VenueState(revision_id, *map(int, counted))
 
     def searchable_plans(self, venue_id: str, model_sha256: str, step_m: float) -> Sequence[Row[Any]]:
-        """What a query needs to know of every plan of a venue.
+        """Return a row for every plan of a venue, regardless of tenant. Callers check access first.
 
         Returns:
-            rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`,
-            `area_m2`, of where the plan lies (`plan_places`), and of the plan's own grid `grid_id`,
-            `grid_sha256` and `poses`, None where it is not stored.
+            Rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`,
+            `area_m2`, the columns of `plan_places`, and `grid_id`, `grid_sha256` and `poses` of the plan's own grid,
+            None without it.
         """
         name = func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name")
         columns = (VENUE_PLANS.c.level, name, *_SEARCH_COLUMNS)
@@ -237,7 +250,7 @@ class Venues:
     def searchable_plans_near(
         self, tenant: str, latitude: float, longitude: float, within_m: float, model_sha256: str, step_m: float
     ) -> Sequence[Row[Any]]:
-        """As `searched`, of the plans of a tenant that may lie so near a place; all are on level 0."""
+        """Return rows as `searchable_plans` does, of a tenant's plans near a place and some more, on level 0."""
         columns = (literal(0.0).label("level"), FLOORPLANS.c.name, *_SEARCH_COLUMNS)
         near = lies_in_box(latitude, longitude, within_m)
         query = _with_grids(select(*columns), FLOORPLANS, model_sha256, step_m)
@@ -245,10 +258,10 @@ class Venues:
             return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
 
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
-        """Delete a venue, and none of its plans; False when there was none.
+        """Delete a venue, but none of its plans; False without one.
 
         Raises:
-            RevisionMismatchError: it has another revision than `expected`.
+            RevisionMismatchError: the venue has another revision than `expected`.
         """
         with self._database.writing() as connection:
             try:
@@ -259,7 +272,7 @@ class Venues:
 
 
 def remove_from_venues(connection: Connection, plan_id: str) -> None:
-    """Before a plan is deleted, in the same transaction: every venue that has it gets a revision without it."""
+    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it."""
     own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
     venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
     ids = connection.scalars(venues).all()
@@ -270,8 +283,8 @@ def remove_from_venues(connection: Connection, plan_id: str) -> None:
         connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
 
 
-def _head(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
-    """What changes of a venue with a revision."""
+def _revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
+    """Return the columns that change with a venue's revision."""
     return {
         "name": name,
         "folded_name": name.casefold(),
@@ -312,7 +325,7 @@ def _record(row: Row[Any]) -> VenueRecord:
 
 
 def _locked(connection: Connection, tenant: str, venue_id: str, expected: str | None) -> Row[Any]:
-    """A venue that nobody else changes until the transaction ends."""
+    """Return a venue's row, locked until the transaction ends."""
     query = select(VENUES).where(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)
     row = connection.execute(query.with_for_update()).one_or_none()
     if row is None:
@@ -323,10 +336,10 @@ def _locked(connection: Connection, tenant: str, venue_id: str, expected: str | 
 
 
 def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -> None:
-    """Keep the plans of a tenant from being deleted until the transaction ends.
+    """Lock the plans of a tenant against deletion until the transaction ends.
 
     Raises:
-        InvalidRequestError: not all of them are there.
+        InvalidRequestError: a plan is not the tenant's.
     """
     found: set[str] = set()
     own = FLOORPLANS.c.tenant == tenant
@@ -340,7 +353,8 @@ def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -
 def _insert(connection: Connection, venue_id: str, members: Sequence[VenueMember]) -> None:
     if members:
         values = [
-            {"venue_id": venue_id, "plan_id": one.plan_id, "level": one.level, "name": one.name} for one in members
+            {"venue_id": venue_id, "plan_id": member.plan_id, "level": member.level, "name": member.name}
+            for member in members
         ]
         connection.execute(VENUE_PLANS.insert(), values)
 
@@ -366,14 +380,14 @@ def _in_venue(query: Any, venue_id: str, model_sha256: str, step_m: float) -> An
 
 
 def _with_grids(query: Any, plans: FromClause, model_sha256: str, step_m: float) -> Any:
-    """Plans joined with their current revision, and with their own grids where those are."""
+    """Return a query about plans, joined with their current revision and, if stored, their own grid."""
     joined = plans.join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id)
     return query.select_from(joined.outerjoin(LATENT_GRIDS, is_own_grid(model_sha256, step_m)))
 
 
 def _named(ids: Sequence[str]) -> str:
     more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
-    return ", ".join(f"'{one[:64]}'" for one in ids[:_NAMED]) + more
+    return ", ".join(f"'{plan_id[:64]}'" for plan_id in ids[:_NAMED]) + more
 
 
 def _parts(ids: Sequence[str]) -> Iterable[Sequence[str]]:

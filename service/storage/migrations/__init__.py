@@ -1,4 +1,4 @@
-"""How the tables came to be: one module per step in `versions/`, run in order by `service.storage.migration`.
+"""Migrations of the schema, one module per step in `versions/`, run in order by `service.storage.store`.
 
-Begin with `versions/v0001_revisions_and_leases.py`; what the tables look like now says `service.storage.tables`.
+Begin with `versions/v0001_revisions_and_leases.py`. `service.storage.tables` describes the current schema.
 """

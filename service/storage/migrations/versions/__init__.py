@@ -1,4 +1,4 @@
-"""The steps of the schema, each with the one that it follows.
+"""Steps of the schema; each names its predecessor.
 
 Begin with `v0001_revisions_and_leases.py`.
 """

@@ -1,7 +1,7 @@
-"""The first schema with revisions; takes over a database of the first version of the service.
+"""First schema with revisions, migrated from the first version of the service.
 
-That one had `floorplans`, `originals` and `latent_grids` or `latent_grids_2`. Plans keep their ids, and get one
-revision each; grids are dropped, they are computed again.
+That version had `floorplans`, `originals` and `latent_grids` or `latent_grids_2`. Plans keep their ids and get one
+revision each. Grids are dropped and computed again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _OLD_ORIGINALS = sa.table("old_originals", sa.column("plan_id", sa.String), sa.c
 
 
 def upgrade() -> None:
-    """Make the tables, and move what an older service stored into them."""
+    """Create the tables, and move the data of the first version into them."""
     connection = op.get_bind()
     before = set(sa.inspect(connection).get_table_names())
     old = "floorplans" in before

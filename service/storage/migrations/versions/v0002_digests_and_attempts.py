@@ -1,7 +1,7 @@
-"""Digests of grids and plans, warnings kept with plans, and leases that know how long they are.
+"""Digests of grids and plans, stored warnings of plans, and lengths of leases.
 
-Latent grids that were stored without a digest are dropped: whether they are what was computed cannot be told, and they
-are computed again. Plans without one are validated when they are read, as before.
+Grids without a digest are dropped and computed again, because they cannot be verified. Plans without a digest are
+validated when they are read, as before.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ down_revision = "0001"
 
 
 def upgrade() -> None:
-    """Add the columns, drop the grids."""
+    """Add the columns, and drop the grids."""
     op.execute("DELETE FROM grid_chunks")
     op.execute("DELETE FROM latent_grids")
     op.add_column("latent_grids", sa.Column("sha256", sa.String(64)))

@@ -1,7 +1,7 @@
-"""Venues, and prototypes of plans beside their latent grids.
+"""Venues, and prototypes of plans beside their grids.
 
-Grids that were stored before have no prototypes; they are made of the grid when they are asked for. Of plans that were,
-venues do not know how sure their camera height is, and take any.
+Prototypes of grids that were stored before are made on demand. Plans that were stored before have no deviation of their
+camera height, so venues treat it as unknown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ down_revision = "0002"
 
 
 def upgrade() -> None:
-    """Add the tables and the column."""
+    """Add the tables and the columns."""
     moment = sa.DateTime(timezone=True)
     op.create_table(
         "venues",

@@ -1,4 +1,4 @@
-"""The media type of the file that a plan was uploaded as, and the report of how it was read."""
+"""Media type of a plan's uploaded file, and the report of its import."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ down_revision = "0003"
 
 
 def upgrade() -> None:
-    """Add the columns; plans of before were JSON, and nothing was told of reading them."""
+    """Add the columns; earlier plans were JSON and have no report."""
     op.add_column("revisions", sa.Column("original_media_type", sa.String(64)))
     op.add_column("revisions", sa.Column("report", sa.Text))

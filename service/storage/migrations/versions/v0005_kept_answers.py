@@ -1,4 +1,4 @@
-"""Answers that are kept for a while."""
+"""Table of kept answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where plans lie: in their own frame, and those with an anchor on Earth, so that they can be looked for by place."""
+"""Places of plans, in their own frame and, with an anchor, on Earth, for searches by place."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ revision = "0006"
 down_revision = "0005"
 
 _COLUMNS = ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude")
-# Plans that are read at a time.
+# Plans per read.
 _BATCH_SIZE = 500
 
 
 def upgrade() -> None:
-    """Add the columns, and fill them in from the plans; one that cannot be read has no place."""
+    """Add the columns, and fill them from the plans; a plan that cannot be read has no place."""
     for name in _COLUMNS:
         op.add_column("floorplans", sa.Column(name, sa.Double))
     op.create_index("floorplans_by_place", "floorplans", ["tenant", "latitude"])
