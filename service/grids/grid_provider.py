@@ -232,7 +232,7 @@ class GridProvider:
         return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
     def queue_missing(self) -> bool:
-        """Queue the oldest grids that no replica computes, unless the queue is long; tell whether more can be missing."""
+        """Queue the oldest grids that no replica computes, unless the queue is long; tell whether more are left."""
         if len(self._jobs) >= _BATCH:
             return True
         model = (self._model_sha256, self._settings.grids.grid_step_m)

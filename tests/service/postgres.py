@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the tests' own: a fresh cluster on a free port, stopped and removed at the end."""
+"""PostgreSQL server for the tests: a temporary cluster on a free port."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ _START_S = 60
 
 @dataclass(frozen=True)
 class PostgresServer:
-    """A running cluster.
+    """Running cluster.
 
     Attributes:
-        folder: its data folder.
+        programs: folder of PostgreSQL's programs.
+        folder: data folder.
+        port: port on the loopback interface.
     """
 
     programs: Path
@@ -34,13 +36,13 @@ class PostgresServer:
     port: int
 
     def url(self, user: str = "postgres") -> str:
-        """The address of its database, as an operator would write it."""
+        """Return the URL of the database, as an operator writes it."""
         return f"postgresql://{user}@127.0.0.1:{self.port}/postgres"
 
     def new_database(self) -> str:
-        """Make a user with an empty schema of their own, which is all they see; gives the address.
+        """Create a user with an own empty schema, and return the URL.
 
-        As good as a database of their own, and made and removed in a hundredth of the time.
+        The schema isolates a test like a database of its own, and is created and removed in a hundredth of the time.
         """
         name = f"test_{uuid.uuid4().hex}"
         engine = sqlalchemy.create_engine(
@@ -54,7 +56,7 @@ class PostgresServer:
 
     @contextmanager
     def locked(self, url: str, table: str) -> Iterator[None]:
-        """Inside the block, whoever reads or writes a table of a database of `new_database` waits."""
+        """Lock a table inside the block, so that readers and writers wait."""
         engine = sqlalchemy.create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
         with engine.connect() as connection:
             connection.exec_driver_sql(f"LOCK TABLE {table}")
@@ -63,9 +65,9 @@ class PostgresServer:
 
     @contextmanager
     def silent(self) -> Iterator[None]:
-        """Inside the block it does not answer, nor does it close a connection: all its processes stand still."""
+        """Stop all processes of the server inside the block: it neither answers nor closes connections."""
         postmaster = int((self.folder / "postmaster.pid").read_text(encoding="ascii").split()[0])
-        # It first, so that no more of them come.
+        # The postmaster first, so that no new processes start.
         stopped = [postmaster]
         os.kill(postmaster, signal.SIGSTOP)
         try:
@@ -78,20 +80,20 @@ class PostgresServer:
                 os.kill(pid, signal.SIGCONT)
 
     def start(self) -> None:
-        """Start it, or start it again."""
+        """Start the server."""
         log = self.folder / "log"
-        # Tests end their processes, not the machine: what is not on the disk yet need not wait for it.
+        # Tests do not crash the machine, so fsync is not needed.
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
         command = [self.programs / "pg_ctl", "start", "-w", "-t", str(_START_S)]
         _run([*command, "-D", self.folder, "-l", log, "-o", options])
 
     def stop(self) -> None:
-        """Stop it at once, whoever is connected."""
+        """Stop the server, and disconnect its clients."""
         _run([self.programs / "pg_ctl", "stop", "-w", "-m", "fast", "-D", self.folder, "-t", str(_START_S)])
 
 
 def postgres_programs() -> Path | None:
-    """The folder of `initdb` and the others, of the newest PostgreSQL here; None where it is not installed."""
+    """Return the folder of `initdb` of the newest installed PostgreSQL; None without one."""
     found = shutil.which("initdb")
     if found is not None:
         return Path(found).resolve().parent
@@ -101,7 +103,7 @@ def postgres_programs() -> Path | None:
 
 @contextmanager
 def postgres_server(programs: Path) -> Iterator[PostgresServer]:
-    """Run a cluster of its own."""
+    """Run a temporary cluster."""
     with tempfile.TemporaryDirectory(prefix="lalaloc-postgres-") as parent:
         folder = Path(parent) / "cluster"
         if (user := _user()) is not None:
@@ -122,7 +124,7 @@ def postgres_server(programs: Path) -> Iterator[PostgresServer]:
 
 
 def _run(command: list[str | Path]) -> None:
-    # Output goes to a file: the server would keep a pipe open for as long as it runs.
+    # Output goes to a file, because the server would keep a pipe open.
     with tempfile.TemporaryFile() as output:
         done = subprocess.run(command, user=_user(), cwd="/", stdout=output, stderr=output, check=False)
         output.seek(0)
@@ -135,7 +137,7 @@ def _children(pid: int) -> list[int]:
 
 
 def _user() -> str | None:
-    """PostgreSQL refuses to run as root; Debian's package comes with a user for it."""
+    """Return the user for the server, which refuses to run as root; Debian's package creates one."""
     if os.geteuid() != 0:
         return None
     pwd.getpwnam("postgres")

@@ -1,4 +1,4 @@
-"""A Ray cluster on this machine for the tests, and the service as an application on it."""
+"""Ray cluster on this machine for the tests, and the service as an application on it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 
 from service.settings import Settings
 
-# One of each but those that search, so that there is a choice of them.
+# One replica each, but several that search, so that requests are routed.
 REPLICAS = {"ingress_max": 1, "encoder_max": 1, "search_min": 2, "search_max": 2, "lpo_max": 1}
 NAME = "lalaloc"
-# Replicas are about processors that there need not be: more than one runs on each here.
+# More CPUs than the machine has, because several replicas share one here.
 _PROCESSORS = 8
 _OBJECT_STORE_BYTES = 200 * 2**20
 _ATTEMPTS = 3
@@ -22,12 +22,12 @@ _ATTEMPTS = 3
 
 @contextmanager
 def ray_cluster() -> Iterator[str]:
-    """A cluster with Ray Serve on it, of one node; gives the address of its proxy."""
+    """Run a cluster of one node with Ray Serve, and yield the address of its proxy."""
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c constraints.txt -e '.[ray]'")
     from ray import serve
 
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Else replicas come after whatever else the machine does.
+    # Otherwise replicas run at a lower priority than other processes.
     os.environ.setdefault("RAY_worker_niceness", "0")
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -39,7 +39,7 @@ def ray_cluster() -> Iterator[str]:
             )
             break
         except Exception:
-            # Ray gives a node half a minute to start, which cannot be set; a busy machine may take longer.
+            # Ray's fixed limit of half a minute for starting a node is too short on a busy machine.
             ray.shutdown()
             if attempt == _ATTEMPTS:
                 raise

@@ -1,4 +1,4 @@
-"""What a damaged, full or vanished database does to requests: they are told, and what can still be done is done."""
+"""Requests to a service whose database is damaged, full or deleted."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ def _sqlite(data_dir: Path) -> Path:
     return path
 
 
-def test_a_plan_whose_document_is_damaged_can_be_had_as_uploaded_replaced_and_deleted(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_damaged_plan_can_be_replaced_and_deleted(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path) as client:
         replaced, deleted = upload(client), upload(client)
     with sqlite3.connect(_sqlite(tmp_path)) as raw:
@@ -43,7 +41,7 @@ def test_a_plan_whose_document_is_damaged_can_be_had_as_uploaded_replaced_and_de
         assert localise(client, replaced, panorama, refine="none").status_code == 200
 
 
-def test_nothing_is_acknowledged_once_the_data_folder_is_gone(start_app: StartApp, tmp_path: Path) -> None:
+def test_deleted_data_folder_is_store_unavailable(start_app: StartApp, tmp_path: Path) -> None:
     data_dir = tmp_path / "data"
     data_dir.mkdir()
     with start_app(data_dir) as client:
@@ -55,7 +53,7 @@ def test_nothing_is_acknowledged_once_the_data_folder_is_gone(start_app: StartAp
         assert_problem(client.get("/floorplans"), 503, "store-unavailable")
 
 
-def test_a_full_disk_is_a_507_and_reads_go_on(
+def test_full_disk_is_a_507_and_reads_continue(
     start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepare = database._prepare_sqlite

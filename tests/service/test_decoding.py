@@ -1,4 +1,4 @@
-"""Panoramas are decoded in processes that may die: whatever a picture does to them, the service goes on."""
+"""Decoding of panoramas in processes that can die."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def decoders() -> list[BaseProcess]:
 
 
 def decoder() -> int:
-    """Process id of the only decoding worker."""
+    """Return the process id of the only decoding worker."""
     wait_for(lambda: len(decoders()) == 1 and decoders()[0].pid is not None)
     pid = decoders()[0].pid
     assert pid is not None
@@ -44,7 +44,7 @@ def decoder() -> int:
 
 
 def most_memory(pid: int) -> int:
-    """The most bytes that a process ever had resident."""
+    """Return the peak resident memory (bytes) of a process."""
     status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
     line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
     return 1024 * int(line.split()[1])
@@ -60,7 +60,7 @@ def restarts(client: httpx.Client) -> float:
 
 
 def black_png(width: int, height: int) -> bytes:
-    """A PNG of nothing but zeros, a thousandth of its pixels' size."""
+    """Return a PNG of zeros, a thousandth of the size of its pixels."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -78,7 +78,7 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
     return buffer.getvalue()
 
 
-def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for _ in range(3):
@@ -89,9 +89,7 @@ def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_pat
     assert decoders() == [], "the pool left a process behind"
 
 
-def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answered(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     slow = black_png(10_000, 5_000)
     with start_app(tmp_path, decode_stall_s=0.2) as client:
         plan_id = upload(client)
@@ -105,7 +103,7 @@ def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answ
         assert localise(client, plan_id, panorama, **QUICK).status_code == 200
 
 
-def test_more_panoramas_than_may_wait_are_refused_at_once(
+def test_full_decode_queue_rejects_at_once(
     start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "_QUEUE", 1)
@@ -125,7 +123,7 @@ def test_more_panoramas_than_may_wait_are_refused_at_once(
 
 
 class TestBombs:
-    """Small files that claim many pixels; the decoder's memory is looked up in its process."""
+    """Small files with many pixels; memory is measured in the decoder's process."""
 
     CAP = 96 * MIB
 
@@ -133,7 +131,7 @@ class TestBombs:
         ("kind", "options"),
         [("PNG", {}), ("WEBP", {"lossless": True, "method": 0}), ("JPEG", {"progressive": True, "subsampling": 0})],
     )
-    def test_one_that_needs_too_much_memory_is_refused_and_the_next_is_answered(
+    def test_memory_limit_rejects_the_picture_only(
         self, start_app: StartApp, tmp_path: Path, panorama: bytes, kind: str, options: dict[str, object]
     ) -> None:
         bomb = black_png(7_000, 3_500) if kind == "PNG" else black(7_000, 3_500, kind, **options)
@@ -147,9 +145,7 @@ class TestBombs:
             assert decoder() == pid, "it did not have to die for that"
             assert most_memory(pid) < before + self.CAP
 
-    def test_one_that_claims_too_many_pixels_is_refused_on_its_header(
-        self, start_app: StartApp, tmp_path: Path, panorama: bytes
-    ) -> None:
+    def test_pixel_limit_is_checked_on_the_header(self, start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
         bombs = {kind: black(4_000, 2_000, kind) for kind in ("PNG", "WEBP", "JPEG")}
         with start_app(tmp_path, max_pixels=1_000_000) as client:
             plan_id = upload(client)
@@ -162,13 +158,13 @@ class TestBombs:
                 )
             assert most_memory(decoder()) < before + 4 * MIB
 
-    def test_a_large_panorama_is_read_in_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
+    def test_large_panorama_needs_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
         with start_app(tmp_path, decode_memory_bytes=64 * MIB) as client:
             plan_id = upload(client)
             assert localise(client, plan_id, black(10_000, 5_000, "JPEG"), **QUICK).status_code == 200
 
 
-def test_the_place_where_a_panorama_was_taken_is_neither_stored_nor_logged(
+def test_gps_metadata_is_neither_stored_nor_logged(
     start_app: StartApp,
     database_of: DatabaseOf,
     tmp_path: Path,
@@ -182,7 +178,7 @@ def test_the_place_where_a_panorama_was_taken_is_neither_stored_nor_logged(
     Image.new("RGB", (512, 256)).save(picture, "JPEG", exif=exif)
     Image.new("RGB", (256, 512)).save(portrait, "JPEG", exif=exif)
     with start_app(tmp_path, log_level="debug") as client:
-        # Only now: starting the app sets its log up.
+        # After the start of the app, which configures logging.
         monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
         plan_id = upload(client)
         assert localise(client, plan_id, picture.getvalue(), **QUICK).status_code == 200

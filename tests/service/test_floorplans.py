@@ -1,4 +1,4 @@
-"""Uploading, listing and deleting floor plans; what is refused leaves nothing behind."""
+"""Upload, listing and deletion of floor plans."""
 
 from __future__ import annotations
 
@@ -43,9 +43,7 @@ BAD_PLANS = {
 
 
 @pytest.mark.parametrize(("plan", "message"), BAD_PLANS.values(), ids=BAD_PLANS.keys())
-def test_a_bad_plan_is_refused_by_what_is_wrong_and_nothing_is_stored(
-    client: httpx.Client, plan: Any, message: str
-) -> None:
+def test_invalid_plan_is_rejected_with_its_fault(client: httpx.Client, plan: Any, message: str) -> None:
     before = client.get("/floorplans").json()
     response = client.post("/floorplans", content=json.dumps(plan), headers={"content-type": "application/json"})
     assert message in assert_problem(response, 422, "invalid-floorplan")["detail"]
@@ -53,7 +51,7 @@ def test_a_bad_plan_is_refused_by_what_is_wrong_and_nothing_is_stored(
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_coordinates_that_are_not_finite_are_refused(client: httpx.Client, number: str) -> None:
+def test_non_finite_coordinates_are_rejected(client: httpx.Client, number: str) -> None:
     body = json.dumps(_room([[0, 0], [4, 0], [4, "HERE"]])).replace('"HERE"', number)
     response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
     problem = assert_problem(response, 422, "invalid-floorplan")
@@ -62,13 +60,13 @@ def test_coordinates_that_are_not_finite_are_refused(client: httpx.Client, numbe
 
 
 @pytest.mark.parametrize("body", [b"", b"  ", b"{", b"\xff\xfe\xfd", b"[" * 100_000], ids=repr)
-def test_a_body_that_is_not_json_is_refused(client: httpx.Client, body: bytes) -> None:
+def test_body_that_is_not_json_is_rejected(client: httpx.Client, body: bytes) -> None:
     response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
     assert_problem(response, 422, "invalid-floorplan")
 
 
 @pytest.mark.parametrize("media", ["application/json", "multipart/form-data; boundary=x"])
-def test_a_compressed_body_is_refused_as_such(client: httpx.Client, media: str) -> None:
+def test_compressed_body_is_rejected(client: httpx.Client, media: str) -> None:
     headers = {"content-type": media, "content-encoding": "gzip"}
     response = client.post("/floorplans", content=gzip.compress(json.dumps(FLAT).encode()), headers=headers)
     assert "Content-Encoding 'gzip'" in assert_problem(response, 415, "unsupported-media")["detail"]
@@ -78,13 +76,13 @@ def test_a_compressed_body_is_refused_as_such(client: httpx.Client, media: str) 
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", None])
-def test_other_content_types_are_refused(client: httpx.Client, content_type: str | None) -> None:
+def test_other_content_types_are_rejected(client: httpx.Client, content_type: str | None) -> None:
     headers = {} if content_type is None else {"content-type": content_type}
     response = client.post("/floorplans", content=json.dumps(FLAT).encode(), headers=headers)
     assert "application/json" in assert_problem(response, 415, "unsupported-media")["detail"]
 
 
-def test_a_plan_is_answered_with_what_was_understood(client: httpx.Client) -> None:
+def test_upload_returns_the_plan(client: httpx.Client) -> None:
     response = client.post("/floorplans", json=FLAT)
     assert response.status_code == 201
     plan = response.json()
@@ -99,24 +97,24 @@ def test_a_plan_is_answered_with_what_was_understood(client: httpx.Client) -> No
     assert plan["bounds"] == {"x_min_m": 0.0, "y_min_m": 0.0, "x_max_m": 9.0, "y_max_m": 6.0}
 
 
-def test_a_plan_is_told_in_the_native_format_and_can_be_uploaded_again(client: httpx.Client) -> None:
+def test_plan_can_be_downloaded_and_uploaded_again(client: httpx.Client) -> None:
     openings = [{"kind": "window", "line": [[0.5, 0.0], [1.5, 0.0]], "sill_m": 0.9, "head_m": 2.0}]
     uploaded = client.post("/floorplans", json=FLAT | {"openings": openings, "north_deg": 30}).json()
-    told = client.get(f"/floorplans/{uploaded['id']}").json()
-    plan = told["plan"]
+    stored = client.get(f"/floorplans/{uploaded['id']}").json()
+    plan = stored["plan"]
     assert plan["north_deg"] == 30
     assert [room["polygon"] for room in plan["rooms"]] == [
         room.polygon_m.tolist() for room in FloorPlan.from_dict(FLAT).rooms
     ]
     assert [{key: opening[key] for key in openings[0]} for opening in plan["openings"]] == openings
-    assert [room["id"] for room in told["rooms"]] == [room["id"] for room in plan["rooms"]]
+    assert [room["id"] for room in stored["rooms"]] == [room["id"] for room in plan["rooms"]]
     again = client.post("/floorplans", json=plan).json()
     assert again["plan"] == plan
     for made in (uploaded, again):
         client.delete(f"/floorplans/{made['id']}")
 
 
-def test_the_grid_is_computed_in_the_background(client: httpx.Client) -> None:
+def test_grid_is_computed_in_the_background(client: httpx.Client) -> None:
     plan_id = upload(client)
     plan = client.get(f"/floorplans/{plan_id}").json()
     assert plan["status"] == "ready"
@@ -124,7 +122,7 @@ def test_the_grid_is_computed_in_the_background(client: httpx.Client) -> None:
     assert plan["grid"]["poses"] == 110
 
 
-def test_json_as_a_file_is_the_same_as_json_as_the_body(client: httpx.Client) -> None:
+def test_json_file_equals_json_body(client: httpx.Client) -> None:
     content = json.dumps(FLAT).encode()
     response = client.post("/floorplans", files={"file": ("flat.json", content, "application/octet-stream")})
     assert response.status_code == 201
@@ -133,7 +131,7 @@ def test_json_as_a_file_is_the_same_as_json_as_the_body(client: httpx.Client) ->
     assert response.json()["rooms"] == client.post("/floorplans", json=FLAT).json()["rooms"]
 
 
-def test_every_part_of_a_form_is_accounted_for(client: httpx.Client) -> None:
+def test_unknown_and_missing_parts_are_rejected(client: httpx.Client) -> None:
     file = ("flat.json", json.dumps(FLAT).encode())
     extra = assert_problem(
         client.post("/floorplans", files={"file": file}, data={"colour": "2"}), 422, "invalid-request"
@@ -148,12 +146,12 @@ def test_every_part_of_a_form_is_accounted_for(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("content_type", ["multipart/form-data", "multipart/form-data; boundary=x"])
-def test_a_form_that_is_no_form_is_refused(client: httpx.Client, content_type: str) -> None:
+def test_malformed_form_is_rejected(client: httpx.Client, content_type: str) -> None:
     response = client.post("/floorplans", content=b"no form", headers={"content-type": content_type})
     assert_problem(response, 400, "malformed-request")
 
 
-def test_a_deleted_plan_is_gone(client: httpx.Client) -> None:
+def test_deleted_plan_is_not_found(client: httpx.Client) -> None:
     plan_id = upload(client)
     assert client.delete(f"/floorplans/{plan_id}").status_code == 204
     assert_problem(client.delete(f"/floorplans/{plan_id}"), 404, "unknown-floorplan")
@@ -161,7 +159,7 @@ def test_a_deleted_plan_is_gone(client: httpx.Client) -> None:
         assert_problem(client.get(f"/floorplans/{plan_id}{path}"), 404, "unknown-floorplan")
 
 
-def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> None:
+def test_preview_and_mesh_have_their_media_types(client: httpx.Client) -> None:
     plan_id = upload(client, wait=False)
     drawing = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1, "y_m": 2, "heading_deg": 30})
     assert drawing.headers["content-type"].startswith("image/svg+xml")
@@ -182,9 +180,7 @@ def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> N
     assert (fault["field"], "is 1e+06; it must lie between " in fault["message"]) == ("y_m", True)
 
 
-def test_a_plan_whose_grid_would_be_too_large_is_refused_by_estimate_and_limit(
-    start_app: StartApp, tmp_path: Path
-) -> None:
+def test_plan_with_too_large_grid_is_rejected(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_grid_poses=100) as client:
         detail = assert_problem(client.post("/floorplans", json=FLAT), 422, "floorplan-too-large")["detail"]
         assert "146" in detail
@@ -192,7 +188,7 @@ def test_a_plan_whose_grid_would_be_too_large_is_refused_by_estimate_and_limit(
         assert client.get("/floorplans").json()["floorplans"] == []
 
 
-def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartApp, tmp_path: Path) -> None:
+def test_upload_is_cut_off_at_its_limit(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_plan_bytes=2000) as client:
         headers = {"content-type": "application/json"}
         stated = client.post("/floorplans", content=b" " * 2001, headers=headers)
@@ -204,7 +200,7 @@ def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartAp
         assert client.get("/floorplans").json()["floorplans"] == []
 
 
-def test_limits_come_from_the_settings(start_app: StartApp, tmp_path: Path) -> None:
+def test_plan_limits_come_from_settings(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_rooms=1, max_vertices=4, max_floorplans=1) as client:
         problem = assert_problem(client.post("/floorplans", json=FLAT), 422, "invalid-floorplan")
         assert "the limit is 1 (LALALOC_MAX_ROOMS)" in problem["detail"]
@@ -215,7 +211,7 @@ def test_limits_come_from_the_settings(start_app: StartApp, tmp_path: Path) -> N
         assert_problem(client.post("/floorplans", json=_room(SQUARE)), 507, "too-many-floorplans")
 
 
-def test_an_upload_that_stalls_is_ended(start_app: StartApp, tmp_path: Path) -> None:
+def test_stalled_upload_is_ended(start_app: StartApp, tmp_path: Path) -> None:
     import socket
 
     with start_app(tmp_path, upload_deadline_s=0.3) as client:
@@ -228,10 +224,10 @@ def test_an_upload_that_stalls_is_ended(start_app: StartApp, tmp_path: Path) -> 
             assert b"408" in connection.recv(4096).split(b"\r\n")[0]
 
 
-def test_a_grid_that_fails_is_told_and_tried_again_at_the_next_start(start_app: StartApp, tmp_path: Path) -> None:
+def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
-    # With a finer grid the stored plan no longer fits the limit: its grid cannot be computed any more.
+    # With a finer grid the stored plan exceeds the limit, so its grid cannot be computed.
     with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
         assert "at most 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]

@@ -1,4 +1,4 @@
-"""Latent grids: the same as the core's, computed once by whichever replica, bounded, replaced with the model."""
+"""Pose grids: equal to the core's, computed once by any replica, limited in number, replaced with the model."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ LARGE_HALL = FloorPlan.from_dict(
 
 
 class CountingEncoders(Encoders):
-    """The real encoders; count the poses that they embed, and wait between chunks if told to."""
+    """Real encoders that count the rendered poses, and can wait between chunks."""
 
     def __init__(self, bundle: Bundle) -> None:
         super().__init__(bundle, threads=1)
@@ -67,7 +67,7 @@ class CountingEncoders(Encoders):
         self.go_on.set()
 
     def rendered(self, *arguments: Any, **named: Any) -> Any:
-        """As the encoders do."""
+        """Render as the encoders do."""
         result = super().rendered(*arguments, **named)
         self.embedded += len(result)
         assert self.go_on.wait(30.0)
@@ -87,17 +87,17 @@ def encoders(bundle: Bundle) -> CountingEncoders:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def open_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[[], Store]]:
-    """Opens one database, of either kind, as often as there are replicas."""
+    """Return a function that opens one database of either kind again, as a replica does."""
     url = f"sqlite:///{tmp_path / 'test.sqlite3'}"
     if request.param == "postgresql":
         url = request.getfixturevalue("postgres").new_database()
     opened: list[Store] = []
 
-    def one_more() -> Store:
+    def open_another() -> Store:
         opened.append(Store(url))
         return opened[-1]
 
-    yield one_more
+    yield open_another
     for store in opened:
         store.close()
 
@@ -130,20 +130,18 @@ MakeGrids = Callable[..., GridProvider]
 OpenStore = Callable[[], Store]
 
 
-def test_chunks_make_the_same_grid_as_the_core_does_at_once(
-    store: Store, make_grids: MakeGrids, encoders: Encoders
-) -> None:
+def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: Encoders) -> None:
     computed = make_grids(store).compute(_add(store, HALL), 1.5).result(30.0)
     expected = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5, latents=False)
     np.testing.assert_array_equal(computed.poses.position_m, expected.poses.position_m)
     np.testing.assert_array_equal(computed.profile_m, expected.profile_m)
     np.testing.assert_array_equal(computed.layouts(HALL).log_profile, expected.layouts(HALL).log_profile)
-    # Poses are compared by their walls, so nobody asks for their latents.
+    # Poses are compared by wall profiles, so latents are not computed.
     assert computed.latents is None
     assert computed.profile_m.dtype == np.float16
 
 
-def test_asking_twice_computes_once(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+def test_second_request_shares_the_computation(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids, record = make_grids(store), _add(store)
     futures = [grids.compute(record, 1.5) for _ in range(5)]
     results = [future.result(30.0) for future in futures]
@@ -152,7 +150,7 @@ def test_asking_twice_computes_once(store: Store, make_grids: MakeGrids, encoder
     assert encoders.embedded == len(results[0].poses)
 
 
-def test_the_grid_of_an_unknown_plan_is_an_error(store: Store, make_grids: MakeGrids) -> None:
+def test_grid_of_unknown_plan_is_an_error(store: Store, make_grids: MakeGrids) -> None:
     grids, record = make_grids(store), _add(store)
     store.plans.delete("default", "p")
     with pytest.raises(UnknownFloorPlanError):
@@ -164,21 +162,19 @@ def test_the_grid_of_an_unknown_plan_is_an_error(store: Store, make_grids: MakeG
 
 
 @pytest.mark.parametrize("cache_bytes", [0, 200_000])
-def test_the_cache_never_holds_more_than_its_limit(store: Store, make_grids: MakeGrids, cache_bytes: int) -> None:
+def test_cache_stays_within_its_limit(store: Store, make_grids: MakeGrids, cache_bytes: int) -> None:
     grids, record = make_grids(store, grid_cache_bytes=cache_bytes), _add(store)
     for height_m in (1.5, 1.6, 1.7):
         grids.compute(record, height_m).result(30.0)
         assert grids._cache.bytes <= cache_bytes
         assert grids._cache.bytes == sum(grid_bytes(grid) for _, grid in grids._cache.items())
     assert (len(grids._cache.items()) > 0) == (cache_bytes > 0)
-    # What fell out of memory is still in the store.
+    # Evicted grids are still in the store.
     assert all(grids.find(grids.key(record.revision_id, height_m)) is not None for height_m in (1.5, 1.6, 1.7))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 60)), max_size=30), st.integers(0, 100))
-def test_a_bounded_cache_counts_right_and_drops_the_least_recently_used(
-    puts: list[tuple[int, int]], limit_bytes: int
-) -> None:
+def test_bounded_cache_drops_the_least_recently_used(puts: list[tuple[int, int]], limit_bytes: int) -> None:
     cache: BoundedCache[int, int] = BoundedCache(limit_bytes, lambda size: size)
     expected: list[tuple[int, int]] = []
     for key, size in puts:
@@ -190,13 +186,13 @@ def test_a_bounded_cache_counts_right_and_drops_the_least_recently_used(
             expected.pop(0)
         assert sorted(cache.items()) == sorted(expected)
         assert cache.bytes == sum(size for _, size in expected)
-        # Looking at one makes it the most recently used.
+        # Reading an entry makes it the most recently used.
         if expected:
             assert cache.get(expected[0][0]) == expected[0][1]
             expected.append(expected.pop(0))
 
 
-def test_what_the_cache_did_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
+def test_cache_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
     telemetry = Telemetry()
     grids = GridProvider(store, encoders, "m1", Settings(), telemetry)
     record = _add(store)
@@ -214,9 +210,7 @@ def test_what_the_cache_did_is_in_the_metrics(store: Store, encoders: Encoders) 
 # Several replicas
 
 
-def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
-    open_store: OpenStore, make_grids: MakeGrids, bundle: Bundle
-) -> None:
+def test_replicas_share_one_computation(open_store: OpenStore, make_grids: MakeGrids, bundle: Bundle) -> None:
     first_store, second_store = open_store(), open_store()
     first_encoders, second_encoders = CountingEncoders(bundle), CountingEncoders(bundle)
     first = make_grids(first_store, first_encoders, grid_lease_s=10.0)
@@ -243,7 +237,7 @@ def _looked(grids: GridProvider) -> bool:
     return False
 
 
-def test_progress_elsewhere_is_told(open_store: OpenStore, make_grids: MakeGrids) -> None:
+def test_remote_progress_is_reported(open_store: OpenStore, make_grids: MakeGrids) -> None:
     store = open_store()
     grids, record = make_grids(open_store()), _add(store, HALL)
     key = grids.key(record.revision_id, 1.5)
@@ -255,7 +249,7 @@ def test_progress_elsewhere_is_told(open_store: OpenStore, make_grids: MakeGrids
     wait_for(lambda: _looked(grids) or grids.progress(key) == 0.25)
 
 
-def test_the_lease_of_a_dead_replica_is_taken_over(
+def test_lease_of_dead_replica_is_taken_over(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store = open_store()
@@ -269,13 +263,13 @@ def test_the_lease_of_a_dead_replica_is_taken_over(
     assert len(future.result(30.0).poses) == encoders.embedded
 
 
-def test_a_grid_that_nobody_ever_finishes_fails_after_a_few_attempts(
+def test_grid_fails_after_unfinished_attempts(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store = open_store()
     grids, record = make_grids(store), _add(store)
     key = grids.key(record.revision_id, 1.5)
-    # As replicas do that lose their lease each time, or their life.
+    # As replicas that lose their lease or die.
     for number in range(5):
         assert store.leases.claim(key, f"replica {number % 2}", 0.001)
         time.sleep(0.01)
@@ -283,13 +277,13 @@ def test_a_grid_that_nobody_ever_finishes_fails_after_a_few_attempts(
         grids.compute(record, 1.5).result(30.0)
     assert encoders.embedded == 0
     state = grids.states(store.plans.list_plans("default", limit=1))[0]
-    assert (state.status, state.reason) == ("failed", "its latent grid was begun 5 times and never finished")
+    assert (state.status, state.reason) == ("failed", "its pose grid was begun 5 times and never finished")
     # The next start tries again.
     store.plans.clear_failures()
     assert len(grids.compute(record, 1.5).result(30.0).poses) == encoders.embedded
 
 
-def test_a_grid_without_numbers_fails_and_is_not_stored(store: Store, make_grids: MakeGrids, bundle: Bundle) -> None:
+def test_non_finite_grid_fails(store: Store, make_grids: MakeGrids, bundle: Bundle) -> None:
     class Overflowing(CountingEncoders):
         def rendered(self, *arguments: Any, **named: Any) -> Any:
             layouts = super().rendered(*arguments, **named)
@@ -305,26 +299,24 @@ def test_a_grid_without_numbers_fails_and_is_not_stored(store: Store, make_grids
     assert state.status == "failed"
 
 
-def test_a_lease_is_kept_and_may_be_lost_while_poses_are_looked_for(bundle: Bundle) -> None:
+def test_lease_is_renewed_during_sampling(bundle: Bundle) -> None:
     square = [[0, 0], [2, 0], [2, 2], [0, 2]]
     rooms = [{"name": f"{k}", "polygon": [[x + 3 * k, y] for x, y in square]} for k in range(5)]
-    plan, told = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms}), []
+    plan, reported = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms}), []
 
     def lose_after_three(progress: float, _worked_s: float) -> None:
-        told.append(progress)
-        if len(told) == 3:
+        reported.append(progress)
+        if len(reported) == 3:
             raise StoppingError
 
     encoders = CountingEncoders(bundle)
     with pytest.raises(StoppingError):
         embed(plan, encoders, step_m=0.5, camera_height_m=1.5, after_chunk=lose_after_three)
-    assert told == [0.0] * 3
+    assert reported == [0.0] * 3
     assert encoders.embedded == 0
 
 
-def test_a_replica_that_was_thought_dead_gives_way(
-    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
+def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     store = open_store()
     grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
     key = grids.key(record.revision_id, 1.5)
@@ -342,7 +334,7 @@ def test_a_replica_that_was_thought_dead_gives_way(
     np.testing.assert_array_equal(future.result().profile_m, grid.profile_m)
 
 
-def test_deleting_a_plan_on_another_replica_ends_the_work_on_its_grid(
+def test_remote_deletion_cancels_the_grid(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store = open_store()
@@ -358,7 +350,7 @@ def test_deleting_a_plan_on_another_replica_ends_the_work_on_its_grid(
     assert grids.pending == 0
 
 
-def test_what_a_stopped_replica_left_is_taken_up_by_another(
+def test_work_of_stopped_replica_is_taken_over(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders, bundle: Bundle
 ) -> None:
     first, second = open_store(), open_store()
@@ -379,7 +371,7 @@ def test_what_a_stopped_replica_left_is_taken_up_by_another(
     assert grids.find(grids.key(record.revision_id, 1.5)) is not None
 
 
-def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
+def test_unqueued_plans_count_as_preparing(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store = open_store()
@@ -387,12 +379,12 @@ def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
         _add(store, plan_id=f"plan {number}")
     grids = make_grids(store)
     encoders.go_on.clear()
-    # Sixteen are taken up at a time, and the rest is known of.
+    # Sixteen are queued at a time, and the rest is counted.
     assert grids.queue_missing()
     assert (grids.pending, grids.preparing) == (16, 20)
     encoders.go_on.set()
     wait_for(lambda: grids.pending == 0)
-    # One that another replica computes, dead or alive, is not done either.
+    # Grids that another replica computes, dead or alive, count as well.
     key = grids.key(store.grids.missing("m1", 0.5, 1)[0].revision_id, 1.5)
     store.leases.claim(key, "another replica", 60.0)
     grids.queue_missing()
@@ -405,9 +397,7 @@ def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
     assert grids.preparing == 0
 
 
-def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
-    open_store: OpenStore, make_grids: MakeGrids
-) -> None:
+def test_sweep_drops_deleted_revisions_from_memory(open_store: OpenStore, make_grids: MakeGrids) -> None:
     store, elsewhere = open_store(), open_store()
     grids = make_grids(store)
     records = {name: _add(store, plan_id=name) for name in ("deleted", "changed", "kept")}
@@ -420,13 +410,13 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
     assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
 
-def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_more(
+def test_sweep_cancels_revisions_replaced_remotely(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store, elsewhere = open_store(), open_store()
     grids = make_grids(store)
     encoders.go_on.clear()
-    # The first one has begun, the others wait.
+    # The first grid has begun, the others wait.
     futures = [grids.compute(_add(store, HALL), 1.5)]
     wait_for(lambda: encoders.embedded > 0)
     for _ in range(3):
@@ -439,9 +429,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     assert encoders.embedded <= 256 + 1521
 
 
-def test_the_job_of_a_replaced_revision_ends_although_another_replica_is_at_it(
-    open_store: OpenStore, make_grids: MakeGrids
-) -> None:
+def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids: MakeGrids) -> None:
     store = open_store()
     grids, record = make_grids(store), _add(store)
     store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
@@ -469,16 +457,14 @@ def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, e
     assert slow.result(60.0) is not None
 
 
-def test_a_large_grid_keeps_its_lease_while_a_small_one_overtakes_it(
-    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
+def test_overtaken_grid_keeps_its_lease(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_lease_s=2.0)
     large, small = _add(store, LARGE_HALL, "large"), _add(store, HALL, "small")
     encoders.go_on.clear()
     slow = grids.compute(large, 1.5)
     wait_for(lambda: encoders.embedded > 0)
     quick = grids.compute(small, 1.5)
-    # Six chunks, which take longer than the lease lasts.
+    # Six chunks, which take longer than the lease.
     encoders.pause_s = 0.5
     encoders.go_on.set()
     while not quick.done():
@@ -489,20 +475,18 @@ def test_a_large_grid_keeps_its_lease_while_a_small_one_overtakes_it(
     assert len(slow.result(60.0).poses) > 2000
 
 
-def test_what_waits_is_bounded_and_a_plans_own_grid_has_a_place_of_its_own(
-    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
+def test_queue_of_grids_is_limited(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids, record = make_grids(store), _add(store)
     encoders.go_on.clear()
-    asked = [grids.compute(record, 1.0 + 0.02 * number) for number in range(MAX_ON_DEMAND)]
+    futures = [grids.compute(record, 1.0 + 0.02 * number) for number in range(MAX_ON_DEMAND)]
     with pytest.raises(OverloadedError, match=str(MAX_ON_DEMAND)):
         grids.compute(record, 2.2)
     own = grids.compute(record, 1.5)
     encoders.go_on.set()
-    assert all(future.result(60.0) is not None for future in (*asked, own))
+    assert all(future.result(60.0) is not None for future in (*futures, own))
 
 
-def test_work_on_a_revision_that_was_replaced_ends(
+def test_grid_of_replaced_revision_is_cancelled(
     store: Store, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     grids, record = make_grids(store), _add(store, HALL)
@@ -516,7 +500,7 @@ def test_work_on_a_revision_that_was_replaced_ends(
     assert len(grids.compute(new, 1.5).result(30.0).poses) == 110
 
 
-def test_the_background_pauses_for_queries_but_not_for_good() -> None:
+def test_background_pauses_for_queries() -> None:
     queries = BackgroundThrottle()
     with queries.query(), queries.query():
         begin = time.monotonic()
@@ -532,12 +516,10 @@ def test_the_background_pauses_for_queries_but_not_for_good() -> None:
     assert time.monotonic() - begin < 0.5
 
 
-# The database away
+# Outages of the database
 
 
-def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
-    postgres: PostgresServer, make_grids: MakeGrids
-) -> None:
+def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make_grids: MakeGrids) -> None:
     url = postgres.new_database()
     store, elsewhere, without_memory = Store(url), Store(url), Store(url, plan_cache_bytes=0)
     grids, record = make_grids(store), _add(store)
@@ -566,7 +548,7 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
     finally:
         postgres.start()
     wait_for(lambda: known.get("default", "q") is not None)
-    # It was no failure of the plan.
+    # An outage is not a failure of the plan.
     assert grids.compute(record, 1.6).result(30.0) is not None
     store.plans.delete("default", "p")
     time.sleep(1.1)
@@ -575,13 +557,13 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
         opened.close()
 
 
-def test_a_database_that_is_busy_is_no_reason_to_go_by_what_was_read_lately(tmp_path: Path) -> None:
+def test_busy_database_does_not_serve_cached_plans(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", connections=1, wait_s=0.05)
     known = PlanLookup(store, max_age_s=600.0)
     record = _add(store)
     assert known.get("default", "p") == record
     with store._database.reading():
-        # As if others were answered all the while.
+        # As if the database answered other callers meanwhile.
         store._database._answered_s = float("inf")
         for _ in range(2):
             with pytest.raises(StoreBusyError):
@@ -598,18 +580,16 @@ def postgres_app(start_app: StartApp, postgres: PostgresServer, tmp_path_factory
 
 
 def test_two_replicas_serve_the_same_plans(postgres_app: Any, panorama: bytes) -> None:
-    with postgres_app() as one, postgres_app() as other:
-        plan_id = upload(one, wait=False)
-        assert localise(other, plan_id, panorama, refine="none").status_code == 200
-        assert other.delete(f"/floorplans/{plan_id}").status_code == 204
-        assert_problem(localise(one, plan_id, panorama, refine="none"), 404, "unknown-floorplan")
-        wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in one.get("/metrics").text)
+    with postgres_app() as first, postgres_app() as second:
+        plan_id = upload(first, wait=False)
+        assert localise(second, plan_id, panorama, refine="none").status_code == 200
+        assert second.delete(f"/floorplans/{plan_id}").status_code == 204
+        assert_problem(localise(first, plan_id, panorama, refine="none"), 404, "unknown-floorplan")
+        wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in first.get("/metrics").text)
 
 
 @pytest.mark.one_replica
-def test_localise_goes_on_while_the_database_is_away(
-    postgres_app: Any, postgres: PostgresServer, panorama: bytes
-) -> None:
+def test_queries_continue_during_an_outage(postgres_app: Any, postgres: PostgresServer, panorama: bytes) -> None:
     with postgres_app() as client:
         plan_id = upload(client)
         assert localise(client, plan_id, panorama, refine="none").status_code == 200
@@ -627,7 +607,7 @@ def test_localise_goes_on_while_the_database_is_away(
 # The whole service
 
 
-def test_a_small_plan_is_ready_when_its_upload_is_answered(start_app: StartApp, tmp_path: Path) -> None:
+def test_small_plan_is_ready_after_upload(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         answer = client.post("/floorplans", json=FLAT).json()
         assert (answer["status"], answer["grid"]["poses"]) == ("ready", 110)
@@ -640,7 +620,7 @@ def test_a_small_plan_is_ready_when_its_upload_is_answered(start_app: StartApp, 
 @example(2.399)
 @example(0.1)
 @example(0.001)
-def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -> None:
+def test_rounded_height_is_below_the_ceiling(asked_m: float) -> None:
     now = datetime.now(UTC)
     record = PlanRecord(
         id="p", tenant="t", revision_id="r", revision=1, created_at=now, updated_at=now, plan=PLAN, failure=None
@@ -658,9 +638,7 @@ def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -
 
 
 @pytest.mark.one_replica
-def test_a_new_model_recomputes_the_grids(
-    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes
-) -> None:
+def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path / "data") as client:
         plan_id = upload(client)
         old = localise(client, plan_id, panorama, refine="none").json()["model"]["sha256"]
@@ -675,7 +653,7 @@ def test_a_new_model_recomputes_the_grids(
         assert localise(client, plan_id, panorama, refine="none").json()["model"]["sha256"] == bundle.sha256
 
 
-def test_a_model_that_predicts_walls_needs_no_grids_of_other_camera_heights(
+def test_profile_model_needs_one_grid_for_all_heights(
     start_app: StartApp,
     database_of: DatabaseOf,
     tmp_path: Path,

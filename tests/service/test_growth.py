@@ -1,4 +1,4 @@
-"""Requests are read in time that grows with their size and no faster, whatever is in them."""
+"""Parsing time of requests, which grows at most linearly with their size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.security.keys import parse_authorization
 from service.telemetry.trace_context import parse_traceparent
 from tests.growth import assert_no_worse_than_linear
 
-# As long as heads of requests may be, and a bit.
+# Slightly more than the maximum size of a request's head.
 _HEAD = 12_000
 _LIMITS = UploadLimits(max_bytes=100_000_000, name="max_panorama_bytes", deadline_s=60.0, idle_s=60.0, bytes_per_s=1.0)
 _UPLOAD_CHUNK = 65_536
@@ -43,8 +43,8 @@ _TAGS: dict[str, Callable[[int], str]] = {
 
 
 @pytest.mark.parametrize("kind", _TAGS)
-def test_entity_tags(kind: str) -> None:
-    def work_of(size: int) -> Callable[[], None]:
+def test_entity_tag_parsing_is_linear(kind: str) -> None:
+    def make_work(size: int) -> Callable[[], None]:
         request = _request("if-match", _TAGS[kind](size))
 
         def work() -> None:
@@ -53,7 +53,7 @@ def test_entity_tags(kind: str) -> None:
 
         return work
 
-    assert_no_worse_than_linear(work_of, _HEAD)
+    assert_no_worse_than_linear(make_work, _HEAD)
 
 
 _PARSED: dict[str, Callable[[str], object]] = {
@@ -67,8 +67,8 @@ _PARSED: dict[str, Callable[[str], object]] = {
 
 @pytest.mark.parametrize("unit", ["a", "-", "_", " ", ":", "[", "1.", "%0a", "@", "-a"])
 @pytest.mark.parametrize("kind", _PARSED)
-def test_what_heads_have(kind: str, unit: str) -> None:
-    def work_of(size: int) -> Callable[[], None]:
+def test_head_parsing_is_linear(kind: str, unit: str) -> None:
+    def make_work(size: int) -> Callable[[], None]:
         text = unit * (size // len(unit))
 
         def work() -> None:
@@ -77,7 +77,7 @@ def test_what_heads_have(kind: str, unit: str) -> None:
 
         return work
 
-    assert_no_worse_than_linear(work_of, _HEAD)
+    assert_no_worse_than_linear(make_work, _HEAD)
 
 
 _PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
@@ -101,12 +101,12 @@ _BODIES: dict[str, Callable[[int], bytes]] = {
 
 @pytest.mark.parametrize("chunk", [_UPLOAD_CHUNK, 512])
 @pytest.mark.parametrize("kind", _BODIES)
-def test_forms(kind: str, chunk: int) -> None:
-    def work_of(size: int) -> Callable[[], None]:
+def test_form_parsing_is_linear(kind: str, chunk: int) -> None:
+    def make_work(size: int) -> Callable[[], None]:
         body = _BODIES[kind](size)
 
         async def read() -> None:
-            pieces = iter([body[at : at + chunk] for at in range(0, len(body), chunk)])
+            pieces = iter([body[first : first + chunk] for first in range(0, len(body), chunk)])
 
             async def receive() -> Message:
                 piece = next(pieces, None)
@@ -119,11 +119,11 @@ def test_forms(kind: str, chunk: int) -> None:
 
         return lambda: asyncio.run(read())
 
-    assert_no_worse_than_linear(work_of, 300_000)
+    assert_no_worse_than_linear(make_work, 300_000)
 
 
 @pytest.mark.parametrize("unit", [";", "; a=b", '; a="', "\\", '"', "=", "; charset", " "])
-def test_the_type_of_a_body(unit: str) -> None:
+def test_media_type_parsing_is_linear(unit: str) -> None:
     async def read(media: str) -> None:
         headers = [(b"content-type", media.encode())]
         scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
@@ -134,8 +134,8 @@ def test_the_type_of_a_body(unit: str) -> None:
         with suppress(LaLaLocError):
             await read_parts(Request(scope, receive), _LIMITS, files=set(), fields=set())
 
-    def work_of(size: int) -> Callable[[], None]:
+    def make_work(size: int) -> Callable[[], None]:
         media = "multipart/form-data; boundary=b" + unit * (size // len(unit))
         return lambda: asyncio.run(read(media))
 
-    assert_no_worse_than_linear(work_of, _HEAD)
+    assert_no_worse_than_linear(make_work, _HEAD)

@@ -1,4 +1,4 @@
-"""Where the heading of a query comes from."""
+"""Source of a query's heading: request, compass or search."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ def north(compass_client: httpx.Client) -> str:
 def poses(response: httpx.Response) -> tuple[str, list[object]]:
     assert response.status_code == 200, response.text
     answer = response.json()
-    return answer["heading_source"], [(one["position"], one["heading_deg"]) for one in answer["candidates"]]
+    return answer["heading_source"], [
+        (candidate["position"], candidate["heading_deg"]) for candidate in answer["candidates"]
+    ]
 
 
 @pytest.mark.parametrize("compass_deg", [0.0, 100.0, 345.0])
-def test_the_compass_is_used_where_the_plan_knows_north(
-    compass_client: httpx.Client, north: str, compass_deg: float
-) -> None:
+def test_compass_is_used_if_north_is_known(compass_client: httpx.Client, north: str, compass_deg: float) -> None:
     picture = with_packet(PoseHeadingDegrees=compass_deg)
     source, found = poses(localise(compass_client, north, picture, refine="none"))
     assert source == "panorama"
     heading_deg = (compass_deg + NORTH_DEG) % 360.0
-    told = localise(compass_client, north, picture, refine="none", heading_deg=heading_deg, heading_tolerance_deg=15)
-    assert poses(told) == ("given", found)
+    given = localise(compass_client, north, picture, refine="none", heading_deg=heading_deg, heading_tolerance_deg=15)
+    assert poses(given) == ("given", found)
 
 
-def test_what_the_request_says_comes_first(compass_client: httpx.Client, north: str) -> None:
+def test_requested_heading_takes_precedence(compass_client: httpx.Client, north: str) -> None:
     fields = {"refine": "none", "heading_deg": 200}
     with_compass = poses(localise(compass_client, north, with_packet(PoseHeadingDegrees=10), **fields))
     assert with_compass[0] == "given"
@@ -58,13 +58,13 @@ def test_what_the_request_says_comes_first(compass_client: httpx.Client, north: 
 
 
 @pytest.mark.parametrize("properties", [{}, {"PoseHeadingDegrees": 400}, {"InitialViewHeadingDegrees": 90}])
-def test_without_a_compass_the_heading_is_searched(
+def test_heading_is_searched_without_a_compass(
     compass_client: httpx.Client, north: str, properties: dict[str, object]
 ) -> None:
     assert poses(localise(compass_client, north, with_packet(**properties), refine="none"))[0] == "searched"
 
 
-def test_without_north_the_heading_is_searched(compass_client: httpx.Client) -> None:
+def test_heading_is_searched_without_north(compass_client: httpx.Client) -> None:
     plan_id = upload(compass_client)
     with_compass = poses(localise(compass_client, plan_id, with_packet(PoseHeadingDegrees=10), refine="none"))
     assert with_compass[0] == "searched"

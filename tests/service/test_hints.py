@@ -1,4 +1,4 @@
-"""Hints of a query: what they may be, and that they reach the search."""
+"""Hints of a query: validation, and their effect on the search."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ def plan_id(client: httpx.Client) -> str:
     ],
 )
 @pytest.mark.parametrize("refine", ["none", "lpo"])
-def test_strict_rooms_are_the_only_ones(
+def test_strict_rooms_exclude_others(
     client: httpx.Client, plan_id: str, panorama: bytes, rooms: str, possible: set[str], refine: str
 ) -> None:
     response = localise(client, plan_id, panorama, rooms=rooms, strict="true", refine=refine)
     assert response.status_code == 200, response.text
-    assert {one["room_id"] for one in response.json()["candidates"]} <= possible
+    assert {candidate["room_id"] for candidate in response.json()["candidates"]} <= possible
 
 
-def test_a_strict_point_is_the_centre_of_all_answers(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     fields = {"near": json.dumps({"x_m": 6.0, "y_m": 1.0}), "radius_m": 1.2}
     answer = localise(client, plan_id, panorama, strict="true", **fields).json()
     for candidate in answer["candidates"]:
         assert np.hypot(candidate["position"]["x_m"] - 6.0, candidate["position"]["y_m"] - 1.0) <= 1.2 + 1e-3
 
 
-def test_a_hint_makes_the_places_that_it_is_of_likelier(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_room_hint_raises_its_candidates(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     def rooms_found(**fields: Any) -> list[str]:
         found = localise(client, plan_id, panorama, refine="none", **fields).json()
         return [candidate["room_id"] for candidate in found["candidates"]]
@@ -87,7 +87,7 @@ def test_a_hint_makes_the_places_that_it_is_of_likelier(client: httpx.Client, pl
         ({"rooms": "hall", "strict": "maybe"}, "strict", "must be true or false"),
     ],
 )
-def test_hints_that_are_none_are_told(
+def test_invalid_hints_are_rejected(
     client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], field: str, message: str
 ) -> None:
     problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-request")
@@ -102,14 +102,14 @@ def test_hints_that_are_none_are_told(
         ({"near": '{"x_m": 4.5, "y_m": 1}', "radius_m": 0.51, "strict": "true"}, "strict: none of the"),
     ],
 )
-def test_hints_that_the_plan_contradicts_are_told(
+def test_hints_outside_the_plan_are_rejected(
     client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], detail: str
 ) -> None:
     problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-hint")
     assert detail in problem["detail"]
 
 
-def test_what_is_overruled_is_said_with_both_values() -> None:
+def test_contradicted_hints_are_warned_about() -> None:
     plan = FloorPlan.from_dict(PLAN)
     query = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
     answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)

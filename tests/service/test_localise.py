@@ -1,4 +1,4 @@
-"""Queries: every input is checked, every stage can be asked for, and waiting has an end."""
+"""Queries: validation, stages and waiting."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ HALL: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def flat(client: httpx.Client) -> str:
-    """A plan that is ready; returns its id."""
+    """Upload a plan and return its id once it is ready."""
     return upload(client)
 
 
 @pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
 @pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "vdr")])
-def test_an_answer_is_a_place_in_the_plan_by_the_stage_asked_for(
+def test_answer_lies_in_the_plan_and_names_its_stage(
     client: httpx.Client, flat: str, panorama: bytes, heading: float | None, refine: str, stage: str
 ) -> None:
     fields = {} if heading is None else {"heading_deg": heading}
     response = localise(client, flat, panorama, refine=refine, **fields)
     assert response.status_code == 200, response.text
     answer = response.json()
-    # This app runs without LPO workers, so the best it can do is VDR.
+    # This app has no LPO workers, so the best stage is VDR.
     assert answer["stage"] == stage
     assert answer["floorplan_id"] == flat
     plan = FloorPlan.from_dict(FLAT)
@@ -66,9 +66,7 @@ def test_an_answer_is_a_place_in_the_plan_by_the_stage_asked_for(
         assert abs((answer["heading_deg"] - heading + 180.0) % 360.0 - 180.0) < 1e-2
 
 
-def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
-    client: httpx.Client, flat: str, panorama: bytes
-) -> None:
+def test_candidates_are_distinct_and_sorted(client: httpx.Client, flat: str, panorama: bytes) -> None:
     answer = localise(client, flat, panorama, refine="none", top_k=10).json()
     candidates = answer["candidates"]
     assert 2 <= len(candidates) <= 10
@@ -79,20 +77,20 @@ def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
     headings = np.array([c["heading_deg"] for c in candidates])
     turned = np.abs((headings[:, None] - headings[None] + 180.0) % 360.0 - 180.0)
-    # At one place there may be two that look in other directions.
+    # Candidates at one place can differ in their heading only.
     assert ((gaps >= 1.0 - 1e-3) | (turned >= 25.0 - 0.1)).all()
-    told = {**answer, "probability": candidates[0]["probability"]}
-    assert {key: told[key] for key in candidates[0]} == candidates[0]
+    first = {**answer, "probability": candidates[0]["probability"]}
+    assert {key: first[key] for key in candidates[0]} == candidates[0]
 
 
 @pytest.mark.parametrize("top_k", [1, 3, 10])
-def test_no_more_candidates_than_asked_for(client: httpx.Client, flat: str, panorama: bytes, top_k: int) -> None:
+def test_top_k_limits_candidates(client: httpx.Client, flat: str, panorama: bytes, top_k: int) -> None:
     candidates = localise(client, flat, panorama, refine="none", top_k=top_k).json()["candidates"]
     everything = localise(client, flat, panorama, refine="none", top_k=10).json()["candidates"]
     assert candidates == everything[:top_k]
 
 
-def test_timings_and_model_are_told(client: httpx.Client, flat: str, panorama: bytes, tiny_bundle: Path) -> None:
+def test_answer_has_timings_and_model(client: httpx.Client, flat: str, panorama: bytes, tiny_bundle: Path) -> None:
     answer = localise(client, flat, panorama, refine="vdr").json()
     timings = answer["timings_ms"]
     assert set(timings) == set(TimingsAnswer.model_fields)
@@ -104,13 +102,13 @@ def test_timings_and_model_are_told(client: httpx.Client, flat: str, panorama: b
     assert answer["model"]["name"] == bundle.manifest.name
 
 
-def test_the_same_query_has_the_same_answer(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_same_query_has_the_same_answer(client: httpx.Client, flat: str, panorama: bytes) -> None:
     first, second = (localise(client, flat, panorama, refine="vdr").json() for _ in range(2))
     assert first["candidates"] == second["candidates"]
 
 
 @pytest.mark.parametrize("picture_format", ["JPEG", "PNG", "WEBP"])
-def test_every_format_is_read(client: httpx.Client, flat: str, picture_format: str) -> None:
+def test_all_picture_formats_are_read(client: httpx.Client, flat: str, picture_format: str) -> None:
     assert localise(client, flat, encode_picture(256, 128, picture_format), refine="none").status_code == 200
 
 
@@ -139,7 +137,7 @@ BAD_FIELDS = {
 
 
 @pytest.mark.parametrize(("fields", "name", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
-def test_a_bad_field_is_refused_by_name_value_and_limit(
+def test_invalid_field_is_rejected_with_its_limit(
     client: httpx.Client, flat: str, panorama: bytes, fields: dict[str, str], name: str, message: str
 ) -> None:
     response = client.post(
@@ -150,7 +148,7 @@ def test_a_bad_field_is_refused_by_name_value_and_limit(
     assert not re.search("string|float|integer|parse|None|sys", faults[name])
 
 
-def test_everything_that_is_wrong_with_a_form_is_told_at_once(client: httpx.Client, panorama: bytes) -> None:
+def test_all_form_faults_are_reported_at_once(client: httpx.Client, panorama: bytes) -> None:
     fields = {"headng_deg": "1", "heading_deg": "361", "top_k": "1000", "camera_height_m": "nan", "refine": "all"}
     response = client.post("/localise", data=fields, files={"picture": ("p.jpg", panorama)})
     faults = [fault["field"] for fault in assert_problem(response, 422, "invalid-request")["errors"]]
@@ -158,12 +156,12 @@ def test_everything_that_is_wrong_with_a_form_is_told_at_once(client: httpx.Clie
     assert sorted(faults) == sorted(expected)
 
 
-def test_an_empty_optional_field_counts_as_left_out(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_empty_optional_field_counts_as_missing(client: httpx.Client, flat: str, panorama: bytes) -> None:
     empty = localise(client, flat, panorama, refine="none", heading_deg="", heading_tolerance_deg="", top_k="")
     assert empty.status_code == 200
 
 
-def test_a_heading_is_searched_for_within_its_tolerance(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_heading_is_searched_within_its_tolerance(client: httpx.Client, flat: str, panorama: bytes) -> None:
     def headings(**fields: Any) -> np.ndarray:
         candidates = localise(client, flat, panorama, refine="none", top_k=10, heading_deg=30, **fields)
         found = np.array([candidate["heading_deg"] for candidate in candidates.json()["candidates"]])
@@ -176,7 +174,7 @@ def test_a_heading_is_searched_for_within_its_tolerance(client: httpx.Client, fl
     assert 1.0 < searched.max() <= 45.01
 
 
-def test_every_part_is_needed(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_every_part_is_required(client: httpx.Client, flat: str, panorama: bytes) -> None:
     picture = {"panorama": ("p.jpg", panorama, "image/jpeg")}
     no_plan = assert_problem(client.post("/localise", files=picture), 422, "invalid-request")
     assert no_plan["errors"] == [{"field": "floorplan_id", "message": "is missing"}]
@@ -188,12 +186,12 @@ def test_every_part_is_needed(client: httpx.Client, flat: str, panorama: bytes) 
     assert_problem(client.post("/localise"), 415, "unsupported-media")
 
 
-def test_an_unknown_plan_is_named(client: httpx.Client, panorama: bytes) -> None:
+def test_unknown_plan_is_not_found(client: httpx.Client, panorama: bytes) -> None:
     assert "'nowhere'" in assert_problem(localise(client, "nowhere", panorama), 404, "unknown-floorplan")["detail"]
 
 
 def _png_header(width: int, height: int) -> bytes:
-    """A PNG of which nothing but the header is there: whoever decodes pixels finds none."""
+    """Return a PNG with a header only; a decoder of its pixels would find none."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
@@ -216,7 +214,7 @@ BAD_PICTURES = {
 
 
 @pytest.mark.parametrize(("picture", "message"), BAD_PICTURES.values(), ids=BAD_PICTURES.keys())
-def test_a_picture_that_is_no_panorama_is_refused_by_what_is_wrong(
+def test_invalid_panorama_is_rejected_with_its_fault(
     client: httpx.Client, flat: str, picture: bytes, message: str
 ) -> None:
     begin = monotonic()
@@ -224,7 +222,7 @@ def test_a_picture_that_is_no_panorama_is_refused_by_what_is_wrong(
     assert monotonic() - begin < 2.0
 
 
-def test_a_picture_of_too_many_bytes_is_refused(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_too_large_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, max_panorama_bytes=len(panorama) - 1) as client:
         plan_id = upload(client)
         assert (
@@ -233,7 +231,7 @@ def test_a_picture_of_too_many_bytes_is_refused(start_app: StartApp, tmp_path: P
         )
 
 
-def test_a_camera_height_is_solved_for_unless_it_is_exact(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_camera_height_is_solved_unless_exact(client: httpx.Client, flat: str, panorama: bytes) -> None:
     exact = localise(client, flat, panorama, refine="vdr", camera_height_m=1.713, camera_height_std_m=0).json()
     assert exact["camera_height_m"] == 1.713
     inexact = localise(client, flat, panorama, refine="none", camera_height_m=1.713, camera_height_std_m=0.3).json()
@@ -245,7 +243,7 @@ def test_a_camera_height_is_solved_for_unless_it_is_exact(client: httpx.Client, 
     assert "2.4 m" in above["detail"]
 
 
-def test_no_height_needs_a_grid_of_its_own(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_all_heights_share_one_grid(client: httpx.Client, flat: str, panorama: bytes) -> None:
     for height_m in (1.2, 1.6, 1.9):
         assert localise(client, flat, panorama, refine="none", camera_height_m=height_m).status_code == 200
     text = client.get("/metrics").text
@@ -253,25 +251,23 @@ def test_no_height_needs_a_grid_of_its_own(client: httpx.Client, flat: str, pano
 
 
 @pytest.mark.parametrize(("std_m", "limit"), [("-0.1", "0"), ("2.1", "2"), ("nan", "finite")])
-def test_a_deviation_of_the_height_has_limits(
-    client: httpx.Client, flat: str, panorama: bytes, std_m: str, limit: str
-) -> None:
+def test_height_deviation_has_limits(client: httpx.Client, flat: str, panorama: bytes, std_m: str, limit: str) -> None:
     problem = assert_problem(localise(client, flat, panorama, camera_height_std_m=std_m), 422, "invalid-request")
     assert problem["errors"][0]["field"] == "camera_height_std_m"
     assert limit in problem["errors"][0]["message"]
 
 
-def test_a_plan_that_says_no_camera_height_is_searched_at_any(client: httpx.Client, panorama: bytes) -> None:
+def test_unknown_camera_height_is_searched(client: httpx.Client, panorama: bytes) -> None:
     document = {key: value for key, value in FLAT.items() if key != "camera_height_m"}
     plan = client.post("/floorplans", json=document).json()["id"]
     found = localise(client, plan, panorama, refine="none", top_k=10).json()
     stated = localise(client, plan, panorama, refine="none", top_k=10, camera_height_m=1.5).json()
     assert 0.8 <= found["camera_height_m"] <= 2.2
-    # More heights to choose from: nothing fits worse.
+    # More heights to choose from can only lower the cost.
     assert found["candidates"][0]["cost"] <= stated["candidates"][0]["cost"] + 1e-6
 
 
-def test_answers_name_rooms_by_their_ids_too(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_answer_has_room_ids(client: httpx.Client, flat: str, panorama: bytes) -> None:
     answer = localise(client, flat, panorama, refine="none", top_k=10).json()
     ids = {room["name"]: room["id"] for room in FloorPlan.from_dict(FLAT).to_dict()["rooms"]}
     assert answer["room_id"] == ids[answer["room"]]
@@ -280,7 +276,7 @@ def test_answers_name_rooms_by_their_ids_too(client: httpx.Client, flat: str, pa
 
 
 @pytest.mark.parametrize("heading", [None, 30.0])
-def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
+def test_confidence_does_not_depend_on_top_k(
     start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes, heading: float | None
 ) -> None:
     copy = tmp_path / "bundle"
@@ -299,12 +295,12 @@ def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
     expected = found.confidence(model)
     assert expected is not None
     assert 0.0 < expected < 1.0
-    # Opposite places of a rectangular room fit alike but for rounding, and which is the first decides a few per cent.
-    for name, told in (("confidence", expected), ("heading_confidence", found.heading_confidence(model))):
+    # Opposite places of a rectangular room tie up to rounding, and their order changes a few per cent.
+    for name, value in (("confidence", expected), ("heading_confidence", found.heading_confidence(model))):
         assert len({answer[name] for answer in answers}) == 1
-        assert answers[0][name] == pytest.approx(told, rel=0.05, abs=1e-4)
+        assert answers[0][name] == pytest.approx(value, rel=0.05, abs=1e-4)
     shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]
-    # Confidence is of the place, whichever way the camera looks there.
+    # Confidence is about the place, for any heading.
     assert 0.0 < shares[0] <= answers[-1]["confidence"]
     assert sum(shares) <= 1.0
     assert unfitted["confidence"] is None
@@ -312,7 +308,7 @@ def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
 
 
 def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipeline.Localisation:
-    """What the core says of a query of the flat, as far as the first stage."""
+    """Return the core's retrieval result for a query of the flat."""
     encoders = Encoders(Bundle.open(bundle), threads=1)
     manifest, limits = encoders.manifest, Settings().panoramas.panorama_limits
     image = read_panorama(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
@@ -322,14 +318,14 @@ def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipel
     return pipeline.localise(plan, grid, encoders, query, refine="none")
 
 
-def test_a_model_without_confidence_says_null(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, panorama: bytes) -> None:
     answer = localise(client, flat, panorama, refine="none").json()
     assert answer["confidence"] is None
     assert answer["covariance_m2"] is None
     assert answer["heading_std_deg"] is None
 
 
-def test_a_plan_still_preparing_is_waited_for(client: httpx.Client, panorama: bytes) -> None:
+def test_query_waits_for_a_preparing_plan(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
     assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
     assert localise(client, plan_id, panorama, refine="none").status_code == 200
@@ -338,7 +334,7 @@ def test_a_plan_still_preparing_is_waited_for(client: httpx.Client, panorama: by
 
 def test_waiting_ends_at_the_deadline(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, request_deadline_s=0.15) as client:
-        # Else it may be the decoder that is waited for.
+        # Otherwise the query can wait for the decoder instead.
         wait_for(lambda: client.get("/readyz").status_code == 200)
         plan_id = upload(client, HALL, wait=False)
         response = localise(client, plan_id, panorama, refine="none")
@@ -349,14 +345,14 @@ def test_waiting_ends_at_the_deadline(start_app: StartApp, tmp_path: Path, panor
         assert localise(client, plan_id, panorama, refine="none").status_code == 200
 
 
-def test_a_query_that_cannot_be_computed_in_time_is_ended(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_slow_query_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, request_deadline_s=1e-6) as client:
         response = localise(client, upload(client), panorama)
         assert_problem(response, 504, "deadline-exceeded")
 
 
 @pytest.mark.one_replica
-def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_queries_beyond_the_limit_are_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, max_pending_requests=1) as client, ThreadPoolExecutor(1) as threads:
         plan_id = upload(client, HALL, wait=False)
         waiting = threads.submit(localise, client, plan_id, panorama, refine="none")
@@ -368,7 +364,7 @@ def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_p
 
 
 @pytest.mark.one_replica
-def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
+def test_hanging_database_does_not_block_known_plans(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
 ) -> None:
     with start_app(tmp_path, database_url=postgres.new_database(), database_wait_s=1.0) as client:
@@ -378,7 +374,7 @@ def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
             begin = monotonic()
             for _ in range(8):
                 assert localise(client, known, panorama, refine="none").status_code == 200
-            # Not each of them waits, and those that wait do not take all threads.
+            # Not every query waits, and waiting queries leave threads free.
             assert monotonic() - begin < 6.0
             assert_problem(localise(client, unknown, panorama, refine="none"), 503, "store-unavailable")
             assert_problem(
@@ -394,7 +390,7 @@ def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
         wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 404)
 
 
-def test_uploads_hold_up_no_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     plan = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, inline_grid_poses=10**6) as client:
         plan_id = upload(client)
@@ -417,7 +413,7 @@ def test_uploads_hold_up_no_query(start_app: StartApp, tmp_path: Path, panorama:
                 stop.set()
 
 
-def test_deleting_a_plan_ends_the_queries_that_wait_for_it(client: httpx.Client, panorama: bytes) -> None:
+def test_deleting_a_plan_ends_waiting_queries(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
     responses: list[httpx.Response] = []
     waiting = threading.Thread(target=lambda: responses.append(localise(client, plan_id, panorama, refine="none")))
@@ -428,7 +424,7 @@ def test_deleting_a_plan_ends_the_queries_that_wait_for_it(client: httpx.Client,
     assert_problem(responses[0], 404, "unknown-floorplan")
 
 
-def test_the_event_loop_stays_free_while_queries_compute(client: httpx.Client, flat: str) -> None:
+def test_event_loop_stays_free_during_queries(client: httpx.Client, flat: str) -> None:
     picture = encode_picture(2048, 1024, "PNG")
     with ThreadPoolExecutor(4) as threads:
         queries = [threads.submit(localise, client, flat, picture, refine="vdr") for _ in range(8)]

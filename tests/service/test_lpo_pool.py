@@ -1,4 +1,4 @@
-"""The LPO pool: right answers, and None, soon, whatever happens to its workers; `test_pools` has the rest."""
+"""The LPO pool: right results, and a prompt None if workers fail; `test_pools` covers the pool itself."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def bundle(tiny_bundle: Path) -> Bundle:
 
 @pytest.fixture(scope="module")
 def pool(bundle: Bundle) -> Iterator[LpoPool]:
-    """Two workers; every test leaves, or waits for, both of them warm."""
+    """Two workers; every test leaves both of them warm, or waits until they are."""
     with _pool(bundle, workers=2, lpo_queue=6, lpo_stall_s=5.0) as started:
         yield started
 
@@ -63,7 +63,7 @@ def job(bundle: Bundle) -> RefinementJob:
 
 
 def _refine(pool: LpoPool, job: RefinementJob, timeout_s: float) -> RefinementResult | None:
-    """As the service does, but on an event loop of its own."""
+    """Refine on an event loop of its own."""
     result = asyncio.run(pool.refine(job, timeout_s))
     assert not isinstance(result, SequenceResult)
     return result
@@ -74,7 +74,7 @@ def _workers() -> list[int]:
 
 
 @pytest.mark.parametrize("by_profile", [False, True])
-def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
+def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
     from lalaloc_core.localise.optimise import PoseRefiner
 
     job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
@@ -89,9 +89,9 @@ def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, 
     np.testing.assert_allclose(result.information, expected.information, rtol=1e-2, atol=1e-2)
 
 
-def test_many_callers_each_get_their_own_answer(pool: LpoPool, job: RefinementJob) -> None:
+def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: RefinementJob) -> None:
     jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
-    alone = [_refine(pool, one, 20.0) for one in jobs]
+    alone = [_refine(pool, job, 20.0) for job in jobs]
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda one: _refine(pool, one, 20.0), jobs))
     for first, second in zip(alone, together, strict=True):
@@ -100,35 +100,33 @@ def test_many_callers_each_get_their_own_answer(pool: LpoPool, job: RefinementJo
         np.testing.assert_array_equal(first.position_m, second.position_m)
 
 
-def test_a_job_that_breaks_the_optimiser_has_no_answer_and_leaves_the_worker_alive(
-    pool: LpoPool, job: RefinementJob
-) -> None:
+def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) -> None:
     workers = set(_workers())
     assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), 20.0) is None
     assert _refine(pool, job, 20.0) is not None
     assert set(_workers()) == workers
 
 
-def test_no_time_means_no_answer_at_once(pool: LpoPool, job: RefinementJob) -> None:
+def test_no_time_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     assert _refine(pool, job, 0.0) is None
     assert _refine(pool, job, -1.0) is None
 
 
-def test_a_worker_killed_while_idle_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
+def test_idle_killed_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     killed, other = _workers()
     os.kill(killed, signal.SIGKILL)
-    # Right after the kill nobody knows yet: the other worker answers all the same.
+    # The kill is not noticed yet, but the other worker runs the job.
     assert _refine(pool, job, 20.0) is not None
     wait_for(lambda: killed not in _workers() and pool.state.ready == len(_workers()) == 2, 120.0)
     assert other in _workers()
 
 
-def test_while_another_worker_lives_a_killed_one_costs_no_answer(pool: LpoPool, job: RefinementJob) -> None:
+def test_second_worker_takes_over_from_a_killed_one(pool: LpoPool, job: RefinementJob) -> None:
     first, second = _workers()
     for pid in (first, second):
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(1) as threads:
-        # One of the two, who knows which, holds the job when the first dies.
+        # Either of the two holds the job when the first one dies.
         waiting = threads.submit(_refine, pool, job, 20.0)
         wait_for(lambda: pool._workers.waiting == 0 and waiting.running())
         sleep(0.3)
@@ -137,25 +135,25 @@ def test_while_another_worker_lives_a_killed_one_costs_no_answer(pool: LpoPool, 
         assert waiting.result() is not None
 
 
-def test_a_worker_that_stalls_costs_its_deadline_and_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
+def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     stopped = set(_workers())
     for pid in stopped:
         os.kill(pid, signal.SIGSTOP)
     begin = monotonic()
     assert _refine(pool, job, 0.5) is None
     assert monotonic() - begin < 3.0
-    # The one that holds the job is given up; the other one is only idle.
+    # The worker with the job is killed; the other one is idle.
     wait_for(lambda: len(stopped & set(_workers())) == 1)
     for pid in stopped & set(_workers()):
         os.kill(pid, signal.SIGCONT)
     assert _refine(pool, job, 20.0) is not None
 
 
-def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob) -> None:
+def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     for pid in _workers():
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
-        # Two jobs are at the workers, four fill what one client may have of the queue.
+        # Two jobs run, and four fill one client's share of the queue.
         waiting = [threads.submit(_refine, pool, job, 10.0) for _ in range(6)]
         wait_for(lambda: pool._workers.waiting == 4, 8.0)
         begin = monotonic()
@@ -166,9 +164,7 @@ def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob)
         assert len([future.result() for future in waiting]) == 6
 
 
-def test_a_pool_that_will_not_be_warm_in_time_answers_none_at_once_and_closes_cleanly(
-    bundle: Bundle, job: RefinementJob
-) -> None:
+def test_cold_pool_returns_none_and_closes(bundle: Bundle, job: RefinementJob) -> None:
     others = set(_workers())
     with _pool(bundle, workers=1) as cold:
         wait_for(lambda: bool(set(_workers()) - others))
@@ -179,13 +175,13 @@ def test_a_pool_that_will_not_be_warm_in_time_answers_none_at_once_and_closes_cl
     assert not set(_workers()) - others
 
 
-def test_a_pool_without_workers_answers_none(bundle: Bundle, job: RefinementJob) -> None:
+def test_pool_without_workers_returns_none(bundle: Bundle, job: RefinementJob) -> None:
     with _pool(bundle, workers=0) as none:
         assert _refine(none, job, 20.0) is None
         assert none.state.warmed_up
 
 
-def test_a_bundle_changed_on_disk_is_not_used(tiny_bundle: Path, tmp_path: Path, job: RefinementJob) -> None:
+def test_changed_bundle_is_not_used(tiny_bundle: Path, tmp_path: Path, job: RefinementJob) -> None:
     copy = tmp_path / "bundle"
     shutil.copytree(tiny_bundle, copy)
     bundle = Bundle.open(copy)

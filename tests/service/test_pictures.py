@@ -1,4 +1,4 @@
-"""`POST /localise` with `Accept` of a picture: the answer, drawn."""
+"""Answers drawn as pictures: `POST /localise` with an image type in `Accept`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def flat(client: httpx.Client) -> str:
     return upload(client)
 
 
-def asked(
+def request_picture(
     client: httpx.Client, plan_id: str, photograph: bytes, accept: str, query: str = "", **headers: str
 ) -> httpx.Response:
     data = {"floorplan_id": plan_id, "heading_deg": "30", "refine": "vdr"}
@@ -33,9 +33,9 @@ def asked(
 
 
 @pytest.mark.parametrize("picture", ["plan", "photograph", "both"])
-def test_an_answer_is_drawn_as_svg(client: httpx.Client, flat: str, panorama: bytes, picture: str) -> None:
-    answer = asked(client, flat, panorama, JSON).json()
-    response = asked(client, flat, panorama, SVG, f"?picture={picture}")
+def test_answer_is_drawn_as_svg(client: httpx.Client, flat: str, panorama: bytes, picture: str) -> None:
+    answer = request_picture(client, flat, panorama, JSON).json()
+    response = request_picture(client, flat, panorama, SVG, f"?picture={picture}")
     assert response.status_code == 200, response.text
     assert response.headers["content-type"].split(";")[0] == SVG
     assert "Accept" in response.headers["vary"]
@@ -52,38 +52,39 @@ def test_an_answer_is_drawn_as_svg(client: httpx.Client, flat: str, panorama: by
     assert all(href.startswith("data:image/") for href in hrefs), "nothing is loaded from elsewhere"
 
 
-def test_an_answer_is_drawn_as_png_with_the_photograph_in_it(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    response = asked(client, flat, panorama, PNG, "?picture=photograph")
+def test_png_contains_the_photograph(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    response = request_picture(client, flat, panorama, PNG, "?picture=photograph")
     assert response.status_code == 200, response.text
     assert response.headers["content-type"] == PNG
     with Image.open(io.BytesIO(response.content)) as drawn, Image.open(io.BytesIO(panorama)) as sent:
         assert drawn.width == 1600
-        # The upper part of the photograph, which no line crosses.
+        # Upper part of the photograph, without lines.
         inside = np.asarray(drawn.convert("RGB").crop((36, 104, 36 + 1528, 104 + 150)).resize((64, 8))).astype(float)
         above = np.asarray(sent.convert("RGB").crop((0, 0, 512, 50)).resize((64, 8))).astype(float)
     assert np.abs(inside - above).mean() < 6.0
 
 
-def test_both_is_what_is_drawn_unless_it_is_said(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_picture_shows_both_by_default(client: httpx.Client, flat: str, panorama: bytes) -> None:
     classes = {
-        element.get("class") for element in ElementTree.fromstring(asked(client, flat, panorama, SVG).text).iter()
+        element.get("class")
+        for element in ElementTree.fromstring(request_picture(client, flat, panorama, SVG).text).iter()
     }
     assert {"layout", "camera"} <= classes
 
 
-def test_what_goes_wrong_is_told_in_json(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    assert_problem(asked(client, flat, b"no picture", PNG), 422, "invalid-panorama")
-    assert_problem(asked(client, "0" * 32, panorama, PNG), 404, "unknown-floorplan")
-    problem = assert_problem(asked(client, flat, panorama, PNG, "?picture=mesh"), 422, "invalid-request")
+def test_problems_are_json(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    assert_problem(request_picture(client, flat, b"no picture", PNG), 422, "invalid-panorama")
+    assert_problem(request_picture(client, "0" * 32, panorama, PNG), 404, "unknown-floorplan")
+    problem = assert_problem(request_picture(client, flat, panorama, PNG, "?picture=mesh"), 422, "invalid-request")
     assert problem["errors"][0]["field"] == "picture"
-    problem = assert_problem(asked(client, flat, panorama, JSON, "?picture=plan"), 422, "invalid-request")
+    problem = assert_problem(request_picture(client, flat, panorama, JSON, "?picture=plan"), 422, "invalid-request")
     assert "Accept: image/png" in problem["errors"][0]["message"]
-    keyed = asked(client, flat, panorama, PNG, **{"Idempotency-Key": "one"})
+    keyed = request_picture(client, flat, panorama, PNG, **{"Idempotency-Key": "one"})
     problem = assert_problem(keyed, 422, "invalid-request")
     assert problem["errors"][0]["field"] == "Idempotency-Key"
 
 
-def test_the_client_asks_for_pictures(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_client_requests_pictures(client: httpx.Client, flat: str, panorama: bytes) -> None:
     with Client(str(client.base_url)) as service:
         svg = service.picture(flat, panorama, "plan", picture_format="svg", heading_deg=30.0, refine="none")
         assert svg.startswith(b"<svg")
@@ -110,6 +111,6 @@ def test_the_client_asks_for_pictures(client: httpx.Client, flat: str, panorama:
         (" , ;q=1,,", JSON),
     ],
 )
-def test_the_representation_that_is_preferred(accept: str | None, expected: str) -> None:
+def test_accept_header_selects_the_representation(accept: str | None, expected: str) -> None:
     headers = [] if accept is None else [(b"accept", accept.encode())]
     assert preferred(Request({"type": "http", "headers": headers}), (JSON, PNG, SVG)) == expected

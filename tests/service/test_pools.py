@@ -1,4 +1,4 @@
-"""Pools of worker processes: what happens to a worker costs its callers at most a `JobLostError`, and that soon."""
+"""Pools of worker processes: a dead or stalled worker costs its callers at most a prompt `JobLostError`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _count(log: Path, line: str) -> int:
 
 def _kill(pids: list[int]) -> None:
     for pid in pids:
-        # It may just have been replaced.
+        # The worker can just have been replaced.
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
@@ -83,7 +83,7 @@ def _reason(future: Future[Any]) -> str:
     return lost.value.reason
 
 
-def test_every_caller_gets_its_own_answer_and_errors_cost_no_worker(log: Path) -> None:
+def test_each_caller_gets_its_own_result(log: Path) -> None:
     with _warm_pool(log, workers=2, queue_limit=100) as pool, ThreadPoolExecutor(8) as threads:
         answers = [threads.submit(_run, pool, ("echo", index), 20.0) for index in range(50)]
         broken = [threads.submit(_run, pool, ("raise", "on purpose"), 20.0) for _ in range(5)]
@@ -92,7 +92,7 @@ def test_every_caller_gets_its_own_answer_and_errors_cost_no_worker(log: Path) -
         assert _count(log, "start") == 2
 
 
-def test_a_job_whose_worker_is_killed_is_done_by_the_next_one(log: Path) -> None:
+def test_job_of_killed_worker_is_retried(log: Path) -> None:
     with _warm_pool(log) as pool:
         answer = pool.submit(("sleep", 0.5), 20.0)
         wait_for(lambda: _count(log, "sleep") == 1)
@@ -102,7 +102,7 @@ def test_a_job_whose_worker_is_killed_is_done_by_the_next_one(log: Path) -> None
         assert _count(log, "sleep") == 2
 
 
-def test_a_job_has_no_answer_when_there_is_no_time_for_another_try(log: Path) -> None:
+def test_job_is_not_retried_past_its_deadline(log: Path) -> None:
     with _warm_pool(log) as pool:
         pool._supervisors[0]._start_s = 60.0
         begin = monotonic()
@@ -115,17 +115,17 @@ def test_a_job_has_no_answer_when_there_is_no_time_for_another_try(log: Path) ->
         assert monotonic() - begin < 5.0
 
 
-def test_a_job_that_kills_two_workers_is_never_tried_again(log: Path) -> None:
+def test_job_that_kills_two_workers_is_poisoned(log: Path) -> None:
     with _warm_pool(log, workers=2) as pool:
         assert _reason(pool.submit(("die", 1), 30.0)) == "poisoned"
         with pytest.raises(JobLostError, match="poisoned"):
             pool.submit(("die", 1), 30.0)
         assert _count(log, "die") == 2
-        # Others go on as before.
+        # Other jobs are not affected.
         assert _run(pool, ("echo", 2), 30.0) == 2
 
 
-def test_a_job_over_which_a_worker_stalls_is_given_up_and_tried_anew_when_it_comes_again(log: Path) -> None:
+def test_stalled_job_fails_and_can_be_resubmitted(log: Path) -> None:
     with _warm_pool(log, workers=2, stall_s=0.5) as pool:
         for tries in (1, 2):
             assert _reason(pool.submit(("sleep", 5.0), 30.0)) == "stalled"
@@ -133,7 +133,7 @@ def test_a_job_over_which_a_worker_stalls_is_given_up_and_tried_anew_when_it_com
             wait_for(lambda: pool.state.ready == 2)
 
 
-def test_a_job_of_which_its_caller_despairs_while_it_is_submitted_is_not_started(log: Path) -> None:
+def test_job_cancelled_during_submission_is_not_started(log: Path) -> None:
     async def leave_at_once(pool: Pool) -> None:
         # Large enough that copying and hashing it takes a while.
         waiting = asyncio.create_task(pool.run_job(("echo", bytes(200_000_000)), 20.0))
@@ -151,14 +151,14 @@ def test_a_job_of_which_its_caller_despairs_while_it_is_submitted_is_not_started
         assert _count(log, "echo") == 0
 
 
-def test_killing_at_any_moment_loses_no_answer_and_mixes_up_none(log: Path) -> None:
-    """Also in the middle of a message: answers are larger than what a pipe holds."""
+def test_random_kills_lose_and_mix_up_no_result(log: Path) -> None:
+    """Results are larger than a pipe's buffer, so that workers also die in the middle of a message."""
     rng = random.Random(5)
     stop = threading.Event()
 
     def kill_now_and_then(pool: Pool) -> None:
         while not stop.wait(rng.uniform(0.0, 0.8)):
-            # Now and then all at once; those that start up are killed as well.
+            # Sometimes all at once, including workers that are starting.
             _kill(rng.sample(pids, rng.randint(1, len(pids))) if (pids := _pids()) else [])
 
     def ask(pool: Pool, size: int) -> str:
@@ -170,32 +170,32 @@ def test_killing_at_any_moment_loses_no_answer_and_mixes_up_none(log: Path) -> N
     with _warm_pool(log, workers=2, queue_limit=16) as pool:
         killer = threading.Thread(target=kill_now_and_then, args=(pool,))
         killer.start()
-        end, told = monotonic() + 4.0, set[str]()
+        end, outcomes = monotonic() + 4.0, set[str]()
         with ThreadPoolExecutor(4) as threads:
             while monotonic() < end:
                 sizes = [rng.randint(1, 20_000_000) for _ in range(4)]
-                told |= set(threads.map(lambda size: ask(pool, size), sizes))
+                outcomes |= set(threads.map(lambda size: ask(pool, size), sizes))
         stop.set()
         killer.join()
-        # On a busy machine no worker may live long enough to be right.
-        assert told <= {"right", "poisoned", "died", "deadline", "not-ready"}
+        # On a busy machine it is possible that no worker lives long enough for a right result.
+        assert outcomes <= {"right", "poisoned", "died", "deadline", "not-ready"}
         assert _count(log, "start") > 4
         wait_for(lambda: pool.state.ready == 2)
         assert ask(pool, 20_000_000) == "right"
 
 
-def test_a_worker_that_stalls_is_replaced_even_in_the_middle_of_a_message(log: Path) -> None:
+def test_stalled_worker_is_replaced_mid_message(log: Path) -> None:
     with _warm_pool(log, stall_s=1.0) as pool:
         (stalled,) = _pids()
         os.kill(stalled, signal.SIGSTOP)
-        # Larger than what the pipe holds: the supervisor cannot even send it.
+        # Larger than the pipe's buffer, so that the supervisor cannot finish sending it.
         begin = monotonic()
         assert _run(pool, ("echo", b"x" * 10_000_000), 20.0) == b"x" * 10_000_000
         assert monotonic() - begin > 1.0
         assert stalled not in _pids()
 
 
-def test_jobs_that_nobody_waits_for_are_not_started(log: Path) -> None:
+def test_cancelled_jobs_are_not_started(log: Path) -> None:
     with _warm_pool(log) as pool:
         busy = pool.submit(("sleep", 1.0), 20.0)
         wait_for(lambda: _count(log, "sleep") == 1)
@@ -207,7 +207,7 @@ def test_jobs_that_nobody_waits_for_are_not_started(log: Path) -> None:
         assert _count(log, "echo") == _count(log, "raise") == 0
 
 
-def test_a_wait_that_is_cancelled_on_the_event_loop_cancels_the_job(log: Path) -> None:
+def test_cancelling_the_await_cancels_the_job(log: Path) -> None:
     async def give_up(pool: Pool) -> None:
         waiting = asyncio.create_task(pool.run_job(("echo", 1), 20.0))
         await asyncio.sleep(0.1)
@@ -224,7 +224,7 @@ def test_a_wait_that_is_cancelled_on_the_event_loop_cancels_the_job(log: Path) -
         assert _count(log, "echo") == 0
 
 
-def test_a_deadline_is_kept_and_the_worker_goes_on(log: Path) -> None:
+def test_deadline_is_kept_and_worker_continues(log: Path) -> None:
     with _warm_pool(log) as pool:
         begin = monotonic()
         with pytest.raises(JobLostError, match="deadline"):
@@ -234,7 +234,7 @@ def test_a_deadline_is_kept_and_the_worker_goes_on(log: Path) -> None:
         assert _count(log, "start") == 1
 
 
-def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Path) -> None:
+def test_full_queue_refuses_and_frees_cancelled_places(log: Path) -> None:
     with _warm_pool(log, queue_limit=3) as pool:
         pool.submit(("sleep", 1.5), 20.0)
         wait_for(lambda: _count(log, "sleep") == 1)
@@ -248,7 +248,7 @@ def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Pa
         assert second.result(20.0) == 2
 
 
-def test_clients_take_turns_at_the_workers(log: Path) -> None:
+def test_clients_take_turns(log: Path) -> None:
     done: list[str] = []
     with _warm_pool(log, queue_limit=20) as pool:
         busy = pool.submit(("sleep", 1.0), 20.0, "many")
@@ -273,13 +273,13 @@ def test_one_client_cannot_fill_the_queue(log: Path) -> None:
         busy.result(20.0)
 
 
-def test_a_worker_is_kept_for_others_also_while_one_that_stalled_is_replaced(log: Path) -> None:
+def test_spare_worker_is_kept_during_a_restart(log: Path) -> None:
     slow = {"target": worker_jobs.run_slow_start, "arguments": (str(log), 1.0)}
     with _warm_pool(log, workers=2, queue_limit=20, stall_s=1.5, keep_spare=True, **slow) as pool:
         lost = [pool.submit(("sleep", 20.0), 60.0, "worst") for _ in range(4)]
         for stalled in range(2):
             wait_for(lambda stalled=stalled: _count(log, "sleep") == stalled + 1)
-            # While it is at work, and after that while its worker is replaced.
+            # During the job, and then while its worker is replaced.
             assert pool.submit(("echo", 1), 20.0, "other").result(20.0) == 1
             assert not lost[stalled].done()
             assert _reason(lost[stalled]) == "stalled"
@@ -289,7 +289,7 @@ def test_a_worker_is_kept_for_others_also_while_one_that_stalled_is_replaced(log
             future.cancel()
 
 
-def test_closing_finishes_what_is_at_work_and_loses_what_waits(log: Path) -> None:
+def test_close_finishes_running_jobs_only(log: Path) -> None:
     with _warm_pool(log) as pool:
         at_work = pool.submit(("sleep", 0.5), 20.0)
         wait_for(lambda: _count(log, "sleep") == 1)
@@ -303,7 +303,7 @@ def test_closing_finishes_what_is_at_work_and_loses_what_waits(log: Path) -> Non
             _run(pool, ("echo", 1), 20.0)
 
 
-def test_closing_does_not_wait_longer_than_it_is_told(log: Path) -> None:
+def test_close_waits_no_longer_than_drain_s(log: Path) -> None:
     with _warm_pool(log) as pool:
         at_work = pool.submit(("sleep", 30.0), 60.0)
         wait_for(lambda: _count(log, "sleep") == 1)
@@ -313,7 +313,7 @@ def test_closing_does_not_wait_longer_than_it_is_told(log: Path) -> None:
         assert _reason(at_work) == "closing"
 
 
-def test_workers_that_cannot_start_are_tried_less_and_less_often(log: Path) -> None:
+def test_failing_starts_back_off(log: Path) -> None:
     with _pool(log, target=worker_jobs.run_broken) as pool:
         wait_for(lambda: _count(log, "start") == 3)
         begin = monotonic()
@@ -324,14 +324,14 @@ def test_workers_that_cannot_start_are_tried_less_and_less_often(log: Path) -> N
         assert not pool.state.warmed_up
 
 
-def test_a_worker_that_never_gets_ready_is_given_up(log: Path) -> None:
+def test_worker_that_never_gets_ready_is_killed(log: Path) -> None:
     slow = {"target": worker_jobs.run_slow_start, "arguments": (str(log), 60.0)}
     with _pool(log, max_start_s=1.0, **slow) as pool:
         wait_for(lambda: pool.state.fault is not None)
         assert pool.state.fault == "the worker did not start within 1 s"
 
 
-def test_a_worker_killed_while_it_starts_costs_a_waiting_job_only_time(log: Path) -> None:
+def test_kill_during_start_only_delays_a_job(log: Path) -> None:
     with _pool(log, start_s=2.0) as pool:
         answer = pool.submit(("echo", 1), 30.0)
         wait_for(lambda: pool.state.warmed_up)
@@ -339,7 +339,7 @@ def test_a_worker_killed_while_it_starts_costs_a_waiting_job_only_time(log: Path
         _kill(_pids())
         answer = pool.submit(("echo", 2), 30.0)
         for _ in range(2):
-            # Looked at often: a quiet machine starts a worker within a tenth of a second.
+            # Polled often, because an idle machine starts a worker within a tenth of a second.
             while not (len(_pids()) == 1 and not pool.state.ready):
                 sleep(0.002)
             _kill(_pids())

@@ -1,4 +1,4 @@
-"""What an answer tells besides the place when it is asked to, and the walls that drawing it needs."""
+"""The posterior of an answer, and the layout of a plan."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ DOORS = [
 ]
 
 
-def test_the_posterior_is_told_when_it_is_asked_for(client: httpx.Client, panorama: bytes) -> None:
+def test_posterior_is_included_on_request(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client)
     answer = localise(client, plan_id, panorama, include="posterior", heading_deg=10.0).json()
-    told = answer["posterior"]
+    posterior = answer["posterior"]
     step_m = client.get(f"/floorplans/{plan_id}").json()["grid"]["step_m"]
-    assert told["step_m"] == step_m
-    assert len(told["x_m"]) == len(told["y_m"]) == len(told["probability"]) > 0
-    assert sum(told["probability"]) == pytest.approx(1.0, abs=1e-3)
-    assert min(told["probability"]) > 0.0
+    assert posterior["step_m"] == step_m
+    assert len(posterior["x_m"]) == len(posterior["y_m"]) == len(posterior["probability"]) > 0
+    assert sum(posterior["probability"]) == pytest.approx(1.0, abs=1e-3)
+    assert min(posterior["probability"]) > 0.0
     plan = FloorPlan.from_dict(FLAT)
-    places = np.array([told["x_m"], told["y_m"]]).T
+    places = np.array([posterior["x_m"], posterior["y_m"]]).T
     assert all(any(room.shape.covers(type(room.shape.centroid)(*place)) for room in plan.rooms) for place in places)
     assert localise(client, plan_id, panorama, heading_deg=10.0).json()["posterior"] is None
 
 
-def test_nothing_else_can_be_included(client: httpx.Client, panorama: bytes) -> None:
+def test_unknown_include_is_rejected(client: httpx.Client, panorama: bytes) -> None:
     problem = assert_problem(localise(client, upload(client), panorama, include="grid"), 422, "invalid-request")
     (fault,) = problem["errors"]
     assert fault["field"] == "include"
     assert "posterior" in fault["message"]
 
 
-def test_the_layout_has_every_room_s_walls_with_the_openings_in_them(client: httpx.Client) -> None:
+def test_layout_has_walls_and_openings(client: httpx.Client) -> None:
     document = FLAT | {"openings": DOORS}
     plan_id = upload(client, document)
     layout = client.get(f"/floorplans/{plan_id}/layout").json()
     plan = FloorPlan.from_dict(document)
     assert layout["floorplan_id"] == plan_id
     assert [room["id"] for room in layout["rooms"]] == [room.id for room in plan.rooms]
-    for told, room in zip(layout["rooms"], plan.rooms, strict=True):
-        np.testing.assert_allclose(told["walls_m"], room.walls_m)
-        assert told["ceiling_height_m"] == room.ceiling_height_m
+    for drawn, room in zip(layout["rooms"], plan.rooms, strict=True):
+        np.testing.assert_allclose(drawn["walls_m"], room.walls_m)
+        assert drawn["ceiling_height_m"] == room.ceiling_height_m
     kitchen, living = layout["rooms"]
     assert [opening["kind"] for opening in kitchen["openings"]] == ["passage"]
     assert sorted(opening["kind"] for opening in living["openings"]) == ["passage", "window"]
@@ -59,7 +59,7 @@ def test_the_layout_has_every_room_s_walls_with_the_openings_in_them(client: htt
     assert kitchen["openings"][0]["sill_m"] is None
 
 
-def test_the_layout_of_an_older_revision_is_told_while_it_is_kept(client: httpx.Client) -> None:
+def test_layout_of_older_revision_is_available(client: httpx.Client) -> None:
     plan_id = upload(client)
     first = client.get(f"/floorplans/{plan_id}").json()["revision"]
     client.put(f"/floorplans/{plan_id}", json=FLAT | {"openings": DOORS}).raise_for_status()

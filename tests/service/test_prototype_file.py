@@ -1,4 +1,4 @@
-"""The file of prototypes: what was added is found, also after a crash, and nothing else."""
+"""The prototype file: blocks are found after reopening, also after a crash."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "folder" / "prototypes.bin"
 
 
-def test_what_was_added_is_found_also_by_the_next_process(path: Path) -> None:
+def test_blocks_are_found_after_reopening(path: Path) -> None:
     file = opened(path)
     assert len(file.rows()) == 0
     file.add({key(1): rows_of(1, 5), key(2): rows_of(2, 9)})
@@ -53,7 +53,7 @@ def test_what_was_added_is_found_also_by_the_next_process(path: Path) -> None:
         assert content(again, number) == rows_of(number, count).tobytes()
     assert again.find([BlockKey(1, f"{2:064x}"), BlockKey(4, f"{1:064x}")]) == {}
     again.close()
-    # Sorted into cells that are no more.
+    # Sorted into cells of another version.
     assert opened(path, cells_version=8).find([key(1)]) == {}
 
 
@@ -67,7 +67,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_damaged_end_is_cut_off_and_written_again(path: Path, damage: Callable[[bytes], bytes]) -> None:
+def test_damaged_end_is_truncated(path: Path, damage: Callable[[bytes], bytes]) -> None:
     file = opened(path)
     file.add({key(1): rows_of(1, 5)})
     file.add({key(2): rows_of(2, 9)})
@@ -81,7 +81,7 @@ def test_a_damaged_end_is_cut_off_and_written_again(path: Path, damage: Callable
     assert content(opened(path), 2) == rows_of(2, 9).tobytes()
 
 
-def test_a_full_file_begins_anew_and_leaves_queries_in_work_what_they_have(path: Path) -> None:
+def test_full_file_is_replaced_and_maps_stay_valid(path: Path) -> None:
     file = opened(path, limit_bytes=20 * ROW.itemsize)
     file.add({key(1): rows_of(1, 12)})
     begin, count = file.find([key(1)])[key(1)]
@@ -90,7 +90,7 @@ def test_a_full_file_begins_anew_and_leaves_queries_in_work_what_they_have(path:
     assert content(file, 1) is None
     assert content(file, 2) == rows_of(2, 15).tobytes()
     assert in_work[begin : begin + count].tobytes() == rows_of(1, 12).tobytes()
-    # More than may be in it at all.
+    # Larger than the limit of the file.
     file.add({key(3): rows_of(3, 20)})
     assert content(file, 3) is None
     assert content(file, 2) is not None
@@ -99,7 +99,7 @@ def test_a_full_file_begins_anew_and_leaves_queries_in_work_what_they_have(path:
     assert content(opened(path), 2) == rows_of(2, 15).tobytes()
 
 
-def test_two_processes_do_not_write_one_file(path: Path) -> None:
+def test_second_process_gets_its_own_file(path: Path) -> None:
     first = opened(path)
     first.add({key(1): rows_of(1, 5)})
     second = opened(path)
@@ -111,7 +111,7 @@ def test_two_processes_do_not_write_one_file(path: Path) -> None:
     first.close()
 
 
-def test_a_file_without_a_path_is_nowhere() -> None:
+def test_file_without_a_path_is_temporary() -> None:
     file = opened(None)
     file.add({key(1): rows_of(1, 5)})
     assert content(file, 1) == rows_of(1, 5).tobytes()

@@ -1,4 +1,4 @@
-"""Queries of several panoramas: what they may be, and what is told of them."""
+"""Queries of several panoramas: validation and answers."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **field
 
 
 @pytest.mark.parametrize("refine", ["none", "lpo"])
-def test_every_panorama_has_a_place_of_the_plan(
+def test_every_panorama_has_a_pose_in_the_plan(
     client: httpx.Client, plan_id: str, pictures: list[bytes], refine: str
 ) -> None:
     answer = answer_to(client, plan_id, pictures, motions=[MOTION, None], refine=refine, top_k=3)
-    # This app runs without LPO workers, so the best it can do is the grid.
+    # This app has no LPO workers, so the best stage is the grid.
     assert answer["stage"] == "retrieval"
     assert answer["floorplan_id"] == plan_id
     assert len(answer["poses"]) == 3
@@ -63,14 +63,12 @@ def test_every_panorama_has_a_place_of_the_plan(
         assert pose["position"] == pose["candidates"][0]["position"]
         assert 1 <= len(pose["candidates"]) <= 3
         for candidate in pose["candidates"]:
-            at = np.array([[candidate["position"]["x_m"], candidate["position"]["y_m"]]])
-            assert plan.rooms[int(plan.room_index_at(at)[0])].id == candidate["room_id"]
+            position_m = np.array([[candidate["position"]["x_m"], candidate["position"]["y_m"]]])
+            assert plan.rooms[int(plan.room_index_at(position_m)[0])].id == candidate["room_id"]
         assert pose["heading_source"] == "searched"
 
 
-def test_what_is_measured_exactly_is_what_the_answer_moves_by(
-    client: httpx.Client, plan_id: str, pictures: list[bytes]
-) -> None:
+def test_exact_motion_is_followed(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
     sharp = {"distance_m": 2.0, "distance_std_m": 0.01, "turn_deg": 90, "turn_std_deg": 1}
     answer = answer_to(client, plan_id, pictures[:2], motions=[sharp], refine="none")
     first, second = answer["poses"]
@@ -83,7 +81,7 @@ def test_what_is_measured_exactly_is_what_the_answer_moves_by(
         assert "motions[0] has distance_m 2, turn_deg 90" in answer["warnings"][0]
 
 
-def test_without_motions_the_answers_are_those_to_each_alone(
+def test_sequence_without_motions_equals_single_answers(
     client: httpx.Client, plan_id: str, pictures: list[bytes]
 ) -> None:
     fields = {"camera_height_m": 1.5, "camera_height_std_m": 0, "refine": "none"}
@@ -93,13 +91,19 @@ def test_without_motions_the_answers_are_those_to_each_alone(
         assert response.status_code == 200, response.text
         alone = response.json()
         assert pose["cost"] == pytest.approx(alone["cost"], abs=1e-3)
-        # A room that looks the same turned by half has two that are equally good.
-        best = [one for one in alone["candidates"] if one["cost"] == pytest.approx(alone["cost"], abs=1e-4)]
+        # A room with half-turn symmetry has two equally good candidates.
+        best = [
+            candidate
+            for candidate in alone["candidates"]
+            if candidate["cost"] == pytest.approx(alone["cost"], abs=1e-4)
+        ]
         assert len(best) <= 2
-        assert (pose["position"], pose["heading_deg"]) in [(one["position"], one["heading_deg"]) for one in best]
+        assert (pose["position"], pose["heading_deg"]) in [
+            (candidate["position"], candidate["heading_deg"]) for candidate in best
+        ]
 
 
-def test_headings_that_are_given_hold(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+def test_given_headings_are_followed(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
     fields = {"headings_deg": [10, None, 200], "heading_tolerance_deg": 5, "refine": "none"}
     poses = answer_to(client, plan_id, pictures, **fields)["poses"]
     assert poses[1]["heading_source"] == "searched"
@@ -130,26 +134,26 @@ def test_headings_that_are_given_hold(client: httpx.Client, plan_id: str, pictur
         (2, {"heading_deg": 5}, "heading_deg", "unknown part"),
     ],
 )
-def test_what_is_wrong_is_told(
+def test_invalid_sequence_is_rejected(
     client: httpx.Client, plan_id: str, panorama: bytes, count: int, fields: dict[str, Any], field: str, message: str
 ) -> None:
     problem = assert_problem(ask(client, plan_id, [panorama] * count, **fields), 422, "invalid-request")
     assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
 
 
-def test_a_panorama_that_is_none_is_told(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_invalid_panorama_is_rejected(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     assert_problem(ask(client, plan_id, [panorama, b"no picture"]), 422, "invalid-panorama")
     assert_problem(ask(client, "f" * 32, [panorama] * 2), 404, "unknown-floorplan")
 
 
-def test_all_together_are_bounded_and_the_limits_are_told(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     problem = assert_problem(ask(client, plan_id, [panorama, bytes(210_000)]), 413, "upload-too-large")
     assert "max_sequence_bytes" in problem["detail"]
     limits = client.get("/limits").json()
     assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (4, 200_000)
 
 
-def test_a_motion_is_the_one_that_was_stated() -> None:
+def test_stated_motion_is_parsed() -> None:
     stated = StatedMotion(**MOTION, direction_deg=-45, direction_std_deg=2)
     assert stated.motion == Motion(
         distance_m=1.5,

@@ -1,4 +1,4 @@
-"""What is stored comes back the same, in one piece or not at all; on SQLite and on PostgreSQL."""
+"""The store, on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ PLAN = FloorPlan.from_dict(FLAT)
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database of either kind."""
+    """Return the URL of an empty database of either kind."""
     if request.param == "sqlite":
         return _url(tmp_path)
     return request.getfixturevalue("postgres").new_database()
@@ -79,14 +79,14 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture
 def open_store(url: str) -> Iterator[OpenStore]:
-    """Opens the database once more, as another process would."""
+    """Return a function that opens the database again, as another process does."""
     opened: list[Store] = []
 
-    def one_more() -> Store:
+    def open_another() -> Store:
         opened.append(Store(url, wait_s=5.0))
         return opened[-1]
 
-    yield one_more
+    yield open_another
     for store in opened:
         store.close()
 
@@ -101,7 +101,7 @@ def _url(folder: Path) -> str:
 
 
 def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
-    """Add a plan, return the id of its revision."""
+    """Add a plan and return the id of its revision."""
     plan = FloorPlan.from_dict({**FLAT, "name": name})
     return store.plans.add(tenant, plan_id, plan, original=Original(b"{}"), limit=100).revision_id
 
@@ -141,7 +141,7 @@ def _rows(store: Store, table: object) -> int:
 # Plans and originals
 
 
-def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_path: Path) -> None:
+def test_plan_cache_saves_parsing_unless_disabled(tmp_path: Path) -> None:
     kept, not_kept = Store(_url(tmp_path)), Store(_url(tmp_path), plan_cache_bytes=0)
     revision_id = _add(kept, "p")
     for store, same in ((kept, True), (not_kept, False)):
@@ -153,8 +153,8 @@ def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_
         assert store.plan_cache.revisions() == ({revision_id} if same else set())
     changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
     kept.plans.add_revision("default", "p", changed, original=Original(b"{}"), keep=5)
-    told = [kept.plans.get("default", "p"), kept.plans.get_revision("default", "p", revision_id)]
-    assert [record and record.plan.name for record in told] == ["changed", "Flat 3"]
+    records = [kept.plans.get("default", "p"), kept.plans.get_revision("default", "p", revision_id)]
+    assert [record and record.plan.name for record in records] == ["changed", "Flat 3"]
     assert kept.plans.delete("default", "p")
     assert kept.plan_cache.revisions() == set()
     for store in (kept, not_kept):
@@ -162,7 +162,7 @@ def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_
 
 
 @pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES, 2 * CHUNK_BYTES + 3])
-def test_a_plan_and_its_original_are_seen_by_another_process_at_once(open_store: OpenStore, size: int) -> None:
+def test_stored_plan_is_visible_to_other_processes(open_store: OpenStore, size: int) -> None:
     first, second = open_store(), open_store()
     original = np.random.default_rng(1).bytes(size)
     added = first.plans.add("default", "p1", PLAN, original=Original(original), limit=10)
@@ -177,14 +177,14 @@ def test_a_plan_and_its_original_are_seen_by_another_process_at_once(open_store:
     assert second.plans.get("default", "p1") is None
 
 
-def test_a_plan_may_be_stored_along_with_its_grid(store: Store) -> None:
+def test_plan_is_stored_with_its_grid(store: Store) -> None:
     computed = ComputedGrid(model_sha256="m1", grid=_grid())
     record = store.plans.add("default", "p1", PLAN, original=Original(b"{}"), limit=10, grid=computed)
     _assert_same(store.grids.get(computed.key(record.revision_id)), computed.grid)
 
 
 @pytest.mark.parametrize("broken", ["original", "grid"])
-def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store, broken: str) -> None:
+def test_failed_insert_stores_nothing(store: Store, broken: str) -> None:
     grid = ComputedGrid(model_sha256=None if broken == "grid" else "m1", grid=_grid())  # pyright: ignore[reportArgumentType]
     original = None if broken == "original" else b"{}"
     with pytest.raises(Exception, match=r"(?i)not.null|buffer"):
@@ -193,7 +193,7 @@ def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store, b
     assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
 
 
-def test_the_number_of_plans_is_limited_for_each_tenant(store: Store) -> None:
+def test_plan_limit_is_per_tenant(store: Store) -> None:
     _add(store, tenant="one")
     store.plans.add("two", "b", PLAN, original=Original(b"{}"), limit=1)
     with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
@@ -201,7 +201,7 @@ def test_the_number_of_plans_is_limited_for_each_tenant(store: Store) -> None:
     assert [summary.id for summary in store.plans.list_plans("two", limit=10)] == ["b"]
 
 
-def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None:
+def test_plan_limit_holds_under_concurrency(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
 
     def add(number: int) -> bool:
@@ -216,7 +216,7 @@ def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None
     assert len(stores[0].plans.list_plans("default", limit=10)) == 5
 
 
-def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
+def test_plan_is_hidden_from_other_tenants(store: Store) -> None:
     revision_id = _add(store, "p", tenant="one")
     assert store.plans.get("two", "p") is None
     assert store.plans.get_revision("two", "p", revision_id) is None
@@ -229,7 +229,7 @@ def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
 
 
 @pytest.mark.parametrize("half_way", ["SELECT revisions.document", "SELECT original_chunks"])
-def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, half_way: str) -> None:
+def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) -> None:
     first, second = open_store(), open_store()
     original = bytes(CHUNK_BYTES + 1)
     added = first.plans.add("default", "p", PLAN, original=Original(original), limit=10)
@@ -246,9 +246,7 @@ def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, h
     assert second.plans.get("default", "p") is None
 
 
-def test_a_plan_is_read_when_the_database_is_done_with_it(
-    open_store: OpenStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore, monkeypatch: pytest.MonkeyPatch) -> None:
     _add(open_store(), "p")
     store, in_use = open_store(), []
     read = PlanDocument.plan
@@ -264,7 +262,7 @@ def test_a_plan_is_read_when_the_database_is_done_with_it(
     assert in_use == [0, 0]
 
 
-def test_what_was_odd_about_a_plan_is_kept_and_not_looked_for_again(open_store: OpenStore) -> None:
+def test_warnings_are_stored_and_not_recomputed(open_store: OpenStore) -> None:
     plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
     open_store().plans.add("default", "p", plan, original=Original(b"{}"), limit=10)
     found = open_store().plans.get("default", "p")
@@ -272,7 +270,7 @@ def test_what_was_odd_about_a_plan_is_kept_and_not_looked_for_again(open_store: 
     assert found.plan.warnings == plan.warnings
 
 
-def test_a_plan_of_an_earlier_version_is_read_and_looked_at_again(open_store: OpenStore) -> None:
+def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> None:
     rooms = [{"name": name, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]} for name in ("one", "other")]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms})
     store = open_store()
@@ -285,9 +283,7 @@ def test_a_plan_of_an_earlier_version_is_read_and_looked_at_again(open_store: Op
 
 
 @pytest.mark.parametrize("damage", [lambda text: text.replace("4.0", "4.5", 1), lambda text: text[:-1]])
-def test_a_plan_that_is_not_what_was_validated_is_not_given_out(
-    open_store: OpenStore, damage: Callable[[str], str]
-) -> None:
+def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[str], str]) -> None:
     store = open_store()
     _add(store, "p")
     with store._database.writing() as connection:
@@ -306,7 +302,7 @@ def test_a_plan_that_is_not_what_was_validated_is_not_given_out(
 
 
 @pytest.mark.parametrize("cut_off", [True, False])
-def test_an_original_that_is_not_what_was_uploaded_is_not_given_out(store: Store, cut_off: bool) -> None:
+def test_damaged_original_is_an_error(store: Store, cut_off: bool) -> None:
     store.plans.add("default", "p", PLAN, original=Original(bytes(CHUNK_BYTES + 1)), limit=10)
     with store._database.writing() as connection:
         last = ORIGINAL_CHUNKS.c.number == 1
@@ -317,7 +313,7 @@ def test_an_original_that_is_not_what_was_uploaded_is_not_given_out(store: Store
         store.plans.original("default", "p")
 
 
-def test_deleting_a_plan_leaves_nothing_of_it(store: Store) -> None:
+def test_deleted_plan_leaves_no_rows(store: Store) -> None:
     revision_id = _add(store, "p")
     store.plans.add_revision("default", "p", PLAN, original=Original(b"second"), keep=5)
     _put(store, _key(revision_id))
@@ -329,7 +325,7 @@ def test_deleting_a_plan_leaves_nothing_of_it(store: Store) -> None:
     assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
 
 
-def test_listing_is_newest_first_and_paged_by_cursor(store: Store) -> None:
+def test_listing_is_newest_first_and_paged(store: Store) -> None:
     ids = [f"{index:032d}" for index in range(5)]
     for plan_id in ids:
         _add(store, plan_id)
@@ -342,23 +338,23 @@ def test_listing_is_newest_first_and_paged_by_cursor(store: Store) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "found"),
+    ("name", "found"),
     [("FLAT", {"a", "b"}), ("straße", {"c"}), ("STRASSE", {"c"}), ("äpfel", {"d"}), ("%", {"b"}), ("_", set())],
 )
-def test_names_are_found_by_any_part_in_any_case(store: Store, asked: str, found: set[str]) -> None:
+def test_name_filter_is_case_insensitive(store: Store, name: str, found: set[str]) -> None:
     for plan_id, name in {"a": "Flat 3", "b": "flat 100%", "c": "Lange Straße 5", "d": "ÄPFEL"}.items():
         _add(store, plan_id, name=name)
-    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=asked)} == found
+    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=name)} == found
 
 
-def test_summaries_are_those_of_the_plans_that_there_are(store: Store) -> None:
+def test_summaries_skip_missing_plans(store: Store) -> None:
     _add(store, "a", name="one")
     _add(store, "b", name="two")
     assert {summary.id: summary.name for summary in store.plans.summaries({"b", "gone"})} == {"b": "two"}
     assert store.plans.summaries(set()) == []
 
 
-def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) -> None:
+def test_repeated_upload_is_stored_once(store: Store) -> None:
     first = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
     again = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
     assert (again.revision_id, again.revision) == (first.revision_id, 1)
@@ -368,7 +364,7 @@ def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) ->
 # Revisions
 
 
-def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: Store) -> None:
+def test_old_revision_stays_readable(store: Store) -> None:
     old = _add(store, "p")
     smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
     new = store.plans.add_revision("default", "p", smaller, original=Original(b"new"), keep=5, expected=old)
@@ -385,7 +381,7 @@ def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: 
     assert store.plans.current_revisions([old, new.revision_id, "nonsense"]) == {new.revision_id}
 
 
-def test_a_revision_that_follows_another_one_than_expected_is_refused(store: Store) -> None:
+def test_unexpected_revision_is_rejected(store: Store) -> None:
     old = _add(store, "p")
     new = store.plans.add_revision("default", "p", PLAN, original=Original(b"2"), keep=5, expected=old)
     with pytest.raises(RevisionMismatchError, match=new.revision_id):
@@ -393,7 +389,7 @@ def test_a_revision_that_follows_another_one_than_expected_is_refused(store: Sto
     assert store.plans.original("default", "p") == Original(b"2")
 
 
-def test_of_two_revisions_at_the_same_time_that_expect_the_same_one_is_refused(open_store: OpenStore) -> None:
+def test_one_of_two_concurrent_revisions_is_rejected(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
     old = _add(stores[0], "p")
 
@@ -408,7 +404,7 @@ def test_of_two_revisions_at_the_same_time_that_expect_the_same_one_is_refused(o
         assert sorted(threads.map(add, stores)) == [False, True]
 
 
-def test_revisions_and_their_grids_are_bounded(store: Store) -> None:
+def test_revisions_and_grids_are_limited(store: Store) -> None:
     ids = [_add(store, "p")]
     for number in range(4):
         _put(store, _key(ids[-1]))
@@ -417,7 +413,7 @@ def test_revisions_and_their_grids_are_bounded(store: Store) -> None:
         )
     kept = [store.plans.get_revision("default", "p", revision_id) is not None for revision_id in ids]
     assert kept == [False, False, True, True, True]
-    # A query in work may still want the grid of the revision before.
+    # Running queries can still need the grid of the previous revision.
     assert {revision_id for revision_id, _ in store.grids.poses("m1", 0.5)} == {ids[3]}
     assert _rows(store, ORIGINAL_CHUNKS) == 3
 
@@ -425,7 +421,7 @@ def test_revisions_and_their_grids_are_bounded(store: Store) -> None:
 # Grids
 
 
-def test_a_grid_comes_back_exactly_without_being_copied(store: Store) -> None:
+def test_grid_round_trip_is_exact_and_copies_nothing(store: Store) -> None:
     grid = _grid(count=5000)
     key = _key(_add(store))
     assert _put(store, key, grid)
@@ -438,7 +434,7 @@ def test_a_grid_comes_back_exactly_without_being_copied(store: Store) -> None:
     assert not found.latents.flags.writeable
 
 
-def test_a_grid_without_latents_comes_back_in_half_precision(store: Store) -> None:
+def test_grid_without_latents_has_half_precision(store: Store) -> None:
     whole, key = _grid(count=50), _key(_add(store))
     grid = dataclasses.replace(whole, latents=None, profile_m=whole.profile_m.astype(np.float16))
     assert _put(store, key, grid)
@@ -452,13 +448,13 @@ def test_a_grid_without_latents_comes_back_in_half_precision(store: Store) -> No
 
 
 @pytest.mark.parametrize("changed", [{"model_sha256": "m2"}, {"step_m": 0.25}, {"camera_height_mm": 1520}])
-def test_a_grid_is_found_for_its_own_key_only(store: Store, changed: dict[str, object]) -> None:
+def test_grid_is_found_by_its_key_only(store: Store, changed: dict[str, object]) -> None:
     revision_id = _add(store)
     _put(store, _key(revision_id))
     assert store.grids.get(_key(revision_id, **changed)) is None
 
 
-def test_grids_of_a_model_and_of_the_one_before_are_kept(store: Store) -> None:
+def test_grids_of_the_previous_model_are_kept(store: Store) -> None:
     revision_id = _add(store)
     for model in ("m1", "m2", "m3"):
         _put(store, _key(revision_id, model_sha256=model))
@@ -466,7 +462,7 @@ def test_grids_of_a_model_and_of_the_one_before_are_kept(store: Store) -> None:
     assert kept == [False, True, True]
 
 
-def test_grids_of_other_heights_are_bounded_and_the_plans_own_is_never_dropped(store: Store) -> None:
+def test_own_grid_is_never_dropped(store: Store) -> None:
     revision_id = _add(store)
     _put(store, _key(revision_id))
     for height_mm in (1600, 1620, 1640, 1660):
@@ -475,7 +471,7 @@ def test_grids_of_other_heights_are_bounded_and_the_plans_own_is_never_dropped(s
     assert heights == {1500, 1640, 1660}
 
 
-def test_a_grid_of_a_deleted_plan_is_not_stored(store: Store) -> None:
+def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:
     revision_id = _add(store, "p")
     store.plans.delete("default", "p")
     assert not _put(store, _key(revision_id))
@@ -490,16 +486,14 @@ def test_a_grid_of_a_deleted_plan_is_not_stored(store: Store) -> None:
         lambda content: b"NOPE" + content[4:],
         lambda content: content[:4] + b"\x08" + content[5:],
         lambda content: b"",
-        # The first coordinate of the first pose.
+        # First coordinate of the first pose.
         lambda content: content[:16] + struct.pack("<d", math.nan) + content[24:],
-        # The last value of the last profile, before the numbers of rooms.
+        # Last value of the last profile, before the room indices.
         lambda content: content[: -7 * 4 - 4] + struct.pack("<f", math.inf) + content[-7 * 4 :],
     ],
     ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite"],
 )
-def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
-    store: Store, damage: Callable[[bytes], bytes]
-) -> None:
+def test_damaged_grid_counts_as_missing(store: Store, damage: Callable[[bytes], bytes]) -> None:
     key = _key(_add(store))
     _put(store, key)
     with store._database.writing() as connection:
@@ -507,7 +501,7 @@ def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
         assert content is not None
         damaged = damage(bytes(content))
         connection.execute(update(GRID_CHUNKS).values(content=damaged))
-        # What is said of its size and digest agrees, so that the content itself is looked at.
+        # Size and digest agree, so that only the content is wrong.
         digest = hashlib.sha256(damaged).hexdigest()
         connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
     assert store.grids.get(key) is None
@@ -515,13 +509,13 @@ def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
     assert store.grids.get(key) is not None
 
 
-def test_a_grid_with_other_numbers_than_were_computed_is_not_read(store: Store) -> None:
+def test_grid_with_wrong_digest_is_not_read(store: Store) -> None:
     key = _key(_add(store))
     _put(store, key)
     with store._database.writing() as connection:
         content = connection.scalar(select(GRID_CHUNKS.c.content))
         assert content is not None
-        # Two poses change places: as good a grid as before, but of another plan.
+        # Two poses are swapped: a valid grid, but not the one that was computed.
         swapped = content[:16] + content[32:48] + content[16:32] + content[48:]
         connection.execute(update(GRID_CHUNKS).values(content=swapped))
     assert store.grids.get(key) is None
@@ -529,7 +523,7 @@ def test_a_grid_with_other_numbers_than_were_computed_is_not_read(store: Store) 
     assert store.grids.get(key) is not None
 
 
-def test_a_grid_that_an_earlier_version_stores_beside_this_one_is_computed_again(store: Store) -> None:
+def test_grid_without_digest_counts_as_missing(store: Store) -> None:
     key = _key(_add(store))
     _put(store, key)
     with store._database.writing() as connection:
@@ -545,7 +539,7 @@ def test_a_grid_that_an_earlier_version_stores_beside_this_one_is_computed_again
 # Leases
 
 
-def test_a_lease_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
+def test_lease_of_a_fast_clock_is_expired(store: Store) -> None:
     key = _key(_add(store))
     store.leases.claim(key, "ahead", 60.0)
     two_days_s = 2 * 24 * 3600.0
@@ -557,7 +551,7 @@ def test_a_lease_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
     assert store.leases.claim(key, "other", 60.0) is None
 
 
-def test_a_lease_of_an_earlier_version_holds_until_it_ends(store: Store) -> None:
+def test_lease_without_length_holds_until_its_end(store: Store) -> None:
     key = _key(_add(store))
     store.leases.claim(key, "earlier", 60.0)
     with store._database.writing() as connection:
@@ -565,7 +559,7 @@ def test_a_lease_of_an_earlier_version_holds_until_it_ends(store: Store) -> None
     assert store.leases.claim(key, "me", 60.0) is None
 
 
-def test_a_lease_counts_how_often_it_was_taken_until_it_is_given_back(store: Store) -> None:
+def test_lease_counts_attempts_until_released(store: Store) -> None:
     key, counts = _key(_add(store)), []
     for owner in ("one", "two", "one"):
         counts.append(store.leases.claim(key, owner, 0.001))
@@ -575,7 +569,7 @@ def test_a_lease_counts_how_often_it_was_taken_until_it_is_given_back(store: Sto
     assert store.leases.claim(key, "two", 60.0) == 1
 
 
-def test_a_lease_is_one_owners_until_it_runs_out(open_store: OpenStore) -> None:
+def test_lease_is_exclusive_until_it_expires(open_store: OpenStore) -> None:
     first, second = open_store(), open_store()
     key = _key(_add(first))
     assert first.leases.claim(key, "one", 0.5)
@@ -590,7 +584,7 @@ def test_a_lease_is_one_owners_until_it_runs_out(open_store: OpenStore) -> None:
     assert not first.leases.claim(key, "one", 60.0)
 
 
-def test_of_many_who_claim_at_once_one_gets_the_lease(open_store: OpenStore) -> None:
+def test_concurrent_claims_give_one_lease(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
     key = _key(_add(stores[0]))
     start = threading.Barrier(8)
@@ -603,7 +597,7 @@ def test_of_many_who_claim_at_once_one_gets_the_lease(open_store: OpenStore) -> 
         assert sum(threads.map(claim, range(8))) == 1
 
 
-def test_the_lease_of_a_deleted_plan_is_gone_and_cannot_be_had(store: Store) -> None:
+def test_deleted_plan_has_no_lease(store: Store) -> None:
     key = _key(_add(store, "p"))
     assert store.leases.claim(key, "me", 60.0)
     store.plans.delete("default", "p")
@@ -611,14 +605,14 @@ def test_the_lease_of_a_deleted_plan_is_gone_and_cannot_be_had(store: Store) -> 
     assert not store.leases.claim(key, "me", 60.0)
 
 
-def test_storing_a_grid_ends_the_lease_on_it(store: Store) -> None:
+def test_storing_a_grid_ends_its_lease(store: Store) -> None:
     key = _key(_add(store))
     store.leases.claim(key, "me", 60.0)
     _put(store, key)
     assert _rows(store, GRID_LEASES) == 0
 
 
-def test_missing_grids_are_those_that_nobody_has_computes_or_failed_at(store: Store) -> None:
+def test_missing_grids_exclude_leased_and_failed(store: Store) -> None:
     revisions = {name: _add(store, name) for name in ("stored", "leased", "failed", "other height", "missing")}
     _put(store, _key(revisions["stored"]))
     store.leases.claim(_key(revisions["leased"]), "someone", 1.0)
@@ -643,7 +637,7 @@ def test_missing_grids_are_those_that_nobody_has_computes_or_failed_at(store: St
 ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
 
 
-def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore) -> None:
+def test_idempotent_request_is_carried_out_once(open_store: OpenStore) -> None:
     first, second = open_store(), open_store()
     claim = first.idempotency_keys.begin("t", "POST /floorplans", "k", "body")
     assert isinstance(claim, Claimed)
@@ -652,18 +646,18 @@ def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore
     first.idempotency_keys.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == ANSWER
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
-    for other in (("u", "POST /floorplans", "k"), ("t", "POST /localise", "k"), ("t", "POST /floorplans", "l")):
-        assert isinstance(second.idempotency_keys.begin(*other, "body"), Claimed)
+    for route in (("u", "POST /floorplans", "k"), ("t", "POST /localise", "k"), ("t", "POST /floorplans", "l")):
+        assert isinstance(second.idempotency_keys.begin(*route, "body"), Claimed)
 
 
-def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store) -> None:
+def test_abandoned_request_can_be_claimed_again(store: Store) -> None:
     claim = store.idempotency_keys.begin("t", "r", "k", "body")
     assert isinstance(claim, Claimed)
     store.idempotency_keys.abandon("t", "r", "k", "not the token")
     assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
     store.idempotency_keys.abandon("t", "r", "k", claim.token)
     assert store.idempotency_keys.begin("t", "r", "k", "another") == Conflict()
-    # Under the same token: something may have been stored under it.
+    # The token stays the same, because something can have been stored under it.
     assert store.idempotency_keys.begin("t", "r", "k", "body") == claim
     assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
     store.idempotency_keys.finish("t", "r", "k", claim.token, ANSWER)
@@ -671,7 +665,7 @@ def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store
     assert store.idempotency_keys.begin("t", "r", "k", "body") == ANSWER
 
 
-def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
+def test_expired_claim_is_taken_over_with_its_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
     dead = IdempotencyKeys(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
     assert isinstance(dead, Claimed)
@@ -679,13 +673,13 @@ def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(ope
     with ThreadPoolExecutor(4) as threads:
         claims = list(threads.map(lambda n: stores[n % 2].idempotency_keys.begin("t", "r", "k", "body"), range(4)))
     assert [claim for claim in claims if claim != InProgress()] == [Claimed(dead.token)]
-    # Should the dead one have lived, its answer no longer counts.
+    # The answer of the first attempt no longer counts.
     stores[0].idempotency_keys.finish("t", "r", "k", dead.token, ANSWER)
     stores[1].idempotency_keys.finish("t", "r", "k", dead.token, dataclasses.replace(ANSWER, body=b"late"))
     assert stores[0].idempotency_keys.begin("t", "r", "k", "body") == ANSWER
 
 
-def test_answers_are_kept_for_a_day(store: Store) -> None:
+def test_idempotency_keys_expire_after_a_day(store: Store) -> None:
     for key in ("old", "new"):
         claim = store.idempotency_keys.begin("t", "r", key, "body")
         assert isinstance(claim, Claimed)
@@ -693,7 +687,7 @@ def test_answers_are_kept_for_a_day(store: Store) -> None:
     with store._database.writing() as connection:
         yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
-    # Not given out any more, also before it is swept away.
+    # Expired keys are not returned even before they are purged.
     assert isinstance(store.idempotency_keys.begin("t", "r", "old", "another"), Claimed)
     with store._database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
@@ -701,7 +695,7 @@ def test_answers_are_kept_for_a_day(store: Store) -> None:
     assert store.idempotency_keys.begin("t", "r", "new", "body") == ANSWER
 
 
-def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
+def test_api_key_is_found_by_hash_until_revoked(store: Store) -> None:
     made = store.keys.create("t", "robot", "h1", {"read", "localise"})
     store.keys.create("u", "other", "h2", {"read"})
     assert store.keys.find("h1") == made
@@ -718,7 +712,7 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
     assert [key.revoked_at is None for key in store.keys.list_keys()] == [False, True]
 
 
-def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
+def test_claim_of_a_fast_clock_is_expired(store: Store) -> None:
     claim = store.idempotency_keys.begin("t", "r", "k", "body")
     assert isinstance(claim, Claimed)
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
@@ -731,13 +725,13 @@ def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
 # The database itself
 
 
-def test_the_migrations_make_the_tables_that_the_code_uses(store: Store) -> None:
+def test_migrations_match_the_tables(store: Store) -> None:
     with store._database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, METADATA) == []
 
 
-def test_processes_that_start_together_make_the_tables_once(url: str) -> None:
+def test_concurrent_starts_migrate_once(url: str) -> None:
     with ThreadPoolExecutor(4) as threads:
         stores = list(threads.map(lambda _: Store(url), range(4)))
     _add(stores[0])
@@ -746,7 +740,7 @@ def test_processes_that_start_together_make_the_tables_once(url: str) -> None:
         store.close()
 
 
-def test_a_database_of_a_newer_version_is_left_alone(store: Store, url: str) -> None:
+def test_newer_database_is_rejected(store: Store, url: str) -> None:
     with store._database.writing() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     with pytest.raises(ConfigError, match="9999"):
@@ -772,13 +766,13 @@ CREATE TABLE {grids} (
 """
 
 
-# Columns that came with venues.
+# Columns that the migration for venues adds.
 _OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
 _OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
 _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude"))
 
 
-def test_places_of_plans_that_were_stored_before_are_filled_in(store: Store, url: str) -> None:
+def test_migration_fills_in_places(store: Store, url: str) -> None:
     anchored = FloorPlan.from_dict({**FLAT, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0})
     for plan_id, plan in (("p", PLAN), ("q", anchored), ("r", PLAN)):
         store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=100)
@@ -801,7 +795,7 @@ def test_places_of_plans_that_were_stored_before_are_filled_in(store: Store, url
     moved.close()
 
 
-def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store: Store, url: str) -> None:
+def test_migration_drops_grids_without_digest(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
     store.idempotency_keys.begin("t", "r", "k", "body")
@@ -836,7 +830,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
     moved.close()
 
 
-def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
+def test_migration_adds_venues(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
     with store._database.writing() as connection:
@@ -860,7 +854,7 @@ def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
 
 
 @pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
-def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: str) -> None:
+def test_migration_from_the_first_version(tmp_path: Path, grids: str) -> None:
     original = b"\x00 as sent \xff" * 200_000
     with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
         raw.executescript(_FIRST_SCHEMA.format(grids=grids))
@@ -890,7 +884,7 @@ def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: st
     again.close()
 
 
-def test_sqlite_runs_with_foreign_keys_and_a_write_ahead_log(tmp_path: Path) -> None:
+def test_sqlite_uses_foreign_keys_and_wal(tmp_path: Path) -> None:
     store = Store(_url(tmp_path))
     with store._database.reading() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
@@ -910,12 +904,12 @@ def test_sqlite_runs_with_foreign_keys_and_a_write_ahead_log(tmp_path: Path) -> 
         "postgresql://127.0.0.1:9/x",
     ],
 )
-def test_a_database_that_cannot_be_used_is_a_configuration_error(url: str) -> None:
+def test_unusable_database_is_a_config_error(url: str) -> None:
     with pytest.raises(ConfigError, match="database"):
         Store(url)
 
 
-def test_what_is_open_is_bounded_and_waiting_for_it_as_well(url: str) -> None:
+def test_connections_and_waiting_are_limited(url: str) -> None:
     store = Store(url, connections=2, wait_s=0.2)
     with store._database.reading(), store._database.reading():
         begin = time.monotonic()
@@ -926,7 +920,7 @@ def test_what_is_open_is_bounded_and_waiting_for_it_as_well(url: str) -> None:
     store.close()
 
 
-def test_a_database_that_answers_others_meanwhile_is_busy_and_not_away(url: str) -> None:
+def test_database_that_answers_others_is_busy(url: str) -> None:
     store = Store(url, connections=1, wait_s=0.25)
 
     def use(_number: int) -> StoreUnavailableError | None:
@@ -947,7 +941,7 @@ def test_a_database_that_answers_others_meanwhile_is_busy_and_not_away(url: str)
     store.close()
 
 
-def test_an_address_may_say_postgresql_or_name_the_driver(postgres: PostgresServer) -> None:
+def test_postgresql_urls_are_accepted(postgres: PostgresServer) -> None:
     plain = postgres.new_database()
     for url in (plain, plain.replace("postgresql:", "postgresql+psycopg:"), plain.replace("postgresql:", "postgres:")):
         store = Store(url)
@@ -955,7 +949,7 @@ def test_an_address_may_say_postgresql_or_name_the_driver(postgres: PostgresServ
         store.close()
 
 
-def test_a_server_that_was_away_is_used_again_when_it_is_back(postgres: PostgresServer) -> None:
+def test_store_reconnects_after_an_outage(postgres: PostgresServer) -> None:
     store = Store(postgres.new_database())
     _add(store, "p")
     postgres.stop()
@@ -969,7 +963,7 @@ def test_a_server_that_was_away_is_used_again_when_it_is_back(postgres: Postgres
     store.close()
 
 
-def test_a_read_of_a_plan_in_memory_is_one_query(store: Store) -> None:
+def test_cached_plan_needs_one_query(store: Store) -> None:
     _add(store, "p")
     statements: list[str] = []
     event.listen(store._database._engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))

@@ -1,4 +1,4 @@
-"""Hints of queries about venues: what they may be, and that they reach the choice of plans and the search."""
+"""Hints of queries about venues: validation, and their effect on the choice of plans and the search."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from tests.service.test_venue_queries import STUDIO, ask, venue_of
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756}
 
 
-def at(east_m: float, north_m: float = 0.0) -> dict[str, float]:
-    """A place so far from the anchor."""
+def place(east_m: float, north_m: float = 0.0) -> dict[str, float]:
+    """Return a place by its distance (m) from the anchor."""
     ((longitude, latitude),) = Anchor(**ANCHOR).to_earth(np.array([[east_m, north_m]]))
     return {"latitude": float(latitude), "longitude": float(longitude)}
 
 
 @pytest.fixture(scope="module")
 def storeys(client: httpx.Client) -> list[str]:
-    """Three equal flats above each other, and a studio 100 m to the east, all with anchors."""
+    """Upload three equal flats above each other and a studio 100 m to the east, all with anchors."""
     flats = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 0, "name": f"{level}"}) for level in range(3)]
-    return [*flats, upload(client, STUDIO | {"anchor": at(100.0), "north_deg": 0})]
+    return [*flats, upload(client, STUDIO | {"anchor": place(100.0), "north_deg": 0})]
 
 
 @pytest.fixture(scope="module")
 def venue_id(client: httpx.Client, storeys: list[str]) -> str:
-    """All of them, on levels 0, 1, 2 and 3."""
+    """Create a venue of these plans, on levels 0, 1, 2 and 3."""
     return venue_of(client, *storeys)
 
 
@@ -44,25 +44,25 @@ def answer_to(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any
 
 @pytest.fixture(params=["all", "chosen"])
 def search(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Whether all plans are searched in full, or only the three most probable ones."""
+    """Search all plans in full, or only the three most probable ones."""
     if request.param == "chosen":
         monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 3)
     return request.param
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_a_level_tells_equal_storeys_apart(
+def test_level_distinguishes_equal_storeys(
     client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str, level: int
 ) -> None:
     answer = answer_to(client, venue_id, panorama, level=level)
     if answer["floorplan_id"] == storeys[3]:
-        # What the picture is of to this small model has no say in which of the flats it is.
+        # This small model cannot tell the flats apart.
         assert answer["warnings"] == [f"level is {level}, which the panorama contradicts: the answer is on level 3"]
     found = [candidate["level"] for candidate in answer["candidates"] if candidate["floorplan_id"] != storeys[3]]
     assert found[0] == level
 
 
-def test_a_strict_level_leaves_nothing_else(
+def test_strict_level_excludes_other_levels(
     client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str
 ) -> None:
     answer = answer_to(client, venue_id, panorama, level=3, strict="true")
@@ -70,35 +70,33 @@ def test_a_strict_level_leaves_nothing_else(
     assert answer["level"] == 3.0
 
 
-def test_near_on_earth_is_of_all_storeys_there(
+def test_near_on_earth_applies_to_all_storeys(
     client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str
 ) -> None:
-    near = json.dumps(at(2.0, 1.5))
+    near = json.dumps(place(2.0, 1.5))
     answer = answer_to(client, venue_id, panorama, near=near, radius_m=1.0, strict="true")
     assert {candidate["floorplan_id"] for candidate in answer["candidates"]} == set(storeys[:3])
     for candidate in answer["candidates"]:
         assert np.hypot(candidate["position"]["x_m"] - 2.0, candidate["position"]["y_m"] - 1.5) <= 1.0 + 1e-3
     both = answer_to(client, venue_id, panorama, near=near, radius_m=1.0, strict="true", level=2)
     assert {candidate["floorplan_id"] for candidate in both["candidates"]} == {storeys[2]}
-    east = answer_to(client, venue_id, panorama, near=json.dumps(at(103.0, 1.0)), radius_m=3.0, strict="true")
+    east = answer_to(client, venue_id, panorama, near=json.dumps(place(103.0, 1.0)), radius_m=3.0, strict="true")
     assert {candidate["floorplan_id"] for candidate in east["candidates"]} == {storeys[3]}
 
 
-def test_in_a_venue_with_an_anchor_a_point_is_of_the_frame_that_plans_share(
-    client: httpx.Client, panorama: bytes
-) -> None:
-    own = upload(client, FLAT | {"anchor": at(0.0, -2.0), "north_deg": 0})
+def test_anchored_venue_accepts_points_in_its_frame(client: httpx.Client, panorama: bytes) -> None:
+    own = upload(client, FLAT | {"anchor": place(0.0, -2.0), "north_deg": 0})
     venue_id = venue_of(client, upload(client), own, anchor=ANCHOR)
     fields = {"near": '{"x_m": 2, "y_m": 0.8}', "radius_m": 0.8, "strict": "true"}
     answer = answer_to(client, venue_id, panorama, **fields)
     for candidate in answer["candidates"]:
-        # The second plan's own anchor says that its origin lies 2 m to the south.
+        # The second plan's own anchor places its origin 2 m further south.
         y_m = 2.8 if candidate["floorplan_id"] == own else 0.8
         assert np.hypot(candidate["position"]["x_m"] - 2.0, candidate["position"]["y_m"] - y_m) <= 0.8 + 1e-3
     assert {candidate["floorplan_id"] for candidate in answer["candidates"]} > {own}
 
 
-def test_rooms_are_those_of_all_plans_that_have_them(
+def test_rooms_apply_to_all_plans_with_them(
     client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes
 ) -> None:
     answer = answer_to(client, venue_id, panorama, rooms="kitchen", strict="true")
@@ -107,9 +105,9 @@ def test_rooms_are_those_of_all_plans_that_have_them(
     assert {candidate["room"] for candidate in several["candidates"]} <= {"kitchen", "studio"}
 
 
-def test_plans_without_a_place_are_told(client: httpx.Client, storeys: list[str], panorama: bytes) -> None:
+def test_plans_without_an_anchor_are_warned_about(client: httpx.Client, storeys: list[str], panorama: bytes) -> None:
     venue_id = venue_of(client, storeys[0], upload(client, STUDIO))
-    fields = {"near": json.dumps(at(2.0, 1.5)), "radius_m": 5.0}
+    fields = {"near": json.dumps(place(2.0, 1.5)), "radius_m": 5.0}
     free = answer_to(client, venue_id, panorama, **fields)
     assert "1 of the venue's 2 floor plans have no anchor and are not affected by near" in free["warnings"]
     strict = answer_to(client, venue_id, panorama, strict="true", **fields)
@@ -120,7 +118,7 @@ def test_plans_without_a_place_are_told(client: httpx.Client, storeys: list[str]
     assert {candidate["floorplan_id"] for candidate in strict["candidates"]} == {storeys[0]}
 
 
-def test_rooms_that_are_looked_for_in_few_plans_only_are_told(
+def test_room_search_in_some_plans_is_warned_about(
     client: httpx.Client, venue_id: str, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
@@ -135,19 +133,19 @@ def test_rooms_that_are_looked_for_in_few_plans_only_are_told(
     [
         ({"level": 7}, "level: no floor plan of the venue is on level 7; its levels are 0, 1, 2, 3"),
         ({"near": '{"x_m": 1, "y_m": 1}', "radius_m": 3}, "the venue has no anchor"),
-        ({"near": json.dumps(at(50.0)), "radius_m": 10}, "m from the nearest floor plan of the venue"),
+        ({"near": json.dumps(place(50.0)), "radius_m": 10}, "m from the nearest floor plan of the venue"),
         ({"rooms": "attic"}, "rooms: none of the 4 floor plans that are searched has a room 'attic'"),
         ({"rooms": "studio", "level": 0, "strict": "true"}, "strict: none of the"),
     ],
 )
-def test_what_a_venue_contradicts_is_told(
+def test_hints_outside_the_venue_are_rejected(
     client: httpx.Client, venue_id: str, panorama: bytes, fields: dict[str, Any], detail: str
 ) -> None:
     assert detail in assert_problem(ask(client, venue_id, panorama, **fields), 422, "invalid-hint")["detail"]
 
 
-def test_a_venue_that_is_nowhere_has_no_place_on_earth_to_be_near(client: httpx.Client, panorama: bytes) -> None:
-    response = ask(client, venue_of(client, upload(client)), panorama, near=json.dumps(at(0.0)), radius_m=10)
+def test_near_needs_an_anchor(client: httpx.Client, panorama: bytes) -> None:
+    response = ask(client, venue_of(client, upload(client)), panorama, near=json.dumps(place(0.0)), radius_m=10)
     assert (
         "neither the venue nor any of its floor plans has an anchor"
         in assert_problem(response, 422, "invalid-hint")["detail"]

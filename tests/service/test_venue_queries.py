@@ -1,4 +1,4 @@
-"""Queries about venues: which of the plans, on which level, and where in it."""
+"""Queries about venues: the right plan, level and place."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tests.service.test_localise import HALL
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
-# Where each example was taken, in the plan above.
+# Pose of each example in the plan above.
 POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
 STUDIO = {"ceiling_height_m": 2.6, "rooms": [{"name": "studio", "polygon": [[0, 0], [9, 0], [9, 2.2], [0, 2.2]]}]}
 
 
 @pytest.fixture(scope="module")
 def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The app with the model that ships, and a worker that is warm."""
+    """Start the app with the shipped model and a warm worker."""
     deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}
     data_dir = tmp_path_factory.mktemp("data")
     with start_app(data_dir, bundle=ROOT / "models" / "default", workers=1, **deadlines) as client:
@@ -38,7 +38,7 @@ def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 
 
 def venue_of(client: httpx.Client, *plan_ids: str, **more: Any) -> str:
-    """A venue with plans on levels 0, 1, 2 and so on."""
+    """Create a venue with plans on levels 0, 1, 2 and so on."""
     plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
     response = client.post("/venues", json={"plans": plans, **more})
     assert response.status_code == 201, response.text
@@ -51,13 +51,13 @@ def ask(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> h
 
 
 def turned(plan: dict[str, Any]) -> dict[str, Any]:
-    """A plan with x and y exchanged: a mirror image, with the same rooms."""
+    """Return a plan with x and y exchanged: a mirror image with the same rooms."""
 
     def swapped(points: list[list[float]]) -> list[list[float]]:
         return [[y, x] for x, y in points]
 
     rooms = [{**room, "polygon": swapped(room["polygon"])} for room in plan["rooms"]]
-    openings = [{**one, "line": swapped(one["line"])} for one in plan.get("openings", [])]
+    openings = [{**opening, "line": swapped(opening["line"])} for opening in plan.get("openings", [])]
     return {**plan, "rooms": rooms} | ({"openings": openings} if openings else {})
 
 
@@ -73,7 +73,7 @@ def others(shipped: httpx.Client) -> list[str]:
 
 @pytest.mark.parametrize("name", sorted(POSES))
 @pytest.mark.parametrize("given", [True, False], ids=["heading given", "heading searched"])
-def test_the_right_plan_and_place_are_found_among_several(
+def test_right_plan_is_found_among_several(
     shipped: httpx.Client, home: str, others: list[str], name: str, given: bool
 ) -> None:
     pose = POSES[name]
@@ -92,12 +92,12 @@ def test_the_right_plan_and_place_are_found_among_several(
     assert probabilities[0] >= answer["confidence"] - 1e-4
     shares = [candidate["probability"] for candidate in answer["candidates"]]
     assert shares == sorted(shares, reverse=True)
-    # However the camera was turned there.
+    # For any heading of the camera.
     assert shares[0] <= answer["confidence"]
     assert {candidate["floorplan_id"] for candidate in answer["candidates"]} <= {home, others[0], others[1]}
 
 
-def test_a_venue_of_one_plan_is_answered_as_the_plan_itself(shipped: httpx.Client, home: str) -> None:
+def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> None:
     picture = (EXAMPLES / "kitchen.jpg").read_bytes()
     files = {"panorama": ("p.jpg", picture, "image/jpeg")}
     alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
@@ -107,7 +107,7 @@ def test_a_venue_of_one_plan_is_answered_as_the_plan_itself(shipped: httpx.Clien
     assert (alone["venue_id"], alone["level"], alone["plans"]) == (None, None, None)
 
 
-def test_two_equal_flats_share_the_probability(shipped: httpx.Client, home: str, others: list[str]) -> None:
+def test_equal_flats_share_the_probability(shipped: httpx.Client, home: str, others: list[str]) -> None:
     twin = upload(shipped, HOME)
     picture = (EXAMPLES / "kitchen.jpg").read_bytes()
     answer = ask(shipped, venue_of(shipped, home, others[0], twin), picture, heading_deg=250, top_k=10).json()
@@ -121,7 +121,7 @@ def test_two_equal_flats_share_the_probability(shipped: httpx.Client, home: str,
 
 
 @pytest.mark.one_replica
-def test_of_many_plans_the_most_probable_are_searched(
+def test_most_probable_plans_are_searched(
     shipped: httpx.Client, home: str, others: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copies = [upload(shipped, HOME) for _ in range(3)]
@@ -129,18 +129,18 @@ def test_of_many_plans_the_most_probable_are_searched(
     picture = (EXAMPLES / "kitchen.jpg").read_bytes()
     whole = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
-    # Once from the store, once from memory.
+    # First from the store, then from memory.
     for _ in range(2):
         chosen = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
         assert chosen["floorplan_id"] in (home, *copies)
         assert len(chosen["plans"]) == 2
-        # Copies that were left out keep their shares.
+        # Copies that were not searched keep their shares.
         assert chosen["confidence"] == pytest.approx(whole["confidence"], abs=0.05)
         assert chosen["confidence"] <= 0.3
 
 
 @pytest.mark.parametrize("stored", ["NULL", "x'4c4c5032'"], ids=["nothing", "fewer poses"])
-def test_prototypes_that_an_earlier_version_did_not_store_are_made(
+def test_missing_prototypes_are_made(
     start_app: StartApp,
     tmp_path: Path,
     database_of: Any,
@@ -164,7 +164,7 @@ def test_prototypes_that_an_earlier_version_did_not_store_are_made(
         store.close()
 
 
-def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
+def test_replaced_plan_is_chosen_by_its_new_revision(
     start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
@@ -196,7 +196,7 @@ def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
         assert indexed[2] > indexed[1]
         assert answer()["floorplan_id"] == replaced["floorplan_id"]
     monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
-    # Once more, by what the file has.
+    # Again, from the prototype file.
     with start_app(tmp_path, request_deadline_s=60.0) as client:
         response = ask(client, venue_id, panorama, refine="none")
         assert response.status_code == 200, response.text
@@ -218,7 +218,7 @@ BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
 
 
 @pytest.mark.parametrize(("fields", "field", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
-def test_exactly_one_of_plan_and_venue_is_asked_about(
+def test_query_needs_exactly_one_of_plan_and_venue(
     client: httpx.Client, panorama: bytes, fields: dict[str, str], field: str, message: str
 ) -> None:
     files = {"panorama": ("p.jpg", panorama, "image/jpeg")}
@@ -227,7 +227,7 @@ def test_exactly_one_of_plan_and_venue_is_asked_about(
     assert message in problem["detail"]
 
 
-def test_what_cannot_be_found_in_is_told(client: httpx.Client, panorama: bytes) -> None:
+def test_unsearchable_venue_is_an_error(client: httpx.Client, panorama: bytes) -> None:
     assert_problem(ask(client, "0" * 32, panorama), 404, "unknown-venue")
     assert_problem(ask(client, "no id", panorama), 404, "unknown-venue")
     assert (
@@ -235,9 +235,7 @@ def test_what_cannot_be_found_in_is_told(client: httpx.Client, panorama: bytes) 
     )
 
 
-def test_plans_with_lower_ceilings_than_the_camera_are_left_out(
-    client: httpx.Client, plan: str, panorama: bytes
-) -> None:
+def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, plan: str, panorama: bytes) -> None:
     low = upload(client, {**STUDIO, "ceiling_height_m": 2.0})
     answer = ask(client, venue_of(client, plan, low), panorama, camera_height_m=2.1, refine="none").json()
     assert {entry["floorplan_id"] for entry in answer["plans"]} == {plan}
@@ -245,7 +243,7 @@ def test_plans_with_lower_ceilings_than_the_camera_are_left_out(
     assert_problem(ask(client, venue_of(client, low), panorama, camera_height_m=2.1), 422, "invalid-pose")
 
 
-def test_plans_that_are_not_ready_are_told(
+def test_plans_that_are_not_ready_are_warned_about(
     start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, embed = threading.Event(), builder.embed
@@ -269,9 +267,9 @@ def test_plans_that_are_not_ready_are_told(
         go_on.set()
 
 
-def test_a_plan_that_is_deleted_is_not_found_any_more(client: httpx.Client, plan: str, panorama: bytes) -> None:
+def test_deleted_plan_is_not_searched(client: httpx.Client, plan: str, panorama: bytes) -> None:
     leaving = upload(client, STUDIO)
     venue_id = venue_of(client, plan, leaving)
     assert len(ask(client, venue_id, panorama, refine="none").json()["plans"]) == 2
     client.delete(f"/floorplans/{leaving}")
-    assert [one["floorplan_id"] for one in ask(client, venue_id, panorama, refine="none").json()["plans"]] == [plan]
+    assert [entry["floorplan_id"] for entry in ask(client, venue_id, panorama, refine="none").json()["plans"]] == [plan]

@@ -1,4 +1,4 @@
-"""Venues as resources: made, looked at page by page, changed, deleted; each tenant's own, within their limits."""
+"""Venues as resources: creation, paging, changes, deletion, tenants and limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ANCHOR = {"latitude": 51.7546, "longitude": -1.2545, "altitude_m": 61.0, "north_
 
 @pytest.fixture(scope="module")
 def plans(client: httpx.Client) -> list[str]:
-    """Ids of three plans."""
+    """Upload three plans and return their ids."""
     return [upload(client, FLAT | {"name": f"Flat {number}"}) for number in range(3)]
 
 
@@ -35,7 +35,7 @@ def make(client: httpx.Client, *members: dict[str, Any], **more: Any) -> dict[st
 
 
 def plans_of(client: httpx.Client, venue_id: str, **params: Any) -> list[dict[str, Any]]:
-    """All plans of a venue, page by page."""
+    """Return all plans of a venue, page by page."""
     found, cursor = [], None
     while True:
         page = client.get(f"/venues/{venue_id}/plans", params=params | ({"cursor": cursor} if cursor else {})).json()
@@ -44,7 +44,7 @@ def plans_of(client: httpx.Client, venue_id: str, **params: Any) -> list[dict[st
             return found
 
 
-def test_a_venue_is_answered_with_what_was_understood(client: httpx.Client, plans: list[str]) -> None:
+def test_created_venue_is_returned(client: httpx.Client, plans: list[str]) -> None:
     response = client.post("/venues", json={"name": "12 Mill Lane", "anchor": ANCHOR, "plans": [member(plans[0], 1)]})
     assert response.status_code == 201
     venue = response.json()
@@ -58,22 +58,22 @@ def test_a_venue_is_answered_with_what_was_understood(client: httpx.Client, plan
     assert known.status_code == 304
 
 
-def test_plans_are_told_page_by_page_from_the_lowest_level_up(client: httpx.Client, plans: list[str]) -> None:
+def test_plans_of_a_venue_are_paged_by_level(client: httpx.Client, plans: list[str]) -> None:
     members = [member(plans[0], 2, name="penthouse"), member(plans[1], -1), member(plans[2], 0.5)]
     venue = make(client, *members)
     found = plans_of(client, venue["id"], limit=1)
-    assert [(one["floorplan_id"], one["level"], one["name"]) for one in found] == [
+    assert [(entry["floorplan_id"], entry["level"], entry["name"]) for entry in found] == [
         (plans[1], -1.0, "Flat 1"),
         (plans[2], 0.5, "Flat 2"),
         (plans[0], 2.0, "penthouse"),
     ]
-    assert {one["status"] for one in found} == {"ready"}
-    assert [one["floorplan_id"] for one in plans_of(client, venue["id"], level=0.5)] == [plans[2]]
+    assert {entry["status"] for entry in found} == {"ready"}
+    assert [entry["floorplan_id"] for entry in plans_of(client, venue["id"], level=0.5)] == [plans[2]]
     broken = client.get(f"/venues/{venue['id']}/plans", params={"cursor": "x" * 32 + "="})
     assert_problem(broken, 422, "invalid-request")
 
 
-def test_venues_are_listed_newest_first_and_found_by_name(client: httpx.Client, plans: list[str]) -> None:
+def test_venues_are_listed_newest_first(client: httpx.Client, plans: list[str]) -> None:
     word = uuid.uuid4().hex
     made = [make(client, member(plans[0]), name=f"{word} {number}")["id"] for number in range(3)]
     page = client.get("/venues", params={"name": word.upper(), "limit": 2}).json()
@@ -89,15 +89,18 @@ def test_put_replaces_and_patch_changes(client: httpx.Client, plans: list[str]) 
     changed = client.patch(path, json={"plans": [member(plans[0], 3), member(plans[2])], "remove": [plans[1]]})
     assert changed.status_code == 200, changed.text
     assert (changed.json()["name"], changed.json()["anchor"]) == ("old", ANCHOR)
-    assert {one["floorplan_id"]: one["level"] for one in plans_of(client, venue["id"])} == {plans[0]: 3, plans[2]: 0}
+    assert {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])} == {
+        plans[0]: 3,
+        plans[2]: 0,
+    }
     assert client.patch(path, json={"anchor": None}).json()["anchor"] is None
     assert client.patch(path, json={"name": "new"}).json()["plans"] == 2
     replaced = client.put(path, json={"plans": [member(plans[1])]}).json()
     assert (replaced["name"], replaced["plans"], replaced["revision_number"]) == ("venue", 1, 5)
-    assert [one["floorplan_id"] for one in plans_of(client, venue["id"])] == [plans[1]]
+    assert [entry["floorplan_id"] for entry in plans_of(client, venue["id"])] == [plans[1]]
 
 
-def test_changes_follow_the_revision_that_they_expect(client: httpx.Client, plans: list[str]) -> None:
+def test_change_needs_the_expected_revision(client: httpx.Client, plans: list[str]) -> None:
     venue = make(client, member(plans[0]))
     path, stale = f"/venues/{venue['id']}", {"If-Match": venue["etag"]}
     assert client.patch(path, json={"name": "second"}, headers=stale).status_code == 200
@@ -114,9 +117,7 @@ def test_changes_follow_the_revision_that_they_expect(client: httpx.Client, plan
     assert client.get(f"/floorplans/{plans[0]}").status_code == 200
 
 
-def test_a_plan_that_is_deleted_leaves_its_venues_which_get_another_revision(
-    client: httpx.Client, plans: list[str]
-) -> None:
+def test_deleted_plan_leaves_its_venues(client: httpx.Client, plans: list[str]) -> None:
     leaving = upload(client)
     venue, other = make(client, member(leaving), member(plans[0], 1)), make(client, member(plans[0]))
     path = f"/venues/{venue['id']}"
@@ -124,14 +125,14 @@ def test_a_plan_that_is_deleted_leaves_its_venues_which_get_another_revision(
     after = client.get(path)
     assert after.headers["etag"] != venue["etag"]
     assert (after.json()["plans"], after.json()["revision_number"]) == (1, 2)
-    assert [one["floorplan_id"] for one in plans_of(client, venue["id"])] == [plans[0]]
+    assert [entry["floorplan_id"] for entry in plans_of(client, venue["id"])] == [plans[0]]
     refused = client.patch(path, json={"name": "x"}, headers={"If-Match": venue["etag"]})
     assert_problem(refused, 412, "revision-mismatch")
-    # A venue that did not have it is as it was.
+    # Venues without the plan are unchanged.
     assert client.get(f"/venues/{other['id']}").headers["etag"] == other["etag"]
 
 
-def test_a_plan_that_is_replaced_stays_in_its_venues(client: httpx.Client) -> None:
+def test_replaced_plan_stays_in_its_venues(client: httpx.Client) -> None:
     plan_id = upload(client)
     venue = make(client, member(plan_id, 4))
     assert client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "rebuilt"}).status_code == 200
@@ -161,7 +162,7 @@ BAD_VENUES: dict[str, tuple[Any, str, str]] = {
 
 
 @pytest.mark.parametrize(("document", "field", "message"), BAD_VENUES.values(), ids=BAD_VENUES.keys())
-def test_a_bad_venue_is_refused_by_the_field_at_fault(
+def test_invalid_venue_is_rejected_with_its_field(
     client: httpx.Client, document: Any, field: str, message: str
 ) -> None:
     problem = assert_problem(client.post("/venues", json=document), 422, "invalid-request")
@@ -170,12 +171,12 @@ def test_a_bad_venue_is_refused_by_the_field_at_fault(
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b'{"name": "a", "name": "b"}', b'{"anchor": {"latitude": NaN}}'], ids=repr)
-def test_a_body_that_is_no_proper_json_is_refused(client: httpx.Client, body: bytes) -> None:
+def test_malformed_json_is_rejected(client: httpx.Client, body: bytes) -> None:
     response = client.post("/venues", content=body, headers={"content-type": "application/json"})
     assert_problem(response, 422, "invalid-request")
 
 
-def test_a_change_is_refused_whole(client: httpx.Client, plans: list[str]) -> None:
+def test_invalid_change_changes_nothing(client: httpx.Client, plans: list[str]) -> None:
     venue = make(client, member(plans[0]))
     path = f"/venues/{venue['id']}"
     for change, message in (
@@ -190,7 +191,7 @@ def test_a_change_is_refused_whole(client: httpx.Client, plans: list[str]) -> No
     assert client.get(path).headers["etag"] == venue["etag"]
 
 
-def test_the_same_request_makes_one_venue(client: httpx.Client, plans: list[str]) -> None:
+def test_repeated_request_creates_one_venue(client: httpx.Client, plans: list[str]) -> None:
     key = {"Idempotency-Key": uuid.uuid4().hex}
     body = {"name": f"once {key['Idempotency-Key']}", "plans": [member(plans[0])]}
     first, second = (client.post("/venues", json=body, headers=key) for _ in range(2))
@@ -201,7 +202,7 @@ def test_the_same_request_makes_one_venue(client: httpx.Client, plans: list[str]
     assert_problem(other, 422, "idempotency-key-reused")
 
 
-def test_limits_are_named(start_app: StartApp, tmp_path: Path) -> None:
+def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_venues=1, max_venue_plans=2, max_venue_bytes=500) as client:
         plans = [upload(client) for _ in range(3)]
         full = [member(plan) for plan in plans]
@@ -216,9 +217,7 @@ def test_limits_are_named(start_app: StartApp, tmp_path: Path) -> None:
         assert "(max_venue_bytes)" in assert_problem(long, 413, "upload-too-large")["detail"]
 
 
-def test_a_tenant_sees_its_own_venues_and_puts_its_own_plans_into_them(
-    start_app: StartApp, tmp_path: Path, database_of: DatabaseOf
-) -> None:
+def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
     with start_app(tmp_path, api_keys=True) as client:
         store = Store(database_of(tmp_path))
         mine, theirs = (

@@ -1,4 +1,4 @@
-"""Run by a test in a process of its own: localise with LPO, then tell which modules the service process has loaded."""
+"""Program that a test runs in its own process: localise with LPO, then list the modules that the service has loaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the workers of `test_workers` run; apart from the tests, because every worker imports it."""
+"""Programs of the workers of `test_pools`; in a module of its own, because every worker imports it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from service.workers.process import serve_jobs
 
 
 def run(connection: Connection, log: str) -> None:
-    """Answer jobs `(what, argument)`; every job, and every start, leaves a line in `log`."""
+    """Run jobs `(kind, argument)`; every job and every start adds a line to `log`."""
     _note(log, "start")
     serve_jobs(connection, lambda: lambda job: _work(log, *job))
 
 
 def run_slow_start(connection: Connection, log: str, start_s: float) -> None:
-    """The same, after a while."""
+    """Run jobs after a slow start."""
     _note(log, "start")
 
     def load() -> Callable[[Any], Any]:
