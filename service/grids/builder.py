@@ -97,7 +97,7 @@ class GridBuilder:
         self._settings = settings
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
-        # Of the running jobs, all on the one thread of `GridJobs`.
+        # Leases of the running jobs, all on the one thread of `GridJobs`.
         self._heartbeats: list[_LeaseHeartbeat] = []
         self.jobs = GridJobs(self._work)
 

@@ -50,7 +50,7 @@ class PendingJob:
 
     @property
     def wanted(self) -> bool:
-        """Whether the job has time left and was not cancelled."""
+        """True if the job has time left and was not cancelled."""
         return monotonic() < self.deadline and not self.future.cancelled()
 
     def fail(self, reason: LostReason) -> None:
@@ -84,7 +84,7 @@ class JobQueue:
 
     @property
     def closed(self) -> bool:
-        """Whether the queue takes no more jobs."""
+        """True if the queue takes no more jobs."""
         return self._closed
 
     def put(self, pending: PendingJob) -> None:

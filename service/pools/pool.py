@@ -85,7 +85,7 @@ class WorkerPool(Generic[Job, Result]):
 
     @property
     def closing(self) -> bool:
-        """Whether the pool shuts down."""
+        """True while the pool shuts down."""
         return self._queue.closed
 
     def submit(self, job: Job, timeout_s: float, client: str = "") -> Future[Result]:

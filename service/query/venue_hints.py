@@ -228,7 +228,7 @@ def _rooms_called(name: str, plans: Sequence[FloorPlan], partly: bool) -> list[t
         try:
             found += [(index, room) for room in rooms_named(plan, [name])]
         except InvalidHintError:
-            # Another plan may have it.
+            # Another plan can have it.
             continue
     if not found and not partly:
         raise InvalidHintError(

@@ -19,7 +19,7 @@ class CircuitBreaker:
 
     @property
     def is_open(self) -> bool:
-        """Whether the database failed a moment ago."""
+        """True shortly after a failure of the database."""
         return self._clock() < self._open_until_s
 
     def trip(self) -> None:

@@ -58,7 +58,7 @@ class StoredGrids:
             grid = unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
         if grid is None:
             fields = {"revision": key.revision_id, "camera_height_mm": key.camera_height_mm}
-            logging.getLogger(LOGGER_NAME).error("a stored latent grid is damaged", extra={"fields": fields})
+            logging.getLogger(LOGGER_NAME).error("a stored pose grid is damaged", extra={"fields": fields})
         return grid
 
     def prototypes(self, grid_ids: Sequence[int]) -> dict[int, SortedPrototypes]:
