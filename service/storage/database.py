@@ -180,7 +180,9 @@ def _parsed(url: str) -> URL:
             f"the database is '{parsed.drivername}'; it must be sqlite or postgresql (LALALOC_DATABASE_URL)"
         )
     if not parsed.database or parsed.database == ":memory:":
-        raise ConfigError("SQLite in memory is not shared between connections: name a file (LALALOC_DATABASE_URL)")
+        raise ConfigError(
+            "the database is SQLite in memory, which connections do not share: name a file (LALALOC_DATABASE_URL)"
+        )
     return parsed
 
 

@@ -338,13 +338,13 @@ def test_listing_is_newest_first_and_paged(store: Store) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "found"),
+    ("part", "found"),
     [("FLAT", {"a", "b"}), ("straße", {"c"}), ("STRASSE", {"c"}), ("äpfel", {"d"}), ("%", {"b"}), ("_", set())],
 )
-def test_name_filter_is_case_insensitive(store: Store, name: str, found: set[str]) -> None:
+def test_name_filter_is_case_insensitive(store: Store, part: str, found: set[str]) -> None:
     for plan_id, name in {"a": "Flat 3", "b": "flat 100%", "c": "Lange Straße 5", "d": "ÄPFEL"}.items():
         _add(store, plan_id, name=name)
-    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=name)} == found
+    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=part)} == found
 
 
 def test_summaries_skip_missing_plans(store: Store) -> None:
