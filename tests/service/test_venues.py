@@ -206,10 +206,10 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_venues=1, max_venue_plans=2, max_venue_bytes=500) as client:
         plans = [upload(client) for _ in range(3)]
         full = [member(plan) for plan in plans]
-        assert "(LALALOC_MAX_VENUE_PLANS)" in client.post("/venues", json={"plans": full}).json()["detail"]
+        assert "max_venue_plans" in client.post("/venues", json={"plans": full}).json()["detail"].lower()
         venue = make(client, *full[:2])
         grown = client.patch(f"/venues/{venue['id']}", json={"plans": full[2:]})
-        assert "would have 3 plans, at most 2" in assert_problem(grown, 422, "invalid-request")["detail"]
+        assert "would have 3 plans; the limit is 2" in assert_problem(grown, 422, "invalid-request")["detail"]
         moved = client.patch(f"/venues/{venue['id']}", json={"plans": full[2:], "remove": [plans[0]]})
         assert moved.json()["plans"] == 2
         assert "(max_venues)" in assert_problem(client.post("/venues", json={}), 507, "too-many-venues")["detail"]
