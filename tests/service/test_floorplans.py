@@ -31,14 +31,14 @@ BAD_PLANS = {
     "three coordinates": (_room([[0, 0, 0], [4, 0, 0], [4, 4, 0]]), "vertex 0"),
     "an integer beyond floats": (_room([[0, 0], [4, 0], [4, 10**400]]), "vertex 2"),
     "a ceiling beyond floats": (_room(SQUARE, ceiling_height_m=10**400), "ceiling_height_m"),
-    "no ceiling": ({"rooms": [{"polygon": SQUARE}]}, "no ceiling_height_m"),
+    "no ceiling": ({"rooms": [{"polygon": SQUARE}]}, "ceiling_height_m is missing"),
     "no rooms": ({"name": "x", "rooms": []}, "at least one room"),
     "a list": ([1, 2], "must be an object"),
     "an unknown key": ({**FLAT, "scale": 2}, "'scale'"),
     "camera above the ceiling": ({**FLAT, "camera_height_m": 2.45}, "2.4"),
     "a lone surrogate": ({**FLAT, "name": "\ud800"}, "surrogates"),
     "a control character": (_room(SQUARE, name="a\0b"), "control characters"),
-    "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "at most 1000 m"),
+    "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "the limit is 1000 m"),
 }
 
 
