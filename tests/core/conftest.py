@@ -1,4 +1,4 @@
-"""Fixtures of the core's tests: networks small enough to run in milliseconds, and the tiny bundle, opened."""
+"""Fixtures of the core's tests: small networks, and the tiny bundle, opened."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 
-# Derandomised: the same commit always gives the same verdict.
+# Derandomised: results depend on the commit only.
 settings.register_profile(
     "core",
     deadline=None,
@@ -26,14 +26,14 @@ settings.load_profile("core")
 
 
 @pytest.fixture(autouse=True)
-def _same_weights_every_time() -> None:
+def _fixed_weights() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
 def smooth_encoder() -> RingLayoutEncoder:
-    """An untrained layout encoder: a fixed smooth embedding of layouts, which is all that optimisation asks for."""
+    """Untrained layout encoder: a fixed, smooth embedding of layouts, sufficient for optimisation."""
     torch.manual_seed(0)
     config = RingConfig(sectors=64, channels=8, layout_width=16, layout_dilations=(1,))
     return RingLayoutEncoder(config).eval().requires_grad_(False)
@@ -41,17 +41,17 @@ def smooth_encoder() -> RingLayoutEncoder:
 
 @pytest.fixture(scope="session")
 def opened_bundle(tiny_bundle: Path) -> Bundle:
-    """The tiny bundle, its manifest parsed."""
+    """Tiny bundle with parsed manifest."""
     return Bundle.open(tiny_bundle)
 
 
 @pytest.fixture(scope="session")
 def encoders(opened_bundle: Bundle) -> Encoders:
-    """The tiny bundle on onnxruntime."""
+    """Tiny bundle on onnxruntime."""
     return Encoders(opened_bundle, threads=1)
 
 
 @pytest.fixture(scope="session")
 def optimiser(opened_bundle: Bundle) -> PoseRefiner:
-    """Latent pose optimisation with the tiny bundle."""
+    """LPO with the tiny bundle."""
     return PoseRefiner.from_bundle(opened_bundle)

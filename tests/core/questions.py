@@ -1,4 +1,4 @@
-"""Questions about poses of small plans, for tests of the methods."""
+"""Questions about poses of small plans, for tests of methods."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def question_at(
     camera_height_m: float = CAMERA_M,
     grid: PoseSet | None = None,
 ) -> Question:
-    """A question about a place of a plan: of its photograph, or of its layout where there is none."""
+    """Return a question about a pose of a plan, with its photograph or, without one, its layout."""
     position = np.array(position_m, dtype=float)
     camera = Camera(
         name="0",
@@ -51,7 +51,7 @@ def question_at(
 
 @dataclass(frozen=True, eq=False)
 class BareRoom:
-    """A photograph of an empty room of which only the depth is known: that of its layout."""
+    """Photograph of an empty room with the depth of its layout and no pixels."""
 
     plan: FloorPlan
     position_m: tuple[float, float]

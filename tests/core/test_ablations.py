@@ -1,4 +1,4 @@
-"""The trained variants: each differs from the paper's model in what its name says, and training one is idempotent."""
+"""Trained variants: each differs from the paper's model in the named setting, and training is idempotent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HOMES = GeneratedScenes(homes=3, shots_per_home=2)
 
 
 def differences(first: dict[str, object], second: dict[str, object], path: str = "") -> set[str]:
-    """Paths of the settings in which two configurations differ."""
+    """Return the paths of the settings in which two configurations differ."""
     found: set[str] = set()
     for key, value in first.items():
         other = second[key]
@@ -53,11 +53,11 @@ class TestTable:
             ("end-to-end", set()),
         ],
     )
-    def test_a_small_variant_differs_in_what_it_is_named_after_alone(self, name: str, changed: set[str]) -> None:
+    def test_small_variant_differs_only_in_its_setting(self, name: str, changed: set[str]) -> None:
         base, config = ABLATIONS[BASE].config["small"], ABLATIONS[name].config["small"]
         assert differences(base.to_dict(), config.to_dict()) == changed | {"name"}
 
-    def test_full_variants_train_as_the_paper_says(self) -> None:
+    def test_full_variants_follow_the_paper(self) -> None:
         base = ABLATIONS[BASE].config["full"]
         assert (base.paper.width, base.paper.layout_depth, base.paper.image_depth) == (64, 18, 50)
         assert (base.image.batch, base.image.optimiser.learning_rate) == (64, 0.1)
@@ -67,7 +67,7 @@ class TestTable:
             assert (image.batch, image.steps, image.optimiser) == (4, layout.steps, layout.optimiser)
 
     @pytest.mark.parametrize("budget", BUDGETS)
-    def test_branches_that_meet_have_the_same_networks(self, budget: Budget) -> None:
+    def test_variants_share_networks_of_the_base(self, budget: Budget) -> None:
         for ablation in ABLATIONS.values():
             if ablation.layout_from is not None:
                 teacher = ABLATIONS[ablation.layout_from].config[budget]
@@ -76,7 +76,7 @@ class TestTable:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every small variant shrunk until it trains in a second."""
+    """Shrink every small variant so that it trains in a second."""
 
     def shrunk(config: TrainConfig) -> TrainConfig:
         paper = dataclasses.replace(config.paper, width=8, image_depth=18, image_height=64, image_width=128)
@@ -106,7 +106,7 @@ def written(folder: Path) -> dict[str, int]:
 
 @pytest.mark.usefixtures("brief")
 class TestTraining:
-    def test_image_variants_share_the_base_s_first_stage_and_are_trained_once(self, tmp_path: Path) -> None:
+    def test_image_variants_share_stage_one(self, tmp_path: Path) -> None:
         first = train("image-l2-kd", tmp_path)
         assert first.folder == tmp_path / "image-l2-kd" / "bundle"
         assert first.manifest.training["budget"] == "small"
@@ -120,7 +120,7 @@ class TestTraining:
         assert train("image-l2-kd", tmp_path).sha256 == first.sha256
         assert written(tmp_path) == before
 
-    def test_layout_variants_answer_layouts_and_say_that_they_see_no_panoramas(self, tmp_path: Path) -> None:
+    def test_layout_variants_answer_layouts_only(self, tmp_path: Path) -> None:
         bundle = train("layout-log-ratio", tmp_path)
         assert not {IMAGE_ONNX, DECODER_WEIGHTS} & set(bundle.manifest.files)
         encoders = Encoders(bundle, threads=1)
@@ -128,13 +128,13 @@ class TestTraining:
         assert encoders.layouts(np.full((2, columns), 2.0), np.full(2, 1.5), np.full(2, 2.5)).shape == (2, 128)
         with pytest.raises(BundleError, match="layout queries only"):
             encoders.query(np.zeros((64, 128, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
-        # An export that was interrupted is done again, without training.
+        # An interrupted export is repeated without training.
         before = written(tmp_path)["layout-log-ratio/layout.pt"]
         (bundle.folder / MANIFEST_NAME).unlink()
         assert train("layout-log-ratio", tmp_path).sha256 == bundle.sha256
         assert written(tmp_path)["layout-log-ratio/layout.pt"] == before
 
-    def test_an_interrupted_variant_goes_on_and_another_data_set_s_is_not_taken(self, tmp_path: Path) -> None:
+    def test_variant_resumes_on_its_own_data_set_only(self, tmp_path: Path) -> None:
         config = ablations.ABLATIONS["layout-mlp"].config["small"]
         shorter = dataclasses.replace(config, layout=dataclasses.replace(config.layout, steps=2))
         train_layout(shorter, tmp_path / "layout-mlp", device=CPU, data=TrainingData(dataset=HOMES), workers=0)
@@ -145,6 +145,6 @@ class TestTraining:
         assert resumed.manifest.training["layout"]["steps"] == 3
         assert resumed.manifest.layout_config["layout_predictor"] == "mlp"
 
-    def test_an_unknown_variant_is_refused_by_name(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="no variant 'layout-resnet34'"):
+    def test_unknown_variant_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="there is no variant 'layout-resnet34'"):
             train("layout-resnet34", tmp_path)

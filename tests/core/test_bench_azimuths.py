@@ -1,4 +1,4 @@
-"""What the benchmark says of openings is what was counted."""
+"""Benchmark of walls and openings by azimuth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.localise.encoders import Encoders
 
 
-def test_figures_are_of_every_panorama_and_every_azimuth() -> None:
+def test_figures_cover_every_panorama_and_azimuth() -> None:
     encoders = Encoders(Bundle.open(default_bundle()), threads=1)
     figures = azimuth_figures(encoders, GeneratedScenes(homes=1, shots_per_home=3))
     assert figures["n"] == 3

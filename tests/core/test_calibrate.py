@@ -1,4 +1,4 @@
-"""Confidence and covariance: fitted on answers, honest on fresh ones."""
+"""Calibration of confidence, covariance and matching weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel,
 from tests.strategies import seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
-# What made the answers of `believable`.
+# Model that generates the predictions of `believable`.
 MAKER = LogisticModel(bias=1.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=-3.0)
 
 
@@ -31,7 +31,7 @@ def result(
     answer_to_chance: float = 0.0,
     latent_distance: float = 0.1,
 ) -> Prediction:
-    """A query that was answered that far off; NaN stands for no answer."""
+    """Return a prediction with a position error (m); NaN for no answer."""
     answered = not math.isnan(error_m)
     signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty}
     signals |= {
@@ -51,13 +51,13 @@ def result(
 
 
 def confidence(model: LogisticModel, prediction: Prediction) -> float:
-    """The posterior, times the probability that the picture fits the plan."""
+    """Return the posterior times the probability that the photograph belongs to the plan."""
     signals = prediction.signals["lpo"]
     return model.probability(**signals) / (1.0 + math.exp(-signals["log_odds"]))
 
 
 def believable(count: int, seed: int) -> list[Prediction]:
-    """Queries that are right as often as `MAKER` says of their signals."""
+    """Return queries that are right with the probability that `MAKER` gives their signals."""
     rng = np.random.default_rng(seed)
     results = []
     drawn = rng.uniform([-3.0, 0.0, -4.0, 0.0], [4.0, 1.0, -2.0, 0.5], (count, 4))
@@ -76,23 +76,23 @@ def fitted(predictions: list[Prediction]) -> LogisticModel:
 
 
 def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> Prediction:
-    """A query answered off by `offset` (m) and `turn_deg`, whose cost had this curvature."""
+    """Return a prediction with errors `offset` (m) and `turn_deg` and a curvature of its cost."""
     pose = dataclasses.replace(TRUTH, x_m=float(offset[0]), y_m=float(offset[1]), heading_deg=turn_deg)
     return dataclasses.replace(result(0.0), stages={"lpo": pose}, information=tuple(map(tuple, information.tolist())))
 
 
 class TestConfidence:
-    def test_a_fit_finds_the_model_that_made_the_data(self) -> None:
+    def test_fit_recovers_the_generating_model(self) -> None:
         model = fitted(believable(8000, 0))
-        # What this stood for is told by its successor.
+        # Replaced by a later signal.
         assert model.cost_to_chance == 0.0
         assert model.log_odds == 0.0
         assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.3)
         assert model.cost == pytest.approx(MAKER.cost, abs=0.8)
         assert model.latent_distance == pytest.approx(MAKER.latent_distance, abs=0.8)
 
-    def test_what_fits_like_photographs_of_other_homes_is_not_trusted(self) -> None:
-        # Of the home's own photographs none tells that a poor fit is bad: all have the same cost.
+    def test_fit_like_unknown_places_has_low_confidence(self) -> None:
+        # All photographs of the home have the same cost, so they do not show that a poor fit is bad.
         rng = np.random.default_rng(0)
         odds = rng.uniform(0.0, 5.0, 400)
         own = [result(0.2 if rng.random() < 1.0 / (1.0 + math.exp(-each)) else 3.0, each) for each in odds]
@@ -103,11 +103,11 @@ class TestConfidence:
         )
         assert np.mean([confidence(plain, one) for one in mismatched]) > 0.5
         assert np.mean([confidence(taught, one) for one in mismatched]) < 0.1
-        # Answers about the home itself are told as right as they are.
+        # Confidence in the home itself stays calibrated.
         share = np.mean(position_errors_m(own) < 1.0)
         assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(share, abs=0.03)
 
-    def test_what_fits_no_better_than_by_chance_is_not_believed_whatever_it_costs(self) -> None:
+    def test_chance_fit_has_low_confidence(self) -> None:
         rng = np.random.default_rng(7)
         own = [result(0.2, 6.0, cost, answer_to_chance=rng.normal(-1.0, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
         others = [result(3.0, 6.0, cost, answer_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
@@ -116,7 +116,7 @@ class TestConfidence:
         assert np.mean([confidence(model, one) for one in own]) > 0.95
         assert np.mean([confidence(model, one) for one in others]) < 0.1
 
-    def test_what_fits_as_disturbed_photographs_do_is_trusted_if_they_were_right(self) -> None:
+    def test_fit_like_right_disturbed_photographs_is_confident(self) -> None:
         rng = np.random.default_rng(3)
         own = [result(0.2, 6.0, cost) for cost in rng.uniform(0.1, 0.2, 200)]
         disturbed = [result(0.2, 6.0, cost) for cost in rng.uniform(0.2, 0.55, 200)]
@@ -130,7 +130,7 @@ class TestConfidence:
         assert confidence(taught, between) > 0.8
         assert np.mean([confidence(taught, one) for one in others]) < 0.1
 
-    def test_disturbed_photographs_say_nothing_of_the_covariance(self) -> None:
+    def test_disturbed_photographs_do_not_change_covariance(self) -> None:
         offsets = np.random.default_rng(5).normal(0.0, 0.1, (200, 2))
         own = [bent(offset, 100.0 * np.eye(3)) for offset in offsets]
         far = [bent(3.0 * offset, 100.0 * np.eye(3)) for offset in offsets]
@@ -139,13 +139,13 @@ class TestConfidence:
             fit_confidence(Answers(own=own), Answers(own=own)).position_factor
         )
 
-    def test_answers_that_were_stored_by_an_earlier_version_are_refused(self) -> None:
+    def test_predictions_without_signals_are_refused(self) -> None:
         stored = result(0.2)
         del stored.signals["lpo"]["answer_to_chance"]
-        with pytest.raises(InvalidInputError, match="lack answer_to_chance"):
+        with pytest.raises(InvalidInputError, match="lack the signals answer_to_chance"):
             fitted([result(0.2), stored])
 
-    def test_models_of_before_weigh_what_they_were_fitted_with(self) -> None:
+    def test_older_models_use_their_own_signals(self) -> None:
         weights = {"cost": -2.0, "uncertainty": -0.5, "latent_distance": -4.0, "cost_to_chance": -3.0}
         model = LogisticModel(bias=1.0, log_odds=0.0, **weights)
         told = {"log_odds": 0.0, "cost": 0.3, "uncertainty": -2.0, "latent_distance": 0.1, "cost_to_chance": -0.4}
@@ -153,8 +153,8 @@ class TestConfidence:
         for more in ({}, {"answer_to_chance": -9.0}):
             assert model.probability(**told, **more) == pytest.approx(1.0 / (1.0 + math.exp(-logit)))
 
-    def test_what_is_told_of_it_is_of_homes_that_it_was_not_fitted_on(self) -> None:
-        # In each home costs mean something else, so that what was learnt in the others is wrong here.
+    def test_cross_validation_uses_other_homes(self) -> None:
+        # Costs differ in meaning between homes, so a fit on the others is wrong here.
         def of_home(number: int, cost: float, *, right: bool) -> Prediction:
             one = result(0.2 if right else 3.0, 6.0, cost)
             return dataclasses.replace(one, scene=f"home-{number}")
@@ -166,10 +166,10 @@ class TestConfidence:
         ]
         assert cross_validate(Answers(own=turned))["calibration_error"] > 0.9
 
-    def test_it_tells_which_share_of_others_is_believed(self) -> None:
+    def test_false_accept_rate_is_reported(self) -> None:
         own = [dataclasses.replace(result(0.2, 6.0, 0.1), scene=f"home-{k % 5}") for k in range(100)]
         others = [dataclasses.replace(result(3.0, 6.0, 0.8), scene=f"home-{k % 5}") for k in range(75)]
-        # A quarter cannot be told from the home's own photographs.
+        # A quarter is indistinguishable from the home's own photographs.
         others += [dataclasses.replace(result(3.0, 6.0, 0.1), scene=f"home-{k % 5}") for k in range(25)]
         figures = cross_validate(Answers(own=own, mismatched=others))
         assert figures["mismatched_believed"] == pytest.approx(0.25)
@@ -177,9 +177,7 @@ class TestConfidence:
         assert cross_validate(Answers(own=[])) == {}
 
     @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
-    def test_mismatched_photographs_gain_nothing_where_hardly_an_answer_is_wrong(
-        self, wrong_log_odds: float | None
-    ) -> None:
+    def test_mismatched_weight_does_not_grow_with_accuracy(self, wrong_log_odds: float | None) -> None:
         rng = np.random.default_rng(0)
         own = [result(0.2, rng.normal() + 5.0, cost=0.1) for _ in range(490)]
         own += [result(3.0, wrong_log_odds, cost=0.1) for _ in range(10) if wrong_log_odds is not None]
@@ -190,21 +188,21 @@ class TestConfidence:
 
     @given(seeds())
     @settings(max_examples=10)
-    def test_it_rises_with_the_odds_and_falls_with_cost_and_uncertainty(self, seed: int) -> None:
+    def test_confidence_follows_odds_cost_and_uncertainty(self, seed: int) -> None:
         model = fitted(believable(800, seed))
         here = confidence(model, result(0.0, 0.0, 0.2, -3.0))
         assert confidence(model, result(0.0, 1.0, 0.2, -3.0)) > here
         assert confidence(model, result(0.0, 0.0, 0.4, -3.0)) < here
         assert confidence(model, result(0.0, 0.0, 0.2, -2.0)) < here
 
-    def test_its_probabilities_are_frequencies(self) -> None:
+    def test_confidences_are_frequencies(self) -> None:
         model = fitted(believable(4000, 1))
         fresh = believable(4000, 2)
         told = np.array([confidence(model, one) for one in fresh])
         assert expected_calibration_error(told, position_errors_m(fresh) < 1.0) < 0.04
 
     @pytest.mark.parametrize("right", [True, False])
-    def test_queries_that_all_went_the_same_way_give_a_finite_model(self, right: bool) -> None:
+    def test_equal_outcomes_give_a_finite_model(self, right: bool) -> None:
         model = fitted([result(0.1 if right else 5.0, 0.1 * k, 0.1 * k) for k in range(10)])
         assert all(np.isfinite(value) for value in dataclasses.asdict(model).values())
         assert (confidence(model, result(0.0, 0.3, 0.3)) > 0.5) == right
@@ -214,7 +212,7 @@ class TestConfidence:
         model = fitted([good, bad] * 20)
         assert confidence(model, good) > 0.9 > 0.1 > confidence(model, bad)
 
-    def test_known_and_searched_headings_and_stages_have_models_of_their_own(self) -> None:
+    def test_headings_and_stages_have_their_own_models(self) -> None:
         early = [
             dataclasses.replace(
                 one,
@@ -234,13 +232,11 @@ class TestConfidence:
         assert (told["lpo", False] or 1.0) < 0.5
         assert told["retrieval", False] is None
 
-    def test_queries_without_an_answer_have_no_say(self) -> None:
+    def test_unanswered_queries_are_ignored(self) -> None:
         some = believable(100, 0)
         assert fitted(some + [result(math.nan)] * 50) == fitted(some)
 
-    def test_calibration_is_stored_without_changing_the_model_s_identity(
-        self, tiny_bundle: Path, opened_bundle: Bundle
-    ) -> None:
+    def test_calibration_keeps_the_model_identity(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
         try:
             calibrated = calibrate(
                 opened_bundle, Answers(own=believable(200, 0)), Answers(own=believable(50, 1)), "made-up queries"
@@ -255,9 +251,9 @@ class TestConfidence:
             write_manifest(tiny_bundle, opened_bundle.manifest)
 
 
-class TestEvidence:
+class TestMatchingWeights:
     def choice(self, rng: np.random.Generator, weights: np.ndarray) -> Prediction:
-        """A query of ten candidates, the right one as probable as these weights of their terms say."""
+        """Return a query of ten candidates, the right one drawn with the probability of these weights."""
         terms = rng.uniform(0.0, 0.5, (10, 4))
         score = -(terms @ weights)
         right = rng.choice(10, p=np.exp(score) / np.exp(score).sum())
@@ -272,17 +268,17 @@ class TestEvidence:
         ]
         return dataclasses.replace(result(0.2), candidates=tuple(rivals))
 
-    def test_the_weights_that_made_the_right_ones_right_are_found(self) -> None:
+    def test_fit_recovers_generating_weights(self) -> None:
         rng = np.random.default_rng(0)
         made = np.array([12.0, 9.0, 1.0, 3.0])
         model = fit_matching_weights([self.choice(rng, made) for _ in range(1500)])
         found = model.temperature * np.array([1.0, model.openings, model.ceiling, model.room_type])
         np.testing.assert_allclose(found, made, atol=1.5)
 
-    def test_without_queries_that_teach_anything_they_are_the_usual_ones(self) -> None:
+    def test_uninformative_queries_keep_default_weights(self) -> None:
         assert fit_matching_weights([result(0.2)]) == fit_matching_weights([]) == MatchingWeights()
 
-    def test_terms_that_never_differ_keep_their_weights(self) -> None:
+    def test_constant_terms_keep_their_weights(self) -> None:
         rng = np.random.default_rng(1)
         queries = []
         for _ in range(50):
@@ -297,7 +293,7 @@ class TestEvidence:
 class TestCovariance:
     @given(seed=seeds(), factor=st.floats(1e-3, 1e3))
     @settings(max_examples=10)
-    def test_a_fit_finds_the_factors_that_made_the_errors(self, seed: int, factor: float) -> None:
+    def test_fit_recovers_generating_factors(self, seed: int, factor: float) -> None:
         rng = np.random.default_rng(seed)
         known, searched = [], []
         for _ in range(600):
@@ -312,7 +308,7 @@ class TestCovariance:
         assert model.position_factor_searched == pytest.approx(factor, rel=0.25)
         assert model.heading_factor == pytest.approx(factor, rel=0.35)
 
-    def test_wrong_answers_and_those_without_curvature_have_no_say(self) -> None:
+    def test_wrong_poses_and_missing_curvature_are_ignored(self) -> None:
         right = [bent(np.array([0.01 * k, 0.0]), 100.0 * np.eye(2)) for k in range(1, 6)]
         wrong = [bent(np.array([2.0, 0.0]), 100.0 * np.eye(2))] * 20
         plain = [result(0.1)] * 20

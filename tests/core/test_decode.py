@@ -1,4 +1,4 @@
-"""VDR + Decode: the decoded layout leads to its pose, and what comes before is LaLaLoc's."""
+"""VDR + Decode: the decoded layout leads to its pose; retrieval and VDR equal LaLaLoc's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.strategies import crooked_flat, plan_of
 
 
 class TrueDecoder(LayoutDecoder):
-    """Stands in for a decoder that is never wrong: the layout depth of a question's true pose, whatever the latent."""
+    """Stub of a perfect decoder: the layout depth of the true pose for every latent."""
 
     def __init__(self, question: Question) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class TrueDecoder(LayoutDecoder):
 
 
 @pytest.mark.parametrize("position", [(1.4, 1.3), (2.1, 0.9), (3.1, 1.6)])
-def test_a_decoder_that_is_right_leads_to_the_truth(encoders: Encoders, position: tuple[float, float]) -> None:
+def test_perfect_decoder_finds_the_truth(encoders: Encoders, position: tuple[float, float]) -> None:
     question = question_at(plan_of([[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [0.0, 3.0]]), position)
     answer = VdrDecode(encoders, TrueDecoder(question)).locate(question)
     found = answer.stages["decode"]
@@ -45,7 +45,7 @@ def test_a_decoder_that_is_right_leads_to_the_truth(encoders: Encoders, position
 
 
 @pytest.mark.parametrize("heading_known", [True, False])
-def test_retrieval_and_re_sampling_are_lalaloc_s(encoders: Encoders, heading_known: bool) -> None:
+def test_retrieval_and_vdr_equal_lalaloc(encoders: Encoders, heading_known: bool) -> None:
     torch.manual_seed(0)
     question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
     answer = VdrDecode(encoders, LayoutDecoder()).locate(question)
@@ -54,14 +54,14 @@ def test_retrieval_and_re_sampling_are_lalaloc_s(encoders: Encoders, heading_kno
     assert list(answer.stages) == ["retrieval", "vdr", "decode"]
     assert {stage: answer.stages[stage] for stage in expected.stages} == expected.stages
     assert answer.retrieved == expected.retrieved
-    # An untrained decoder decodes nonsense; the pose stays in its room all the same.
+    # The decoder is untrained; the pose still stays in its room.
     found = answer.stages["decode"]
     assert crooked_flat().room_index_at(np.array([[found.x_m, found.y_m]]))[0] == found.room_index
     if heading_known:
         assert found.heading == pytest.approx(0.7)
 
 
-def test_decoded_layouts_are_as_wide_as_what_they_are_compared_with(encoders: Encoders) -> None:
+def test_decoded_layouts_have_the_compared_width(encoders: Encoders) -> None:
     torch.manual_seed(0)
     decoder = LayoutDecoder().eval()
     latents = np.random.default_rng(0).normal(size=(3, 128)).astype(np.float32)

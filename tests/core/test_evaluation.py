@@ -1,4 +1,4 @@
-"""Running an evaluation: every query is asked once, whatever interrupts it, and the command line says what it found."""
+"""Evaluation runs: every query is localised once, also after interruptions; commands `evaluate` and `score`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OWN_DATA = Path(__file__).parents[2] / "examples" / "own_data"
 
 @pytest.fixture
 def layout_run(tiny_bundle: Path) -> RunInfo:
-    """Layout queries of three generated homes, two each."""
+    """Return a run of layout queries: three generated homes, two queries each."""
     return RunInfo(
         label="test",
         method="lalaloc",
@@ -40,7 +40,7 @@ def without_times(predictions: list[Prediction]) -> list[Prediction]:
 
 
 class TestGeneratedScenes:
-    def test_the_same_scene_is_always_the_same_and_splits_differ(self) -> None:
+    def test_scene_is_reproducible_and_splits_differ(self) -> None:
         scenes = GeneratedScenes(homes=3, shots_per_home=2)
         assert list(scenes.scenes("test")) == ["test-00000", "test-00001", "test-00002"]
         first, again = (scenes.load("test-00001") for _ in range(2))
@@ -50,24 +50,24 @@ class TestGeneratedScenes:
             assert a.heading == b.heading != c.heading
             assert first.plan.room_index_at(a.position_m[None])[0] == a.room_index
 
-    def test_a_photograph_and_its_depth_agree_about_the_room(self) -> None:
+    def test_photograph_and_depth_show_the_same_room(self) -> None:
         scene = GeneratedScenes(homes=1, furniture="empty").load("test-00000")
         camera = scene.cameras[0]
         (photograph,) = camera.photographs.values()
         assert photograph.image(32, 64).shape == (32, 64, 3)
         depth = photograph.depth_m()
-        # Right below the camera lies the floor, right above it the ceiling.
+        # The floor is directly below the camera, the ceiling directly above.
         np.testing.assert_allclose(depth[-1], camera.camera_height_m, rtol=1e-3)
         ceiling = scene.plan.ceiling_heights_m[camera.room_index]
         assert np.median(depth[0]) <= ceiling - camera.camera_height_m + 1e-3
 
-    def test_an_unknown_scene_is_named(self) -> None:
+    def test_unknown_scene_is_named(self) -> None:
         with pytest.raises(InvalidInputError, match="scene 'roof-1'"):
             GeneratedScenes(homes=1).load("roof-1")
 
 
 class TestRunning:
-    def test_layout_queries_are_found_again(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_layout_queries_are_located(self, layout_run: RunInfo, tmp_path: Path) -> None:
         info = dataclasses.replace(layout_run, generated={"homes": 4, "shots_per_home": 3})
         predictions = run_evaluation(RunFolder(tmp_path), info, workers=0)
         assert len(predictions) == 12
@@ -82,14 +82,14 @@ class TestRunning:
         assert [one.scene for one in predictions[::3]] == list(build_dataset(info).scenes("test"))
 
     @pytest.mark.parametrize("heading_known", [True, False])
-    def test_panoramas_are_answered_every_one(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
+    def test_every_panorama_is_answered(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
         info = dataclasses.replace(layout_run, kind="panorama", furniture="full", heading_known=heading_known)
         predictions = run_evaluation(RunFolder(tmp_path), info, workers=0)
         assert len(predictions) == 6
         assert np.isfinite(position_errors_m(predictions)).all()
         assert (heading_errors_deg(predictions).max() < 1e-3) == heading_known
         assert RunFolder(tmp_path).read_predictions() == predictions
-        # What is known of the photographs is what the generator says of its shots.
+        # Facts come from the generator's shots.
         scenes = build_dataset(info)
         for one in predictions:
             camera = next(c for c in scenes.load(one.scene).cameras if c.name == one.camera)
@@ -98,24 +98,24 @@ class TestRunning:
             assert one.facts == tuple(sorted(facts_of(photograph.shot)))
         assert any(one.facts for one in predictions)
 
-    def test_processes_answer_the_same_in_the_same_order(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_workers_do_not_change_predictions(self, layout_run: RunInfo, tmp_path: Path) -> None:
         here = run_evaluation(RunFolder(tmp_path / "here"), layout_run, workers=0)
         there = run_evaluation(RunFolder(tmp_path / "there"), layout_run, workers=2)
         assert without_times(here) == without_times(there)
 
-    def test_an_interrupted_run_ends_in_the_same_file(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_interrupted_run_resumes_to_the_same_file(self, layout_run: RunInfo, tmp_path: Path) -> None:
         whole = RunFolder(tmp_path / "whole")
         expected = run_evaluation(whole, layout_run, workers=0)
         broken = RunFolder(tmp_path / "broken")
         broken.write_info(layout_run)
-        # Interrupted within the second scene.
+        # Interruption within the second scene.
         broken.append(expected[:3])
         done = run_evaluation(broken, dataclasses.replace(layout_run, command="again"), workers=0)
         assert without_times(done) == without_times(expected)
         assert without_times(broken.read_predictions()) == without_times(expected)
         assert broken.read_info().command == "again"
 
-    def test_a_limit_ends_a_run_and_a_larger_one_goes_on(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_larger_limit_continues_the_run(self, layout_run: RunInfo, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path)
         first = run_evaluation(folder, dataclasses.replace(layout_run, limit=3), workers=0)
         assert len(first) == len(folder.read_predictions()) == 3
@@ -124,7 +124,7 @@ class TestRunning:
         assert without_times(more[:3]) == without_times(first)
         assert len(run_evaluation(folder, dataclasses.replace(layout_run, limit=2), workers=0)) == 2
 
-    def test_answers_without_facts_are_still_read(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_predictions_without_facts_are_read(self, layout_run: RunInfo, tmp_path: Path) -> None:
         (asked,) = run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
         assert asked.facts == ()
         path = tmp_path / PREDICTIONS_FILE
@@ -133,12 +133,12 @@ class TestRunning:
         path.write_text(json.dumps(line) + "\n", encoding="utf-8")
         assert RunFolder(tmp_path).read_predictions() == [asked]
 
-    def test_another_question_in_the_same_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_other_description_in_the_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
         run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
         with pytest.raises(RunError, match=r"grid_step_m 0\.5, not 1\.0"):
             run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, grid_step_m=1.0), workers=0)
 
-    def test_a_coarser_grid_finds_less_exactly(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_coarser_grid_is_less_accurate(self, layout_run: RunInfo, tmp_path: Path) -> None:
         medians = []
         for step in (0.5, 2.0):
             info = dataclasses.replace(layout_run, grid_step_m=step, settings={"refine": "none"})
@@ -147,15 +147,15 @@ class TestRunning:
             medians.append(np.median(position_errors_m(predictions)))
         assert medians[0] < medians[1]
 
-    def test_photographs_that_a_data_set_lacks_are_refused(self) -> None:
+    def test_missing_appearance_is_refused(self) -> None:
         scenes = GeneratedScenes(homes=1)
         assert choose_appearance(scenes, None, None).furniture == "full"
-        with pytest.raises(InvalidInputError, match="no photographs 'full/warm', choose one of: full"):
+        with pytest.raises(InvalidInputError, match="no photographs 'full/warm'; choose one of: full"):
             choose_appearance(scenes, "full", "warm")
 
 
 class TestCommandLine:
-    def test_evaluate_prints_scores_and_score_needs_nothing_but_the_answers(
+    def test_score_needs_only_predictions(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         asked = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
@@ -174,7 +174,7 @@ class TestCommandLine:
         (row,) = [line for line in table.splitlines() if line.startswith("answer ")]
         assert f"{printed['final']['median_cm']['value']:.1f}" in row
 
-    def test_an_empty_split_is_an_error_that_leaves_no_folder(
+    def test_empty_split_leaves_no_folder(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         asked = ["--data", str(OWN_DATA), "--split", "train", "--bundle", str(tiny_bundle)]
@@ -182,17 +182,13 @@ class TestCommandLine:
         assert "split 'train'" in capsys.readouterr().err
         assert not (tmp_path / "run").exists()
 
-    def test_a_split_without_queries_is_an_error_that_leaves_no_folder(
-        self, layout_run: RunInfo, tmp_path: Path
-    ) -> None:
+    def test_split_without_queries_leaves_no_folder(self, layout_run: RunInfo, tmp_path: Path) -> None:
         folder, silent = RunFolder(tmp_path / "run"), {"homes": 1, "shots_per_home": 0}
         with pytest.raises(InvalidInputError, match="no queries"):
             run_evaluation(folder, dataclasses.replace(layout_run, generated=silent), workers=0)
         assert not folder.path.exists()
 
-    def test_the_project_s_own_errors_are_a_message_and_an_exit_code(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_error_is_a_message_and_exit_code(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["evaluate", "--bundle", str(tmp_path), "--homes", "1"]) == 1
         assert main(["export", "--run", str(tmp_path), "--out", str(tmp_path / "o"), "--version", "1"]) == 1
         assert main(["score", str(tmp_path)]) == 1
@@ -201,7 +197,7 @@ class TestCommandLine:
         assert "error: no checkpoint at" in errors
         assert "error: no evaluation run at" in errors
 
-    def test_the_caller_s_mistakes_are_exit_code_2(
+    def test_invalid_request_has_exit_code_2(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         bundle = ["--bundle", str(tiny_bundle)]
@@ -225,7 +221,7 @@ class TestCommandLine:
             ["reproduce", "--limit", "0"],
         ],
     )
-    def test_wrong_arguments_are_exit_code_2(self, arguments: list[str]) -> None:
+    def test_invalid_argument_has_exit_code_2(self, arguments: list[str]) -> None:
         with pytest.raises(SystemExit) as caught:
             main(arguments)
         assert caught.value.code == 2

@@ -1,4 +1,4 @@
-"""Localisation by explicit layouts: the predicted wall profile, retrieval and alignment by depth."""
+"""Localisation by explicit layouts: predicted wall profile, retrieval and alignment by depth."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ _ROUNDED = 2e-4
 
 
 class PaintedProfile(onnxruntime.InferenceSession):
-    """Stands in for the image encoder's session: the wall profile that is painted on the picture (`paint`)."""
+    """Stub of the image encoder's session: returns the wall profile painted on the picture (`paint`)."""
 
     def __init__(self) -> None:
-        """Nothing to load."""
+        """Skip loading."""
 
     def run(self, output_names: Any, input_feed: Any, run_options: Any = None) -> list[np.ndarray]:
         assert output_names == ["ring", "log_profile", "log_scale"]
         pixels = input_feed["image"][:, 0].astype(np.float64)
         log_m = np.log((pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * 1e-4).astype(np.float32)
-        # Of the ring, and of how sure the network is, explicit layouts take no notice.
+        # Explicit layouts use neither the ring nor the predicted scale.
         return [np.zeros((1, RING.channels, RING.sectors), np.float32), log_m, np.zeros_like(log_m)]
 
 
 @dataclass(frozen=True, eq=False)
 class PaintedRoom(BareRoom):
-    """A photograph that shows nothing but its wall profile."""
+    """Photograph that shows only its wall profile."""
 
     def image(self, height: int, width: int) -> np.ndarray:
         position = np.array([self.position_m])
@@ -66,7 +66,7 @@ def painted(opened_bundle: Bundle) -> Encoders:
 
 
 def depth_job(scene: Scene, starts_m: np.ndarray, truths_m: np.ndarray, columns: int) -> RefinementJob:
-    """Starts, each with the layout depth of another place of its room as target."""
+    """Return starts with the layout depth of another place in their room as target."""
     count = len(starts_m)
     profile = wall_profile(truths_m, np.zeros(count), scene.walls_m, columns)
     depth = layout_depth(profile, np.full(count, CAMERA_M), scene.ceiling_height_m, ROWS)
@@ -84,7 +84,7 @@ def depth_job(scene: Scene, starts_m: np.ndarray, truths_m: np.ndarray, columns:
 class TestAligner:
     @given(polygon=convex_polygons(), seed=seeds())
     @settings(max_examples=5)
-    def test_it_finds_the_place_of_a_depth_image(self, polygon: list, seed: int) -> None:
+    def test_aligner_finds_the_pose_of_a_depth_image(self, polygon: list, seed: int) -> None:
         scene = scene_of(plan_of(polygon), 3, seed)
         rng = np.random.default_rng(seed)
         moved = scene.poses.position_m + rng.uniform(-0.1, 0.1, (3, 2))
@@ -94,7 +94,7 @@ class TestAligner:
 
     @given(polygon=room_polygons(), seed=seeds())
     @settings(max_examples=4)
-    def test_it_never_leaves_the_room_nor_ends_worse(self, polygon: list, seed: int) -> None:
+    def test_aligner_stays_in_room_and_never_worsens(self, polygon: list, seed: int) -> None:
         scene = scene_of(plan_of(polygon), 3, seed, margin_m=0.05)
         starts = scene.poses.position_m
         job = depth_job(scene, starts, starts[::-1], 32)
@@ -104,7 +104,7 @@ class TestAligner:
         depth = layout_depth(profile, np.full(3, CAMERA_M), scene.ceiling_height_m, ROWS).reshape(3, -1)
         assert (result.cost <= np.abs(depth - job.targets).mean(axis=1) + 1e-5).all()
 
-    def test_thinned_images_have_every_so_manieth_column(self) -> None:
+    def test_thinned_images_keep_every_nth_column(self) -> None:
         scene = scene_of(plan_of([[0, 0], [4, 0], [4, 3], [0, 3.5]]), 2, 0)
         job = depth_job(scene, scene.poses.position_m, scene.poses.position_m, 64)
         thinned = job.targets.reshape(2, ROWS, 64)[:, :, ::4].reshape(2, -1)
@@ -114,12 +114,12 @@ class TestAligner:
 
     @given(room_polygons(), seeds(), st.sampled_from(["l1", "l2"]))
     @settings(max_examples=10)
-    def test_its_first_step_is_downhill_by_finite_differences(self, polygon: list, seed: int, norm: Any) -> None:
+    def test_first_step_follows_finite_differences(self, polygon: list, seed: int, norm: Any) -> None:
         scene = scene_of(plan_of(polygon), 1, seed)
         start = scene.poses.position_m
         targets = torch.linspace(0.0, 1.0, 3)[None]
 
-        # A smooth function of the profile, so that differences and derivatives must agree.
+        # Smooth in the profile, so that differences and derivatives agree.
         def embedding(profile_m: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
             return torch.stack([profile_m.log().mean(1), profile_m.square().mean(1), profile_m[:, 0]], dim=1)
 
@@ -134,7 +134,7 @@ class TestAligner:
         gradient = np.array([(distance(step * e) - distance(-step * e)) / (2 * step) for e in np.eye(2)])
         once = LpoConfig(method="adam", adam_steps=2, adam_learning_rate=1e-3)
         moved = PoseOptimiser(embedding, 32, norm=norm, config=once).refine(job).position_m[0] - start[0]
-        # Adam's first step has the sign of the gradient alone; it is kept only where it lowered the distance.
+        # Adam's first step has the sign of the gradient; it is kept only where it lowers the distance.
         clear = np.abs(gradient) > 1e-2 * np.abs(gradient).max()
         if np.any(moved != 0.0):
             assert (np.sign(moved[clear]) == -np.sign(gradient[clear])).all()
@@ -142,7 +142,7 @@ class TestAligner:
         else:
             assert distance(-1e-3 * np.sign(gradient)) >= distance(np.zeros(2)) - 1e-6
 
-    def test_squares_are_all_that_levenberg_marquardt_minimises(self) -> None:
+    def test_levenberg_marquardt_needs_squares(self) -> None:
         with pytest.raises(ConfigError, match="l1"):
             PoseOptimiser(lambda profile, *_: profile, 32, norm="l1", config=LpoConfig())
 
@@ -150,7 +150,7 @@ class TestAligner:
 class TestPredictedProfile:
     @given(heading=st.floats(-math.pi, TWO_PI))
     @settings(max_examples=15)
-    def test_the_heading_is_undone(self, painted: Encoders, heading: float) -> None:
+    def test_profile_is_turned_to_heading_zero(self, painted: Encoders, heading: float) -> None:
         plan, position = crooked_flat(), (1.37, 1.12)
         image = PaintedRoom(plan, position, heading).image(0, 0)
         profile, left_over = painted.profile(image, heading, CAMERA_M)
@@ -158,7 +158,7 @@ class TestPredictedProfile:
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
 
-    def test_it_is_what_the_image_encoder_says_of_the_panorama_and_its_mirror_image(self, encoders: Encoders) -> None:
+    def test_profile_averages_panorama_and_mirror_image(self, encoders: Encoders) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
         said = []
@@ -171,7 +171,7 @@ class TestPredictedProfile:
         np.testing.assert_allclose(np.log(profile), 0.5 * (said[0] + said[1][::-1]), atol=1e-5)
         assert profile.shape == (COLUMNS,)
 
-    def test_a_network_that_predicts_none_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
+    def test_network_without_profile_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
         encoders = Encoders(opened_bundle, threads=1)
         encoders.predicts_profile = False
         with pytest.raises(BundleError, match="log_profile"):
@@ -181,7 +181,7 @@ class TestPredictedProfile:
 class TestMethod:
     @pytest.mark.parametrize("position", [(1.13, 1.02), (5.21, 1.42), (2.34, 4.81)])
     @pytest.mark.parametrize("heading", [None, 0.0, 2.3])
-    def test_a_perfect_prediction_is_found(
+    def test_perfect_prediction_is_located(
         self, painted: Encoders, position: tuple[float, float], heading: float | None
     ) -> None:
         plan = crooked_flat()
@@ -201,7 +201,7 @@ class TestMethod:
 
     @given(seed=seeds())
     @settings(max_examples=3)
-    def test_retrieval_takes_the_least_mean_difference_of_depth(self, painted: Encoders, seed: int) -> None:
+    def test_retrieval_minimises_mean_depth_difference(self, painted: Encoders, seed: int) -> None:
         plan = _two_ceilings()
         scene = scene_of(plan, 1, seed)
         question = question_at(plan, scene.poses.position_m[0])
@@ -213,7 +213,7 @@ class TestMethod:
         assert expected[answer.retrieved] == pytest.approx(min(expected), abs=1e-5)
         assert answer.stages["retrieval"].distance == pytest.approx(min(expected), abs=1e-5)
 
-    def test_without_the_heading_it_says_so(self, painted: Encoders) -> None:
+    def test_unknown_heading_is_refused(self, painted: Encoders) -> None:
         with pytest.raises(InvalidInputError, match="heading"):
             ExplicitLayout(painted).locate(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
 
@@ -225,7 +225,7 @@ def _two_ceilings() -> FloorPlan:
 
 
 def _slow_distance(profile_m: np.ndarray, plan: FloorPlan, grid: PoseSet, index: int) -> float:
-    """Mean |difference| of two depth images of 32 rows, pixel by pixel, under the ceiling of the pose's room."""
+    """Return the mean |difference| of two depth images of 32 rows, under the ceiling of the pose's room."""
     room = plan.rooms[int(grid.room_index[index])]
     seen = wall_profile(grid.position_m[index][None], np.zeros(1), room.walls_m[None], COLUMNS)[0]
     total = 0.0

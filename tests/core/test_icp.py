@@ -1,4 +1,4 @@
-"""Iterative closest point: its parts against slow oracles, and whole alignments against the truth."""
+"""ICP: parts against slow oracles, alignments against the truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.strategies import crooked_flat, l_shape, plan_of, rectangle, scene_of
 
 class TestParts:
     @given(seeds(), st.floats(0.01, 1.0))
-    def test_merging_is_the_mean_of_each_cell(self, seed: int, cell_m: float) -> None:
+    def test_merged_points_are_cell_means(self, seed: int, cell_m: float) -> None:
         points = np.random.default_rng(seed).uniform(-2.0, 2.0, (60, 2))
         cells: dict[tuple[int, int], list[np.ndarray]] = defaultdict(list)
         for point in points:
@@ -33,7 +33,7 @@ class TestParts:
         np.testing.assert_allclose(merge_cells(points, cell_m), expected, atol=1e-12)
 
     @given(seeds())
-    def test_the_best_motion_is_kabsch_s(self, seed: int) -> None:
+    def test_best_motion_equals_kabsch(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         scan, targets = rng.normal(size=(9, 2)), rng.normal(size=(3, 9, 2))
         turn, shift = best_motion(scan, targets)
@@ -45,15 +45,15 @@ class TestParts:
             np.testing.assert_allclose([[cosine, -sine], [sine, cosine]], rotation, atol=1e-6)
             np.testing.assert_allclose(shift[index], target.mean(axis=0) - rotation @ scan.mean(axis=0), atol=1e-6)
 
-    def test_points_of_a_scan_lie_where_it_looks(self) -> None:
+    def test_scan_points_follow_azimuth(self) -> None:
         # Columns of a scan with four: -135, -45, 45, 135 degrees from the heading, which is 45 degrees.
         points = scan_of(np.array([[1.0, np.nan, 3.0, 4.0]]), math.pi / 4)
         np.testing.assert_allclose(points, [[-1.0, 0.0], [3.0, 0.0], [0.0, -4.0]], atol=1e-12)
 
-    def test_the_cloud_of_a_plan_covers_its_walls_and_nothing_else(self) -> None:
+    def test_plan_cloud_covers_exactly_the_walls(self) -> None:
         plan, config = crooked_flat(), IcpConfig()
         cloud = wall_cloud(plan, config)
-        # Merging cuts corners, by no more than a cell; elsewhere points lie on their wall.
+        # Merging moves points at corners by a cell at most; other points stay on their wall.
         to_wall = np.min([_to_boundary(plan.rooms[k].polygon_m, cloud) for k in range(len(plan.rooms))], axis=0)
         assert to_wall.max() < config.plan_cell_m
         assert np.median(to_wall) < 1e-9
@@ -76,7 +76,7 @@ def _to_boundary(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
 class TestAlign:
     @given(seeds())
     @settings(max_examples=10)
-    def test_starts_near_the_truth_find_it_turned_or_not(self, seed: int) -> None:
+    def test_near_starts_find_the_truth(self, seed: int) -> None:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 1, seed, margin_m=0.3)
         rng = np.random.default_rng(seed)
         truth, off = scene.poses.position_m[0], float(rng.uniform(-0.05, 0.05))
@@ -87,11 +87,11 @@ class TestAlign:
         result = align(scan, KDTree(wall_cloud(scene.plan, config)), starts, config)
         best = int(result.rms_m.argmin())
         assert np.linalg.norm(result.shift_m[best] - truth) < 0.01
-        # A scan turned by -off, which is counter-clockwise for positive off, is turned back clockwise.
+        # A scan turned by -off (counter-clockwise for positive off) is turned back clockwise.
         assert abs(result.turn[best] + off) < 0.005
         assert result.rms_m[best] < 0.02
 
-    def test_each_start_is_aligned_by_itself(self) -> None:
+    def test_starts_are_independent(self) -> None:
         plan, config = crooked_flat(), IcpConfig()
         tree = KDTree(wall_cloud(plan, config))
         scan = merge_cells(scan_of(question_at(plan, (1.1, 1.2)).true_profile(256)[None], 0.0), config.cell_m)
@@ -105,7 +105,7 @@ class TestAlign:
         assert together.iterations.max() <= config.max_iterations
         assert together.iterations.min() < config.max_iterations
 
-    def test_the_reported_distance_is_to_the_nearest_points(self) -> None:
+    def test_reported_distance_is_to_nearest_points(self) -> None:
         config, cloud = IcpConfig(max_iterations=3), np.random.default_rng(0).normal(size=(40, 2))
         scan = np.random.default_rng(1).normal(size=(12, 2))
         result = align(scan, KDTree(cloud), np.array([[0.3, -0.2]]), config)
@@ -117,7 +117,7 @@ class TestAlign:
 
 class TestMethod:
     @pytest.mark.parametrize("position", [(1.13, 1.02), (5.21, 1.42), (2.34, 4.81)])
-    def test_a_layout_query_is_found_to_a_centimetre_in_any_room(self, position: tuple[float, float]) -> None:
+    def test_layout_query_is_located_to_a_centimetre(self, position: tuple[float, float]) -> None:
         answer = Icp().locate(question_at(crooked_flat(), position, heading=1.0, step_m=0.7))
         found = answer.stages["icp"]
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.01
@@ -127,7 +127,7 @@ class TestMethod:
         assert answer.timings_ms.keys() == {"icp"}
 
     @pytest.mark.parametrize("heading", [0.0, 2.3, -1.1])
-    def test_a_measured_room_is_found_whatever_the_heading(self, heading: float) -> None:
+    def test_measured_room_is_located_at_any_heading(self, heading: float) -> None:
         plan, position = crooked_flat(), (1.13, 1.02)
         question = question_at(
             plan, position, heading=heading, step_m=0.7, photograph=BareRoom(plan, position, heading, rows=128)
@@ -136,21 +136,21 @@ class TestMethod:
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.02
         assert abs(wrap_angle(found.heading - heading)) < 0.01
 
-    def test_a_heading_that_is_a_little_off_is_put_right(self) -> None:
+    def test_small_heading_error_is_corrected(self) -> None:
         plan, position = crooked_flat(), (1.13, 1.02)
         photograph = BareRoom(plan, position, 1.0, rows=128)
         found = Icp().locate(question_at(plan, position, heading=1.03, photograph=photograph, step_m=0.7)).stages["icp"]
         assert abs(wrap_angle(found.heading - 1.0)) < 0.005
 
     @pytest.mark.parametrize("rows", [32, 64])
-    def test_the_scan_is_the_horizon_not_the_floor(self, rows: int) -> None:
+    def test_scan_uses_the_horizon(self, rows: int) -> None:
         plan, position = plan_of(rectangle(9.0, 7.0)), (4.2, 3.1)
         question = question_at(plan, position, step_m=2.0, photograph=BareRoom(plan, position, 0.3, rows), heading=0.3)
         found = Icp().locate(question).stages["icp"]
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.03
 
-    def test_an_alignment_outside_all_rooms_belongs_to_the_room_it_started_in(self) -> None:
-        # A scan of a large room cannot fit a small one: it ends with its camera outside.
+    def test_alignment_outside_keeps_its_start_room(self) -> None:
+        # The scan of a large room does not fit a small one, so the camera ends outside.
         small, large = plan_of(rectangle(1.0, 1.0)), plan_of(rectangle(8.0, 8.0))
         question = question_at(
             small,
@@ -162,7 +162,7 @@ class TestMethod:
         assert small.room_index_at(np.array([[found.x_m, found.y_m]])).tolist() == [-1]
         assert found.room_index == 0
 
-    def test_a_scan_without_readings_has_no_answer(self) -> None:
+    def test_empty_scan_has_no_answer(self) -> None:
         @dataclass(frozen=True)
         class Dark(BareRoom):
             def depth_m(self) -> np.ndarray:
@@ -171,7 +171,7 @@ class TestMethod:
         plan = crooked_flat()
         assert Icp().locate(question_at(plan, (1.0, 1.0), photograph=Dark(plan, (1.0, 1.0), 0.0))).stages == {}
 
-    def test_without_the_heading_or_depth_it_says_so(self) -> None:
+    def test_missing_heading_or_depth_is_refused(self) -> None:
         plan = crooked_flat()
         with pytest.raises(InvalidInputError, match="heading"):
             Icp().locate(question_at(plan, (1.0, 1.0), heading_known=False))
@@ -186,7 +186,7 @@ class TestMethod:
 
 
 @pytest.mark.slow
-def test_layout_queries_of_generated_homes_are_found_to_a_centimetre() -> None:
+def test_generated_layout_queries_are_located_to_a_centimetre() -> None:
     dataset, method, errors = GeneratedScenes(homes=10, furniture="empty"), Icp(), []
     for name in dataset.scenes("test"):
         scene = dataset.load(name)

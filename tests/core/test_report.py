@@ -1,4 +1,4 @@
-"""The evaluation report: what it says is what the scores are, and it needs nothing but itself."""
+"""Evaluation report: its figures equal the scores, and the page is self-contained."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NASTY = "<img src=x onerror=alert(1)> & \"'$x_{$"
 
 
 class Page(HTMLParser):
-    """A page taken apart, which fails where its tags do not balance."""
+    """Parsed page; parsing fails on unbalanced tags."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)
@@ -54,7 +54,7 @@ class Page(HTMLParser):
 
     @property
     def text(self) -> str:
-        """What a reader sees, with single spaces."""
+        """Visible text, with single spaces."""
         return " ".join(" ".join(self.words).split())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -84,12 +84,12 @@ class Page(HTMLParser):
             self.tables[self._caption][-1][-1] += data.strip()
 
     def table(self, caption: str) -> list[list[str]]:
-        """Cells of a table, without what stands in small below them."""
+        """Return the cells of a table, without the small text below them."""
         return next(rows for name, rows in self.tables.items() if name.startswith(caption))
 
 
 def prediction(index: int = 0, error_m: float | None = 0.02, **changes: Any) -> Prediction:
-    """An answer `error_m` to the right of the truth after a first stage twice as far off; None: no answer."""
+    """Return a pose `error_m` to the right of the truth, after a first stage with twice the error; None: no answer."""
     truth = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=10.0)
     found = {} if error_m is None else {"retrieval": 2.0 * error_m, "lpo": error_m}
     values: dict[str, Any] = {
@@ -105,12 +105,12 @@ def prediction(index: int = 0, error_m: float | None = 0.02, **changes: Any) -> 
 
 
 def in_room(one: Prediction, room_index: int) -> Prediction:
-    """The same answer, put in another room."""
+    """Return the prediction with another room."""
     return replace(one, stages={name: replace(pose, room_index=room_index) for name, pose in one.stages.items()})
 
 
 def mixed() -> list[Prediction]:
-    """Twelve answers of every kind, with confidences and recalls."""
+    """Return twelve predictions of all outcomes, with confidences and recalls."""
     errors_m = [0.004, 0.02, 0.03, 0.06, 0.08, 0.3, 0.4, 0.7, 1.5, 3.0, 6.0, None]
     some = [
         prediction(k, error_m, layout_hit=k % 2 == 0, pose_hit=k % 3 == 0, confidence=0.95 - 0.07 * k)
@@ -120,7 +120,7 @@ def mixed() -> list[Prediction]:
 
 
 def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Path:
-    """A run on disk; its data set does not exist unless `changes` name one."""
+    """Write a run; its data set does not exist unless `changes` name one."""
     values: dict[str, Any] = {
         "label": "a run",
         "method": "lalaloc",
@@ -137,14 +137,14 @@ def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Pat
 
 
 def page_of(*runs: Path, out: Path) -> tuple[Page, str]:
-    """The report on some runs, parsed and as text."""
+    """Return the report on some runs, parsed and as text."""
     write_report(runs, out)
     text = out.read_text(encoding="utf-8")
     return Page(text), text
 
 
 def generated_run(path: Path, bundle: str | None, **changes: Any) -> Path:
-    """One answered query of a generated home, found 12 cm to the right and turned by 30°."""
+    """Write a run with one query of a generated home, located 12 cm to the right with a heading error of 30°."""
     data = GeneratedScenes(homes=1, shots_per_home=1)
     scene = data.load(data.scenes("test")[0])
     (camera,) = scene.cameras
@@ -169,21 +169,21 @@ def generated_run(path: Path, bundle: str | None, **changes: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The report on `mixed`."""
+    """Report on `mixed`."""
     folder = tmp_path_factory.mktemp("report")
     return page_of(run_folder(folder / "run", mixed()), out=folder / "report.html")[1]
 
 
 @pytest.fixture(scope="module")
 def page(text: str) -> Page:
-    """The same, parsed."""
+    """Parsed report on `mixed`."""
     return Page(text)
 
 
 class TestFailures:
-    """Sorting answers by what went wrong."""
+    """Classification of failures."""
 
-    def test_every_kind_is_told_from_the_others(self) -> None:
+    def test_outcomes_are_distinguished(self) -> None:
         kinds = {
             Outcome.LOCATED: prediction(error_m=0.1),
             Outcome.WRONG_ALIGNMENT: prediction(error_m=ALIGNMENT_LIMIT_M + 0.01),
@@ -192,24 +192,24 @@ class TestFailures:
         }
         assert outcomes(list(kinds.values())) == list(kinds)
 
-    def test_a_wrong_room_is_one_however_near(self) -> None:
+    def test_near_pose_in_wrong_room_is_a_wrong_room(self) -> None:
         assert outcomes([in_room(prediction(error_m=0.0), 1)]) == [Outcome.WRONG_ROOM]
 
-    def test_a_stage_is_judged_by_its_own_pose(self) -> None:
+    def test_stage_outcome_uses_its_own_pose(self) -> None:
         one = prediction(error_m=0.4 * ALIGNMENT_LIMIT_M + 0.1)
         assert outcomes([one]) == [Outcome.LOCATED]
         assert outcomes([one], "retrieval") == [Outcome.WRONG_ALIGNMENT]
         assert outcomes([one], "vdr") == [Outcome.NO_ANSWER]
 
-    def test_counts_name_every_kind_and_sum_to_all_queries(self) -> None:
+    def test_outcome_counts_sum_to_all_queries(self) -> None:
         assert count_outcomes(mixed()) == dict(zip(Outcome, (7, 2, 2, 1), strict=True))
         assert count_outcomes([]) == dict.fromkeys(Outcome, 0)
 
 
 class TestFigures:
-    """What the page says, against the scores."""
+    """Figures on the page against the scores."""
 
-    def test_the_table_has_the_scores(self, page: Page) -> None:
+    def test_metric_table_has_the_scores(self, page: Page) -> None:
         scores = score(mixed())
         head, retrieval, lpo = page.table("Accuracy")
         assert head[:4] == ["stage", "n", "Layout R@1", "Pose R@1"]
@@ -225,16 +225,16 @@ class TestFigures:
             assert row[9] == f"{100 * figures.correct_room.value:.1f} %"
             assert row[10] == "2.00°"
 
-    def test_every_share_has_its_interval(self, page: Page) -> None:
+    def test_every_share_has_an_interval(self, page: Page) -> None:
         interval = score(mixed()).final.within_1m
         assert f"{100 * interval.low:.1f}–{100 * interval.high:.1f}" in page.text
 
-    def test_an_answer_that_is_not_the_last_stage_has_its_own_row(self, tmp_path: Path) -> None:
+    def test_answer_of_other_stage_has_a_row(self, tmp_path: Path) -> None:
         some = [prediction(0), prediction(1, stages={"retrieval": prediction(1).stages["retrieval"]})]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert [row[0] for row in page.table("Accuracy")] == ["stage", "retrieval", "lpo", "answer"]
 
-    def test_the_curves_are_also_a_table(self, page: Page) -> None:
+    def test_curves_have_a_table(self, page: Page) -> None:
         head, retrieval, lpo = page.table("Queries within")
         errors_m = position_errors_m(mixed(), "lpo")
         assert lpo[0] == "lpo"
@@ -242,34 +242,34 @@ class TestFigures:
         assert lpo[head.index("1 m")] == f"{within_1m:.1f} %"
         assert retrieval[0] == "retrieval"
 
-    def test_failures_are_counted_and_the_limit_is_named(self, page: Page) -> None:
+    def test_failures_are_counted_with_the_limit(self, page: Page) -> None:
         head, retrieval, answer = page.table("Queries by outcome")
         assert head[1:] == [kind.value for kind in Outcome]
         assert answer == ["answer", "7", "2", "2", "1"]
         assert retrieval[1:] == [str(n) for n in count_outcomes(mixed(), "retrieval").values()]
         assert f"more than {ALIGNMENT_LIMIT_M:g} m" in page.text
 
-    def test_hard_cases_have_a_table_worst_first_where_facts_are_known(self, tmp_path: Path, page: Page) -> None:
+    def test_slices_have_a_table_worst_first(self, tmp_path: Path, page: Page) -> None:
         known = [
             prediction(k, error_m, facts=facts)
             for k, (error_m, facts) in enumerate([(0.02, ("near_wall",)), (3.0, ("corridor",)), (0.05, ("near_wall",))])
         ]
         rows = page_of(run_folder(tmp_path / "run", known), out=tmp_path / "r.html")[0].table(
-            "Accuracy by what is in the picture"
+            "Accuracy by difficulty of the photograph"
         )
         assert [row[0] for row in rows] == ["fact", "corridor", "near wall", "all queries"]
         assert [row[1].split()[0] for row in rows[1:]] == ["1", "2", "3"]
-        assert not any(caption.startswith("Accuracy by what is in the picture") for caption in page.tables)
+        assert not any(caption.startswith("Accuracy by difficulty of the photograph") for caption in page.tables)
 
-    def test_times_and_calibration_stand_there(self, page: Page) -> None:
+    def test_times_and_calibration_are_shown(self, page: Page) -> None:
         rows = {row[0]: row for row in page.table("Milliseconds")}
         assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]
         assert rows[TOTAL][1] == "12"
         error = score(mixed()).calibration_error
         assert f"“within 1 m”: {error:.3f}" in page.text
-        assert len(page.table("Confidence and how often")) == 1 + len(score(mixed()).reliability)
+        assert len(page.table("Confidence and share")) == 1 + len(score(mixed()).reliability)
 
-    def test_what_was_asked_stands_there(self, page: Page) -> None:
+    def test_run_description_is_shown(self, page: Page) -> None:
         for words in (
             "Somewhere3D, test split",
             "12 panorama queries",
@@ -290,13 +290,13 @@ class TestFigures:
             (np.inf, "∞"),
         ],
     )
-    def test_figures_have_three_digits(self, value: float, text: str) -> None:
+    def test_numbers_have_three_digits(self, value: float, text: str) -> None:
         assert number(value) == text
 
-    def test_distances_are_in_metres_from_one_on(self) -> None:
+    def test_distances_from_one_metre_are_in_metres(self) -> None:
         assert (distance(0.0312), distance(1.0), distance(10.38)) == ("3.12 cm", "1.00 m", "10.4 m")
 
-    def test_times_are_of_the_queries_that_went_through_a_stage(self) -> None:
+    def test_stage_times_skip_other_queries(self) -> None:
         timings_ms: list[dict[str, float]] = [{"a": 1.0}, {"a": 3.0, "b": 5.0}, {}]
         times = stage_times([prediction(k, timings_ms=one) for k, one in enumerate(timings_ms)])
         assert (times["a"].count, times["a"].median_ms) == (2, 2.0)
@@ -305,9 +305,9 @@ class TestFigures:
 
 
 class TestPage:
-    """The page as a document."""
+    """Page as a document."""
 
-    def test_it_needs_nothing_but_itself(self, page: Page, text: str) -> None:
+    def test_page_is_self_contained(self, page: Page, text: str) -> None:
         assert "script" not in {tag for tag, _ in page.tags}
         for tag, attributes in page.tags:
             for name in ("src", "href"):
@@ -316,7 +316,7 @@ class TestPage:
         assert set(re.findall(r"url\((.)", text)) <= {"#"}
         assert "@import" not in text
 
-    def test_identifiers_are_unique_and_references_lead_somewhere(self, page: Page, text: str) -> None:
+    def test_identifiers_are_unique_and_references_resolve(self, page: Page, text: str) -> None:
         count = Counter(attributes["id"] for _, attributes in page.tags if "id" in attributes)
         assert [name for name, times in count.items() if times > 1] == []
         wanted = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
@@ -325,19 +325,19 @@ class TestPage:
         assert wanted
         assert wanted <= set(count)
 
-    def test_every_colour_is_known_by_day_and_by_night(self, text: str) -> None:
+    def test_every_colour_has_a_dark_mode(self, text: str) -> None:
         day, night = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
         used = set(re.findall(r"var\((--[\w-]+)\)", text))
         assert used
         for colours in (day, night):
             assert used <= set(re.findall(r"(--[\w-]+):", colours))
 
-    def test_charts_are_told_to_those_who_do_not_see_them(self, page: Page) -> None:
+    def test_charts_have_descriptions(self, page: Page) -> None:
         drawings = [attributes for tag, attributes in page.tags if tag == "svg"]
         assert len(drawings) == 4
         assert all(one["role"] == "img" and one["aria-labelledby"] for one in drawings)
 
-    def test_text_of_files_is_never_markup(self, tmp_path: Path) -> None:
+    def test_text_from_files_is_escaped(self, tmp_path: Path) -> None:
         one = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
         one = replace(one, stages={NASTY: one.stages["lpo"], "lpo": one.stages["lpo"]}, confidence=0.5)
         run = run_folder(
@@ -358,12 +358,12 @@ class TestPage:
             for words in (f"lalaloc {NASTY}", f"scene {NASTY}", f"{NASTY}, test split"):
                 assert words in page.text
 
-    def test_the_same_runs_give_the_same_page(self, tmp_path: Path) -> None:
+    def test_page_is_reproducible(self, tmp_path: Path) -> None:
         run = run_folder(tmp_path / "run", mixed())
         assert page_of(run, out=tmp_path / "a.html")[1] == page_of(run, out=tmp_path / "b.html")[1]
         assert list(tmp_path.glob("*.part")) == []
 
-    def test_what_is_no_run_is_refused_and_the_page_stays(self, tmp_path: Path) -> None:
+    def test_invalid_run_keeps_the_old_page(self, tmp_path: Path) -> None:
         (tmp_path / "report.html").write_text("before", encoding="utf-8")
         with pytest.raises(RunError, match="no evaluation run at"):
             write_report([tmp_path], tmp_path / "report.html")
@@ -373,9 +373,9 @@ class TestPage:
 
 
 class TestRuns:
-    """Runs of every kind."""
+    """Unusual and several runs."""
 
-    def test_several_runs_stand_side_by_side(self, tmp_path: Path) -> None:
+    def test_several_runs_share_a_page(self, tmp_path: Path) -> None:
         some = [run_folder(tmp_path / name, mixed()[: 4 * n], label=name) for n, name in ((3, "one"), (2, "two"))]
         page, _ = page_of(*some, out=tmp_path / "report.html")
         rows = page.table("Accuracy")[1:]
@@ -383,7 +383,7 @@ class TestRuns:
         assert [row[-10] for row in rows] == ["12", "12", "8", "8"]
         assert [row[0] for row in page.table("Queries within")[1:]] == ["1. one", "2. two"]
 
-    def test_a_run_that_answered_nothing_is_all_misses(self, tmp_path: Path) -> None:
+    def test_run_without_answers_is_all_misses(self, tmp_path: Path) -> None:
         some = [prediction(k, None, timings_ms={}) for k in range(4)]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         (_, row) = page.table("Accuracy")
@@ -392,7 +392,7 @@ class TestRuns:
         assert page.table("Queries by outcome")[1] == ["answer", "0", "0", "0", "4"]
         assert "No times were recorded" in page.text
 
-    def test_a_run_without_predictions_has_nothing_to_score(self, tmp_path: Path) -> None:
+    def test_run_without_predictions_has_no_scores(self, tmp_path: Path) -> None:
         empty = run_folder(tmp_path / "empty", [])
         page, _ = page_of(empty, out=tmp_path / "report.html")
         assert "holds no predictions yet" in page.text
@@ -400,7 +400,7 @@ class TestRuns:
         page, _ = page_of(empty, run_folder(tmp_path / "run", mixed()), out=tmp_path / "report.html")
         assert [row[0] for row in page.table("Accuracy")[1:]] == ["2. a run", "lpo"]
 
-    def test_without_confidences_there_is_no_calibration(self, tmp_path: Path) -> None:
+    def test_calibration_is_absent_without_confidence(self, tmp_path: Path) -> None:
         some = [replace(one, confidence=None) for one in mixed()]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert "nothing to calibrate" in page.text
@@ -408,11 +408,11 @@ class TestRuns:
 
 
 class TestGallery:
-    """Choosing queries and drawing them."""
+    """Chosen queries and their pictures."""
 
-    # Whole millimetres: what lies closer together than a coordinate can tell has no order.
+    # Whole millimetres, so that the order does not depend on rounding.
     @given(st.lists(st.one_of(st.none(), st.integers(0, 20_000).map(lambda mm: mm / 1e3)), min_size=1, max_size=30))
-    def test_the_best_and_the_worst_are_chosen_and_none_twice(self, errors_m: list[float | None]) -> None:
+    def test_gallery_has_best_and_worst_once(self, errors_m: list[float | None]) -> None:
         chosen = choose_queries([prediction(k, error_m) for k, error_m in enumerate(errors_m)])
         every = [index for indices in chosen.values() for index in indices]
         assert len(set(every)) == len(every)
@@ -424,7 +424,7 @@ class TestGallery:
             worst = [math.inf if errors_m[index] is None else errors_m[index] for index in chosen["worst"]]
             assert worst == ranked[::-1][:PER_GROUP]
 
-    def test_a_query_is_drawn_with_what_the_run_used(self, tmp_path: Path, tiny_bundle: Path) -> None:
+    def test_query_is_drawn_with_the_run_s_data(self, tmp_path: Path, tiny_bundle: Path) -> None:
         run, pictures = generated_run(tmp_path / "run", str(tiny_bundle)), tmp_path / "pictures"
         write_report([run], tmp_path / "report.html", pictures=pictures)
         page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -446,40 +446,40 @@ class TestGallery:
             else:
                 Image.open(path).verify()
 
-    def test_without_the_model_its_maps_are_missing_and_the_page_says_why(self, tmp_path: Path) -> None:
+    def test_missing_model_is_named(self, tmp_path: Path) -> None:
         page, _ = page_of(generated_run(tmp_path / "run", "no-model"), out=tmp_path / "report.html")
         assert "maps of latent distances are left out, because the model cannot be opened: no model bundle" in page.text
         _, drawing = [attributes["alt"] for tag, attributes in page.tags if tag == "img"]
         assert drawing == "Floor plan coloured by true layout distance"
 
-    def test_another_model_in_its_place_is_not_taken_for_it(self, tmp_path: Path, tiny_bundle: Path) -> None:
+    def test_changed_model_is_named(self, tmp_path: Path, tiny_bundle: Path) -> None:
         run = generated_run(tmp_path / "run", str(tiny_bundle), model={"sha256": "0" * 64})
         page, _ = page_of(run, out=tmp_path / "report.html")
-        assert "holds another model now" in page.text
+        assert "holds another model than the run used" in page.text
 
-    def test_a_method_without_latents_says_so(self, tmp_path: Path) -> None:
+    def test_method_without_latents_is_named(self, tmp_path: Path) -> None:
         run = generated_run(tmp_path / "run", None, method="icp")
         page, _ = page_of(run, out=tmp_path / "report.html")
         assert "Method “icp” compares no latents" in page.text
 
-    def test_without_the_data_set_there_is_no_gallery_and_the_page_says_why(self, page: Page) -> None:
+    def test_missing_data_set_is_named(self, page: Page) -> None:
         assert "The gallery is left out, because its data cannot be opened" in page.text
         assert [tag for tag, _ in page.tags if tag == "img"] == []
 
-    def test_a_data_set_that_changed_is_not_drawn(self, tmp_path: Path) -> None:
+    def test_changed_data_set_is_not_drawn(self, tmp_path: Path) -> None:
         run = generated_run(tmp_path / "run", "no-model")
         (before,) = RunFolder(run).read_predictions()
         RunFolder(run).replace([replace(before, truth=replace(before.truth, x_m=before.truth.x_m + 0.1))])
         page, _ = page_of(run, out=tmp_path / "report.html")
-        assert "0.100 m from where the run saw it" in page.text
+        assert "0.100 m from its position in the run" in page.text
         assert [tag for tag, _ in page.tags if tag == "img"] == []
 
 
 class TestDrawing:
-    """Pictures, against the renderer."""
+    """Pictures against the renderer."""
 
     @given(scenes(count=1))
-    def test_lines_run_where_the_layout_turns_from_wall_to_floor_and_ceiling(self, scene: Scene) -> None:
+    def test_layout_lines_follow_wall_edges(self, scene: Scene) -> None:
         rows, columns, camera_height_m = 90, 40, 1.4
         room = int(scene.poses.room_index[0])
         pose = Pose(
@@ -493,12 +493,12 @@ class TestDrawing:
         depth = layout_depth(profile, np.array([camera_height_m]), scene.ceiling_height_m, rows)[0]
         elevation = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
         is_wall = np.isclose(depth * np.cos(elevation)[:, None], profile, rtol=1e-6)
-        # Middles of the first and the last row that show wall, in every column, are at most a row inside the lines.
+        # In every column, the first and last wall rows are at most a row inside the lines.
         first, last = is_wall.argmax(axis=0) + 0.5, rows - is_wall[::-1].argmax(axis=0) - 0.5
         assert np.all((first - ceiling[:, 1] > -1e-3) & (first - ceiling[:, 1] < 1.001))
         assert np.all((floor[:, 1] - last > -1e-3) & (floor[:, 1] - last < 1.001))
 
-    def test_cells_keep_to_their_rooms(self) -> None:
+    def test_map_cells_stay_in_their_rooms(self) -> None:
         plan = crooked_flat()
         cells = Cells.cover(plan, 0.25)
         assert np.array_equal(plan.room_index_at(cells.poses.position_m), cells.poses.room_index)
@@ -507,10 +507,10 @@ class TestDrawing:
         middles = np.linspace(left, right, x.shape[1] + 1)[:-1] + 0.125
         rows, columns = np.nonzero(cells.room >= 0)
         assert np.allclose(x[rows, columns], middles[columns])
-        # Grown by a cell, never further: what is farther outside stays empty.
+        # Rooms grow by one cell at most.
         assert np.isnan(x).any()
 
-    def test_names_with_dollar_signs_and_no_answer_can_be_drawn(self) -> None:
+    def test_dollar_signs_and_missing_answers_are_drawn(self) -> None:
         plan = plan_of(rectangle(3.0, 2.0))
         plan = replace(plan, rooms=(replace(plan.rooms[0], name="$x_{$"),))
         cells = Cells.cover(plan, 0.2)

@@ -1,4 +1,4 @@
-"""The paper's tables: each is complete, says which figures are whose, and runs."""
+"""Tables of the paper: complete, with named sources, and runnable."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") ->
 
 
 class TestTables:
-    def test_there_is_one_for_every_comparison_of_the_paper(self) -> None:
+    def test_every_table_of_the_paper_exists(self) -> None:
         names = [table.name for table in TABLES]
         assert len(set(names)) == len(names)
         assert {table.source for table in TABLES} == {
@@ -63,7 +63,7 @@ class TestTables:
         }
 
     @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-    def test_columns_are_scores_and_models_are_known(self, table) -> None:
+    def test_columns_and_models_exist(self, table) -> None:
         fields = set(Scores.__dataclass_fields__) | set(StageScores.__dataclass_fields__)
         for column in table.columns:
             assert column in COLUMN_TITLES
@@ -73,9 +73,9 @@ class TestTables:
         assert set(table.models) <= set(ABLATIONS)
 
     @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-    def test_every_row_is_a_method_that_can_be_built(self, table, tiny_bundle: Path) -> None:
+    def test_every_row_has_a_valid_method(self, table, tiny_bundle: Path) -> None:
         for row in table.rows:
-            ask = row.ask
+            ask = row.query
             info = RunInfo(
                 label=row.name,
                 method=ask.method,
@@ -87,9 +87,9 @@ class TestTables:
             )
             assert build_method(info) is not None
 
-    def test_both_architectures_are_in_the_main_table_for_both_kinds_of_query(self) -> None:
+    def test_main_table_has_both_architectures(self) -> None:
         (table,) = (table for table in TABLES if table.name == "localisation")
-        asked = {(row.ask.method, row.ask.kind, row.ask.model) for row in table.rows}
+        asked = {(row.query.method, row.query.kind, row.query.model) for row in table.rows}
         for kind in ("layout", "panorama"):
             assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= asked
             assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= asked
@@ -97,15 +97,15 @@ class TestTables:
 
 
 class TestPaperSetting:
-    def test_all_rows_have_it(self) -> None:
-        asked = [row.ask for table in TABLES for row in table.rows if row.ask.method == "lalaloc"]
+    def test_all_rows_have_the_paper_setting(self) -> None:
+        asked = [row.query for table in TABLES for row in table.rows if row.query.method == "lalaloc"]
         assert len(asked) > 20
         for ask in asked:
             assert ask.run_settings.items() >= PAPER_SETTING.items()
             assert ask.run_settings.items() >= ask.settings.items()
         assert RowQuery(method="icp").run_settings == {}
 
-    def test_openings_of_the_plan_change_no_answer(self, tiny_bundle: Path) -> None:
+    def test_plan_openings_are_ignored(self, tiny_bundle: Path) -> None:
         bare = plan_document(rectangle(4.0, 3.0), rectangle(4.3, 3.6, at=(4.2, 0.0)))
         door = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
         window = {"kind": "window", "line": [[1.0, 0.0], [2.5, 0.0]]}
@@ -130,7 +130,7 @@ class TestPaperSetting:
 
 
 class TestRendering:
-    def test_figures_say_whose_they_are(self) -> None:
+    def test_figures_name_their_source(self) -> None:
         text = markdown(result())
         assert "| Layout: LaLaLoc | 50.0 % [40, 60] · *87.4 %* | ∞ | 100 |" in text
         assert "synthetic scenes (seed 0)" in text
@@ -140,17 +140,15 @@ class TestRendering:
         ("dataset", "budget", "same"),
         [("Structured3D", "full", True), ("Structured3D", "small", False), ("Structured4D", "full", False)],
     )
-    def test_only_structured3d_at_full_budget_is_the_same_experiment(
-        self, dataset: str, budget: str, same: bool
-    ) -> None:
+    def test_same_experiment_needs_structured3d_and_full_budget(self, dataset: str, budget: str, same: bool) -> None:
         assert ("not the same experiment" not in markdown(result(dataset, budget))) == same
 
-    def test_a_table_is_written_and_read_again(self, tmp_path: Path) -> None:
+    def test_table_round_trips(self, tmp_path: Path) -> None:
         path = tmp_path / "table.json"
         path.write_text(result().to_json(), encoding="utf-8")
         assert TableResult.read(path) == result()
         path.write_text("{}", encoding="utf-8")
-        with pytest.raises(RunError, match="no table of results"):
+        with pytest.raises(RunError, match="not a table of results"):
             TableResult.read(path)
 
 
@@ -161,22 +159,20 @@ class TestCommand:
         assert all(f"{table.name} " in printed for table in TABLES)
 
     @pytest.mark.parametrize(
-        ("arguments", "complaint"),
+        ("arguments", "message"),
         [
             (["--table", "roof"], "unknown table 'roof'; --table is one of localisation"),
             ([], "no table is chosen"),
             (["--table", "similarity"], "--data is missing"),
         ],
     )
-    def test_what_is_asked_wrongly_is_exit_code_2(
-        self, arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+    def test_invalid_request_has_exit_code_2(
+        self, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert main(["reproduce", *arguments]) == 2
-        assert complaint in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
-    def test_tables_run_on_synthetic_scenes_and_share_their_runs(
-        self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_tables_share_runs(self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
         data, out = str(tmp_path / "scenes"), tmp_path / "out"
         for split in ("validation", "test"):
             assert main(["synth", "--scenes", "1", "--split", split, "--out", data, "--height", "64"]) == 0
@@ -195,10 +191,10 @@ class TestCommand:
         assert (similarity.dataset, similarity.rows[0].n) == ("synthetic scenes (seed 0)", 3)
         assert (out / "tables" / "vogel-samples.png").stat().st_size > 1000
         assert json.loads((out / "tables" / "vogel-samples.json").read_text())["rows"]
-        # Four metrics and the nearest pose; six different numbers of samples.
+        # Four metrics and the nearest pose; six numbers of samples.
         assert len(list((out / "runs").iterdir())) == 11
 
 
-def test_the_figure_of_samples_needs_its_rows(tmp_path: Path) -> None:
+def test_vogel_figure_needs_its_rows(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not enough values"):
         draw_vogel_samples(result(), tmp_path / "figure.png")

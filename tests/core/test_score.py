@@ -1,4 +1,4 @@
-"""Scores: what they count, what they hide (nothing), and how sure they are."""
+"""Scores, their bootstrap intervals, calibration, and the run folder."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def prediction(
     room: int = 0,
     facts: tuple[str, ...] = (),
 ) -> Prediction:
-    """A query whose stages are that far off."""
+    """Return a query with position errors (m) by stage."""
     stages = ("retrieval", "vdr", "lpo")
     return Prediction(
         scene=scene,
@@ -53,7 +53,7 @@ def prediction(
 
 
 class TestScores:
-    def test_shares_and_medians_are_those_of_the_answer(self) -> None:
+    def test_final_scores_use_the_final_pose(self) -> None:
         scores = score([prediction(0.25, 0.06, 0.005), prediction(0.1, 0.05, 0.04), prediction(3.0, 3.0, 3.0, room=1)])
         assert (scores.n, scores.unanswered) == (3, 0)
         final = scores.final
@@ -68,7 +68,7 @@ class TestScores:
         assert (scores.layout_recall.value, scores.pose_recall.value) == pytest.approx((2 / 3, 1 / 3))
         assert scores.median_ms == {"retrieve": 1.0, "lpo": 10.0}
 
-    def test_a_query_without_an_answer_is_a_miss_everywhere(self) -> None:
+    def test_missing_answer_is_a_miss_in_every_score(self) -> None:
         scores = score([prediction(0.001), prediction(), prediction()])
         assert scores.unanswered == 2
         assert scores.final.within_1m.value == pytest.approx(1 / 3)
@@ -78,20 +78,20 @@ class TestScores:
         assert scores.layout_recall is not None
         assert scores.layout_recall.value == pytest.approx(1 / 3)
 
-    def test_a_stage_that_one_query_missed_counts_it_as_a_miss(self) -> None:
+    def test_missing_stage_is_a_miss(self) -> None:
         scores = score([prediction(0.1, 0.1, 0.1), prediction(0.1)])
         assert scores.stages["lpo"].within_1m.value == 0.5
 
-    def test_headings_are_compared_around_the_circle(self) -> None:
+    def test_heading_error_wraps_around(self) -> None:
         assert heading_errors_deg([prediction(0.1, turned_deg=15.0)])[0] == pytest.approx(15.0)
         assert heading_errors_deg([prediction(0.1, turned_deg=-200.0)])[0] == pytest.approx(160.0)
         assert np.isnan(heading_errors_deg([prediction()])[0])
 
-    def test_methods_that_do_not_retrieve_have_no_recall(self) -> None:
+    def test_method_without_retrieval_has_no_recall(self) -> None:
         plain = Prediction(scene="a", camera="0", room="r", camera_height_m=1.5, truth=prediction(0.1).truth)
         assert score([plain]).layout_recall is None
 
-    def test_slices_count_the_queries_of_each_fact_worst_first(self) -> None:
+    def test_slices_are_sorted_worst_first(self) -> None:
         both, one = ("corridor", "mirror"), ("corridor",)
         scores = score(
             [prediction(0.04, facts=both), prediction(facts=both), prediction(0.3, facts=one), prediction(0.02)]
@@ -105,7 +105,7 @@ class TestScores:
         assert corridor.median_cm.value == pytest.approx(30.0)
         assert score([prediction(0.1)]).slices == {}
 
-    def test_a_fact_of_every_query_has_the_figures_of_all(self) -> None:
+    def test_slice_of_all_queries_has_their_scores(self) -> None:
         scores = score([prediction(0.05 * k, scene=str(k % 5), facts=("closet",)) for k in range(30)])
         closet, final = scores.slices["closet"], scores.final
         assert closet.n == scores.n
@@ -115,18 +115,18 @@ class TestScores:
             final.median_cm,
         )
 
-    def test_a_slice_of_one_scene_has_its_own_figures_as_interval(self) -> None:
+    def test_slice_of_one_scene_has_a_point_interval(self) -> None:
         rare = prediction(2.0, scene="b", facts=("closet",))
         found = score([rare, *(prediction(0.1, scene=str(k)) for k in range(9))]).slices["closet"]
         assert (found.median_cm.low, found.median_cm.high) == pytest.approx((200.0, 200.0))
         assert (found.within_1m.low, found.within_1m.high) == (0.0, 0.0)
 
-    def test_nothing_to_score_is_an_error(self) -> None:
+    def test_no_predictions_are_refused(self) -> None:
         with pytest.raises(InvalidInputError, match="no predictions"):
             score([])
 
     @given(st.lists(st.floats(0.0, 30.0), min_size=1, max_size=30), st.integers(0, 5))
-    def test_intervals_hold_the_figure_s_neighbourhood_and_repeat_by_seed(self, errors: list[float], seed: int) -> None:
+    def test_interval_contains_value_and_repeats_by_seed(self, errors: list[float], seed: int) -> None:
         predictions = [prediction(error, scene=str(k % 7)) for k, error in enumerate(errors)]
         first, again = (score(predictions, seed) for _ in range(2))
         assert first == again
@@ -134,7 +134,7 @@ class TestScores:
             assert one.low <= one.high
         assert 0.0 <= first.final.within_1m.low <= first.final.within_1m.value <= first.final.within_1m.high <= 1.0
 
-    def test_intervals_shrink_with_the_number_of_scenes_and_cover_the_truth(self) -> None:
+    def test_interval_shrinks_with_scenes(self) -> None:
         rng = np.random.default_rng(0)
         widths, covered = [], 0
         for count in (20, 320):
@@ -148,7 +148,7 @@ class TestScores:
             covered += found.low <= 0.7 <= found.high
         assert covered >= 33
 
-    def test_queries_of_one_scene_do_not_count_as_independent(self) -> None:
+    def test_queries_of_one_scene_are_dependent(self) -> None:
         hits = np.arange(80) % 4 > 0
         apart = score([prediction(0.1 if hit else 5.0, scene=str(k)) for k, hit in enumerate(hits)])
         rng = np.random.default_rng(1)
@@ -162,18 +162,18 @@ class TestScores:
 
 
 class TestCalibration:
-    def test_honest_confidence_has_no_error_and_boasting_all(self) -> None:
+    def test_calibration_error_of_right_and_excessive_confidence(self) -> None:
         assert expected_calibration_error(np.array([0.0, 0.0, 1.0]), np.array([False, False, True])) == 0.0
         assert expected_calibration_error(np.ones(4), np.zeros(4, dtype=bool)) == 1.0
         assert expected_calibration_error(np.full(4, 0.75), np.array([True, True, True, False])) == 0.0
 
-    def test_bins_are_weighted_by_their_queries(self) -> None:
+    def test_bins_are_weighted_by_queries(self) -> None:
         confidence = np.array([0.05, 0.95, 0.95, 0.95])
         correct = np.array([True, True, True, True])
         assert expected_calibration_error(confidence, correct) == pytest.approx(0.25 * 0.95 + 0.75 * 0.05)
 
     @given(st.lists(st.tuples(st.floats(0.0, 1.0), st.booleans()), min_size=1, max_size=40))
-    def test_the_diagram_holds_every_query_once(self, queries: list[tuple[float, bool]]) -> None:
+    def test_diagram_has_every_query_once(self, queries: list[tuple[float, bool]]) -> None:
         confidence, correct = (np.array(column) for column in zip(*queries, strict=True))
         bins = reliability_bins(confidence, correct)
         assert sum(one.count for one in bins) == len(queries)
@@ -182,14 +182,14 @@ class TestCalibration:
             assert 0.0 <= one.frequency <= 1.0
         assert 0.0 <= expected_calibration_error(confidence, correct) <= 1.0
 
-    def test_it_is_scored_where_there_is_confidence(self) -> None:
+    def test_calibration_needs_confidence(self) -> None:
         scores = score([prediction(0.2, confidence=1.0), prediction(3.0, confidence=1.0)])
         assert scores.calibration_error == pytest.approx(0.5)
         assert score([prediction(0.2)]).calibration_error is None
 
 
 class TestRunFolder:
-    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
+    def test_predictions_round_trip(self, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path / "run")
         assert not folder.exists()
         folder.write_info(INFO)
@@ -200,7 +200,7 @@ class TestRunFolder:
         assert folder.read_info() == INFO
         assert folder.read_predictions() == predictions
 
-    def test_a_line_that_was_being_written_is_left_out(self, tmp_path: Path) -> None:
+    def test_incomplete_last_line_is_ignored(self, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path)
         folder.write_info(INFO)
         folder.append([prediction(0.1), prediction(0.2)])
@@ -209,7 +209,7 @@ class TestRunFolder:
         assert folder.read_predictions() == [prediction(0.1)]
 
     @pytest.mark.parametrize("text", ["not json\n", '{"scene": 3}\n', '{"scene": "a", "unknown": 1}\n', "[]\n"])
-    def test_a_line_that_is_no_prediction_is_named(self, tmp_path: Path, text: str) -> None:
+    def test_invalid_line_is_named(self, tmp_path: Path, text: str) -> None:
         folder = RunFolder(tmp_path)
         folder.write_info(INFO)
         folder.append([prediction(0.1)])
@@ -218,14 +218,14 @@ class TestRunFolder:
         with pytest.raises(RunError, match="line 2 is not a prediction"):
             folder.read_predictions()
 
-    def test_a_folder_without_a_run_is_named(self, tmp_path: Path) -> None:
+    def test_folder_without_run_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(RunError, match="no evaluation run at"):
             RunFolder(tmp_path / "nowhere").read_info()
         (tmp_path / "run.json").write_text('{"label": 3}')
         with pytest.raises(RunError, match="does not describe a run"):
             RunFolder(tmp_path).read_info()
 
-    def test_scores_stand_beside_the_answers_and_infinity_is_null(self, tmp_path: Path) -> None:
+    def test_scores_file_has_null_for_infinity(self, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path)
         folder.write_info(INFO)
         folder.append([prediction(), prediction(), prediction(0.1)])

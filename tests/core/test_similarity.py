@@ -1,4 +1,4 @@
-"""Layout similarity: each metric is its definition, computed the slow way, and the quick search misses nothing."""
+"""Layout similarity: each metric equals its slow definition, and the fast search is exact."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ROWS, COLUMNS = 8, 16
 
 
 def layout_at(plan: FloorPlan, position_m: np.ndarray, columns: int, camera_height_m: float = CAMERA_M) -> Layout:
-    """The layout of one place."""
+    """Return the layout seen from one place."""
     room = plan.room_index_at(position_m[None])
     profile = wall_profile(position_m[None], np.zeros(1), plan.walls_m[room], columns)[0]
     ceiling = float(plan.ceiling_heights_m[room][0])
@@ -43,7 +43,7 @@ def layout_at(plan: FloorPlan, position_m: np.ndarray, columns: int, camera_heig
 
 
 def slow_cloud(layout: Layout, rows: int) -> np.ndarray:
-    """Points of a layout, one pixel after another."""
+    """Return the points of a layout, pixel by pixel."""
     points = []
     columns = len(layout.profile_m)
     for i in range(rows):
@@ -74,11 +74,11 @@ def some_poses(plan: FloorPlan, seed: int, count: int = 12) -> PoseSet:
 class TestChamfer:
     @given(plan=plans(), elsewhere=plans(), seed=seeds())
     @settings(max_examples=15)
-    def test_it_is_the_chamfer_distance_of_the_clouds(self, plan: FloorPlan, elsewhere: FloorPlan, seed: int) -> None:
+    def test_distance_is_chamfer_of_clouds(self, plan: FloorPlan, elsewhere: FloorPlan, seed: int) -> None:
         poses = some_poses(plan, seed)
         clouds = [slow_cloud(layout_at(plan, position, COLUMNS), ROWS) for position in poses.position_m]
         grid = ChamferGrid(plan, poses, CAMERA_M, rows=ROWS, columns=COLUMNS)
-        # Of the same plan at the same height, where floors coincide, and of another plan at another.
+        # The same plan and height, where floors coincide, and another plan and height.
         queries = [
             layout_at(plan, some_poses(plan, seed + 1, 1).position_m[0], COLUMNS),
             layout_at(elsewhere, some_poses(elsewhere, seed, 1).position_m[0], COLUMNS, 1.1),
@@ -88,7 +88,7 @@ class TestChamfer:
             np.testing.assert_allclose(grid.distances(query), expected, atol=1e-9)
             assert expected[grid.nearest(query)] == pytest.approx(expected.min(), abs=1e-9)
 
-    def test_it_agrees_with_the_distance_that_training_uses(self) -> None:
+    def test_distance_agrees_with_training(self) -> None:
         plan = crooked_flat()
         poses = some_poses(plan, 0)
         walls, ceilings = plan.walls_m[poses.room_index], plan.ceiling_heights_m[poses.room_index]
@@ -98,7 +98,7 @@ class TestChamfer:
         actual = ChamferGrid(plan, poses, CAMERA_M).distances(layout_at(plan, poses.position_m[0], 32))
         np.testing.assert_allclose(actual, expected, atol=1e-6)
 
-    def test_the_search_leaves_most_poses_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_search_skips_most_poses(self, monkeypatch: pytest.MonkeyPatch) -> None:
         plan = plan_of(rectangle(4.0, 3.0), rectangle(6.0, 5.0, (5.0, 0.0)), rectangle(3.0, 8.0, (12.0, 0.0)))
         poses = some_poses(plan, 3, 200)
         grid, asked = ChamferGrid(plan, poses, CAMERA_M), []
@@ -115,7 +115,7 @@ class TestDepth:
     @pytest.mark.parametrize("relative", [False, True])
     @given(plan=plans(), seed=seeds())
     @settings(max_examples=10)
-    def test_it_is_the_mean_difference_of_all_pixels(self, relative: bool, plan: FloorPlan, seed: int) -> None:
+    def test_distance_is_mean_pixel_difference(self, relative: bool, plan: FloorPlan, seed: int) -> None:
         poses = some_poses(plan, seed, 4)
         query = layout_at(plan, some_poses(plan, seed + 1, 1).position_m[0], COLUMNS)
 
@@ -128,7 +128,7 @@ class TestDepth:
         grid = DepthGrid(plan, poses, CAMERA_M, relative=relative, rows=ROWS, columns=COLUMNS)
         np.testing.assert_allclose(grid.distances(query), expected, atol=1e-5)
 
-    def test_relative_depth_does_not_know_the_scale(self) -> None:
+    def test_relative_depth_ignores_scale(self) -> None:
         half, whole = plan_of(rectangle(3.0, 2.5), ceiling_m=2.5), plan_of(rectangle(6.0, 5.0), ceiling_m=5.0)
         poses = some_poses(half, 0, 5)
         grid = DepthGrid(half, poses, CAMERA_M, relative=True)
@@ -141,7 +141,7 @@ class TestDepth:
 class TestEdges:
     @given(plan=plans(), seed=seeds())
     @settings(max_examples=8)
-    def test_it_is_the_chamfer_distance_of_edge_pixels_around_the_horizon(self, plan: FloorPlan, seed: int) -> None:
+    def test_distance_is_chamfer_of_edges_wrapping_around(self, plan: FloorPlan, seed: int) -> None:
         poses = some_poses(plan, seed, 4)
         query = layout_at(plan, some_poses(plan, seed + 1, 1).position_m[0], 32)
 
@@ -159,9 +159,9 @@ class TestEdges:
         grid = EdgeGrid(plan, poses, CAMERA_M, rows=16, columns=32)
         np.testing.assert_allclose(grid.distances(query), expected, atol=1e-5)
 
-    def test_a_square_room_has_two_lines_around_and_four_corners(self) -> None:
+    def test_square_room_has_two_lines_and_four_corners(self) -> None:
         plan = plan_of(rectangle(4.0, 4.0), ceiling_m=2.8)
-        # In the middle of everything: corners at odd multiples of 45 degrees, the walls' foot and top at 35 degrees.
+        # At the centre: corners at odd multiples of 45 degrees, foot and top of walls at 35 degrees.
         layout = layout_at(plan, np.array([2.0, 2.0]), 128, 1.4)
         edges = edge_image(layout.profile_m[None], np.array([1.4]), np.array([2.8]), 64)[0]
         corners = np.flatnonzero(edges[32])
@@ -173,7 +173,7 @@ class TestEdges:
             math.floor((0.5 + math.atan(1.4 / 2.0) / math.pi) * 64),
         ]
 
-    def test_a_wall_that_ends_in_front_of_another_is_an_edge(self) -> None:
+    def test_occlusion_is_an_edge(self) -> None:
         plan = plan_of([[0, 0], [6, 0], [6, 2], [2, 2], [2, 6], [0, 6]])
         layout = layout_at(plan, np.array([4.0, 1.0]), 256)
         edges = edge_image(layout.profile_m[None], np.array([CAMERA_M]), np.array([2.5]), 128)[0]
@@ -186,7 +186,7 @@ class TestAnyMetric:
     @pytest.mark.parametrize("metric", LAYOUT_METRICS)
     @given(seed=seeds())
     @settings(max_examples=5)
-    def test_a_pose_of_the_grid_is_nearest_to_itself(self, metric: LayoutMetric, seed: int) -> None:
+    def test_grid_pose_is_nearest_to_itself(self, metric: LayoutMetric, seed: int) -> None:
         plan = crooked_flat()
         poses = some_poses(plan, seed)
         grid = layout_grid(metric, plan, poses, CAMERA_M)
@@ -196,7 +196,7 @@ class TestAnyMetric:
             assert grid.nearest(query) == index
 
     @pytest.mark.parametrize("metric", LAYOUT_METRICS)
-    def test_a_profile_of_another_width_is_refused(self, metric: LayoutMetric) -> None:
+    def test_other_profile_width_is_refused(self, metric: LayoutMetric) -> None:
         plan = crooked_flat()
         grid = layout_grid(metric, plan, some_poses(plan, 0), CAMERA_M)
         with pytest.raises(InvalidInputError, match="7 columns"):
@@ -207,7 +207,7 @@ class TestAnyMetric:
 
 class TestRetrieval:
     @pytest.mark.parametrize("metric", LAYOUT_METRICS)
-    def test_it_answers_with_the_nearest_layout_of_the_grid(self, metric: LayoutMetric) -> None:
+    def test_similarity_retrieval_takes_the_nearest_layout(self, metric: LayoutMetric) -> None:
         method = SimilarityRetrieval(metric)
         for heading in (0.0, 2.0):
             question = question_at(crooked_flat(), (1.02, 1.03), heading=heading)
@@ -218,8 +218,8 @@ class TestRetrieval:
             np.testing.assert_array_equal(question.grid.position_m[answer.retrieved], [1.0, 1.0])
             assert answer.timings_ms.keys() == {"retrieve"}
 
-    def test_the_pose_oracle_takes_the_nearest_pose_whatever_it_sees(self) -> None:
-        # From the left room the nearest pose of the grid stands in the right one.
+    def test_pose_oracle_takes_the_nearest_pose(self) -> None:
+        # The nearest grid pose is in the room on the right.
         plan = plan_of(rectangle(2.0, 2.0), rectangle(1.0, 1.0, (2.01, 0.5)))
         grid = PoseSet(np.array([[1.5, 1.0], [2.2, 1.0]]), np.array([0, 1]))
         question = question_at(plan, (1.95, 1.0), grid=grid)

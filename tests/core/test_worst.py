@@ -1,4 +1,4 @@
-"""The worst queries: which they are, what is said of them, and that it is true of their pictures."""
+"""Worst queries: choice, summary and pictures."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.render.profile import wall_profile
 from tests.strategies import plan_of, rectangle
 
-# A room from (0, 0) to (6, 4) whose camera stands in its lower left corner.
+# A room from (0, 0) to (6, 4) with its camera in the lower left corner.
 PLAN = plan_of(rectangle(6.0, 4.0))
 TRUTH = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=0.0)
 
 
 def found_at(x_m: float | None, y_m: float = 1.0, room: int = 0, facts: tuple[str, ...] = ()) -> Prediction:
-    """An answer, after a first stage that stood right; None: no answer."""
+    """Return a prediction after a right first stage; None: no answer."""
     stages = {} if x_m is None else {"retrieval": TRUTH, "lpo": replace(TRUTH, x_m=x_m, y_m=y_m, room_index=room)}
     return Prediction(
         scene="s", camera="0", room="r", camera_height_m=1.5, truth=TRUTH, stages=stages, facts=facts, confidence=0.5
@@ -47,16 +47,14 @@ class TestFailures:
         ("x_m", "y_m", "symmetric"),
         [(5.0, 1.0, True), (1.0, 3.0, True), (5.2, 2.8, True), (3.0, 2.0, False), (1.1, 1.0, False)],
     )
-    def test_mirror_images_of_the_true_place_are_told_from_other_wrong_ones(
-        self, x_m: float, y_m: float, symmetric: bool
-    ) -> None:
+    def test_mirrored_poses_are_recognised(self, x_m: float, y_m: float, symmetric: bool) -> None:
         assert is_symmetric(PLAN, found_at(x_m, y_m)) == symmetric
 
-    def test_no_answer_and_a_wrong_room_are_no_mirror_images(self) -> None:
+    def test_wrong_room_is_not_mirrored(self) -> None:
         assert not is_symmetric(PLAN, found_at(None))
         assert not is_symmetric(PLAN, found_at(5.0, 1.0, room=1))
 
-    def test_chance_is_the_share_of_wrong_places_that_count(self) -> None:
+    def test_chance_is_share_of_mirrored_positions(self) -> None:
         rng = np.random.default_rng(0)
         everywhere = [found_at(x, y) for x, y in rng.uniform((0.0, 0.0), (6.0, 4.0), (2000, 2))]
         wrong = [one for one in everywhere if outcomes([one]) == [Outcome.WRONG_ALIGNMENT]]
@@ -65,12 +63,12 @@ class TestFailures:
 
 
 class TestSummary:
-    def test_misses_come_first_then_the_farthest(self) -> None:
+    def test_misses_come_first_then_largest_errors(self) -> None:
         near, far, missed = found_at(1.1), found_at(4.0), found_at(None)
         assert choose_worst([near, far, missed], 2) == [missed, far]
         assert choose_worst([near, far], 5) == [far, near]
 
-    def test_facts_are_weighed_against_all_queries(self) -> None:
+    def test_facts_are_compared_with_all_queries(self) -> None:
         corridor, mirror = ("corridor",), ("mirror",)
         every = [found_at(4.0, facts=corridor), found_at(None, facts=corridor)]
         every += [found_at(1.1, facts=facts) for facts in (corridor, mirror, mirror, mirror, (), ())]
@@ -81,13 +79,13 @@ class TestSummary:
         }
         assert summary["outcomes"] == {"located": 0, "wrong alignment": 1, "wrong room": 0, "no answer": 1}
         assert summary["error_m"] == {"least": 3.0, "most": 3.0}
-        # The first stage of the one that answered stood right.
+        # The answered query had a right first stage.
         assert summary["lost_after_first_stage"] == 1
 
 
 class TestPredictedWalls:
     @pytest.mark.parametrize("heading", [0.0, 0.7, 4.0])
-    def test_they_are_turned_back_to_the_photograph(self, heading: float) -> None:
+    def test_predicted_profile_is_in_photograph_frame(self, heading: float) -> None:
         here, walls = np.array([[1.0, 1.0]]), PLAN.walls_m[[0]]
         columns = 512
         turned = np.log(wall_profile(here, np.zeros(1), walls, columns))
@@ -99,7 +97,7 @@ class TestPredictedWalls:
 
 @pytest.fixture(scope="module")
 def layout_run(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Layout queries of two generated homes, and one of them made wrong."""
+    """Return a run of layout queries of two generated homes, one of them made wrong."""
     folder = RunFolder(tmp_path_factory.mktemp("worst"))
     info = RunInfo(
         label="two homes",
@@ -117,7 +115,7 @@ def layout_run(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 class TestPages:
-    def test_what_is_written_is_what_the_run_holds(self, layout_run: Path, tmp_path: Path) -> None:
+    def test_sheets_and_summary_match_the_run(self, layout_run: Path, tmp_path: Path) -> None:
         summary = write_worst(layout_run, tmp_path, 3)
         content = json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8"))
         predictions = RunFolder(layout_run).read_predictions()
@@ -127,7 +125,7 @@ class TestPages:
         assert [(one["scene"], one["camera"]) for one in worst] == expected
         assert worst[0]["outcome"] == Outcome.NO_ANSWER
         assert worst[0]["error_m"] is None
-        # The picture of a layout query knows its walls; at a door it might as well be looked through.
+        # Costs of a layout query are zero except at doors, which can be seen through.
         for one in worst:
             assert one["true_cost"] < 0.2
             assert abs(one["distance_bias"]) < 1e-3
@@ -136,17 +134,17 @@ class TestPages:
         assert summary["pages"] == ["worst-01.png"]
         with Image.open(tmp_path / "worst-01.png") as page:
             pixels = np.asarray(page.convert("RGB"), dtype=float).reshape(-1, 3)
-        # Lines are smoothed, so that no pixel need have exactly the colour of the true or of the found layout.
+        # Lines are smoothed, so a pixel rarely has exactly the colour of a layout.
         for colour in (ImageColor.getrgb(TRUE), ImageColor.getrgb(FOUND)):
             assert np.abs(pixels - colour).max(axis=1).min() < 48.0
 
-    def test_the_command_says_what_they_have_in_common(
+    def test_command_prints_common_features(
         self, layout_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert main(["worst", str(layout_run), "--count", "1", "--out", str(tmp_path)]) == 0
         assert json.loads(capsys.readouterr().out)["outcomes"]["no answer"] == 1
 
-    def test_a_query_that_is_gone_is_left_out_and_named(self, layout_run: Path, tmp_path: Path) -> None:
+    def test_missing_query_is_named(self, layout_run: Path, tmp_path: Path) -> None:
         run = RunFolder(tmp_path / "run")
         run.write_info(RunFolder(layout_run).read_info())
         run.append([replace(one, camera="gone") for one in RunFolder(layout_run).read_predictions()[:1]])
@@ -154,13 +152,13 @@ class TestPages:
         assert "no camera 'gone'" in summary["left_out"][0]
         assert summary["pages"] == []
 
-    def test_a_run_without_answers_is_refused(self, layout_run: Path, tmp_path: Path) -> None:
+    def test_run_without_predictions_is_refused(self, layout_run: Path, tmp_path: Path) -> None:
         run = RunFolder(tmp_path)
         run.write_info(RunFolder(layout_run).read_info())
-        with pytest.raises(RunError, match="no answers yet"):
+        with pytest.raises(RunError, match="has no predictions"):
             write_worst(tmp_path, tmp_path / "out", 1)
 
-    def test_a_sheet_grows_by_whole_rows(self) -> None:
+    def test_sheet_grows_by_rows(self) -> None:
         thumbnail = Thumbnail(Image.new("RGB", (384, 192)), ["a word " * 40])
         heights = [draw_sheet("t", {"#ff0000": "red"}, [thumbnail] * count).height for count in (1, 4, 5, PER_SHEET)]
         assert heights[0] == heights[1] < heights[2] < heights[3]

@@ -14,19 +14,23 @@ from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import StageScores, score
 from lalaloc_core.localise.bundle import Bundle
 
-# Homes of what is not among the first figures, and of the comparison of evidence, which asks the same six times.
-_MAX_HOMES_OF_MINOR = 100
-_MAX_HOMES_PER_EVIDENCE = 50
+# Limits for minor figures, and for the comparison of matching costs, which repeats its queries six times.
+_MAX_MINOR_HOMES = 100
+_MAX_EVIDENCE_HOMES = 50
 
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark:
-    """What is asked of the model.
+    """Queries for the model.
 
-    `heldout`: in homes that another generator than training's drew; `copies`: in plans of four copies of a home that
-    differ in their doors.
-
-    Of a `minor` benchmark fewer homes are asked. `settings` are of the method "lalaloc".
+    Attributes:
+        kind: kind of the queries.
+        furniture: furniture of the photographs.
+        heading_known: whether the heading is known.
+        heldout: whether the homes are out-of-distribution ones.
+        copies: whether each plan has four copies of a home that differ in their doors.
+        settings: settings of method "lalaloc".
+        minor: whether fewer homes suffice.
     """
 
     kind: QueryKind = "panorama"
@@ -43,23 +47,26 @@ _BENCHMARKS = {
     "panorama_full": Benchmark(),
     "panorama_empty": Benchmark(furniture="empty", minor=True),
     "panorama_full_unknown_heading": Benchmark(heading_known=False),
-    "out_of_family_full": Benchmark(heldout=True, minor=True),
-    "out_of_family_empty": Benchmark(heldout=True, furniture="empty", minor=True),
+    "heldout_full": Benchmark(heldout=True, minor=True),
+    "heldout_full_unknown_heading": Benchmark(heldout=True, heading_known=False, minor=True),
+    "heldout_empty": Benchmark(heldout=True, furniture="empty", minor=True),
 }
 
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Accuracy on generated test homes, 4 queries each, and on at most 100 unfurnished and out-of-family ones."""
-    return {name: summary_of(answers_to(bundle, asked, homes, textures)) for name, asked in _BENCHMARKS.items()}
+    """Measure accuracy in generated test homes, 4 queries each; in at most 100 unfurnished and heldout ones."""
+    return {
+        name: summarise(run_benchmark(bundle, benchmark, homes, textures)) for name, benchmark in _BENCHMARKS.items()
+    }
 
 
 def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """What poses are compared by: the latent, the predicted wall profile, or both; heading known and unknown."""
-    homes = min(homes, _MAX_HOMES_PER_EVIDENCE)
+    """Measure accuracy with the latent, the predicted wall profile, or both in the matching cost."""
+    homes = min(homes, _MAX_EVIDENCE_HOMES)
     return {
         heading: {
-            evidence: summary_of(
-                answers_to(
+            evidence: summarise(
+                run_benchmark(
                     bundle,
                     Benchmark(settings={"evidence": evidence}, heading_known=heading == "known_heading"),
                     homes,
@@ -72,9 +79,9 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     }
 
 
-def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
-    """The answers to a benchmark, 4 queries in each of some homes."""
-    homes = min(homes, _MAX_HOMES_OF_MINOR) if benchmark.minor else homes
+def run_benchmark(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
+    """Return the predictions of a benchmark, 4 queries in each home."""
+    homes = min(homes, _MAX_MINOR_HOMES) if benchmark.minor else homes
     generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
     if benchmark.heldout:
         generated["generator"] = "heldout"
@@ -86,7 +93,7 @@ def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path 
         label=f"{benchmark.kind}, {benchmark.furniture}",
         method="lalaloc",
         kind=benchmark.kind,
-        dataset="out-of-family homes" if benchmark.heldout else "generated homes",
+        dataset="out-of-distribution homes" if benchmark.heldout else "generated homes",
         split="test",
         settings=dict(benchmark.settings),
         generated=generated,
@@ -98,8 +105,8 @@ def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path 
         return run_evaluation(RunFolder(Path(folder)), info)
 
 
-def summary_of(predictions: list[Prediction]) -> dict[str, Any]:
-    """The figures that tables show of some answers."""
+def summarise(predictions: list[Prediction]) -> dict[str, Any]:
+    """Return the figures of some predictions that tables show."""
     scores = score(predictions)
     shares = ("within_1cm", "within_5cm", "within_10cm", "within_1m")
 
@@ -119,7 +126,7 @@ def summary_of(predictions: list[Prediction]) -> dict[str, Any]:
     }
 
 
-# Rows by the settings of method "lalaloc" that make them. What a plan or a model does not tell changes nothing.
+# Settings of method "lalaloc" by row. Terms that a plan or a model lacks have no effect.
 TERMS: Mapping[str, Mapping[str, Any]] = {
     "all": {},
     "without_openings": {"openings": False},
@@ -132,26 +139,26 @@ HEIGHTS: Mapping[str, Mapping[str, Any]] = {
     "right": {},
     "20_cm_too_high": {"camera_height_error_m": 0.2},
     "20_cm_too_low": {"camera_height_error_m": -0.2},
-    "not_told": {"camera_height": "unknown"},
+    "unknown": {"camera_height": "unknown"},
 }
 _HEADINGS = {"known_heading": True, "unknown_heading": False}
 
 
 def bench_terms(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Accuracy with and without each term, heading known and unknown, on the test split and out-of-family."""
+    """Measure accuracy with and without each term of the matching cost, in test and out-of-distribution homes."""
     return {
         family: _rows(bundle, TERMS, homes, textures, heldout=heldout)
-        for family, heldout in (("test", False), ("out_of_family", True))
+        for family, heldout in (("test", False), ("heldout", True))
     }
 
 
 def bench_heights(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Accuracy on the test split at camera heights that are told right, wrong and not at all."""
+    """Measure accuracy in test homes with a right, a wrong and an unknown camera height."""
     return {"test": _rows(bundle, HEIGHTS, homes, textures, heldout=False)}
 
 
 def bench_copies(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Which of four copies of a home that differ in where their doors are, with and without openings."""
+    """Measure accuracy in plans of four copies of a home that differ in their doors, with and without openings."""
     rows = {name: TERMS[name] for name in ("all", "without_openings")}
     return {"test": _rows(bundle, rows, homes, textures, heldout=False, copies=True)}
 
@@ -165,16 +172,11 @@ def _rows(
     heldout: bool,
     copies: bool = False,
 ) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for heading, known in _HEADINGS.items():
-        found[heading] = {}
-        for name, settings in rows.items():
-            benchmark = Benchmark(
-                settings=settings,
-                heading_known=known,
-                heldout=heldout,
-                copies=copies,
-                minor=heldout or copies,
-            )
-            found[heading][name] = summary_of(answers_to(bundle, benchmark, homes, textures))
-    return found
+    """Return the figures by row and heading."""
+    figures: dict[str, Any] = {name: {} for name in rows}
+    for name, settings in rows.items():
+        for heading, known in _HEADINGS.items():
+            minor = heldout or copies
+            benchmark = Benchmark(settings=settings, heading_known=known, heldout=heldout, copies=copies, minor=minor)
+            figures[name][heading] = summarise(run_benchmark(bundle, benchmark, homes, textures))
+    return figures

@@ -1,4 +1,4 @@
-"""What the image encoder reads at each azimuth of homes that training never draws: walls and openings."""
+"""Accuracy of the image encoder by azimuth: walls and openings, in homes that training never draws."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _MAX_HOMES = 100
 
 
 def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Errors of walls and openings on the furnished test split and out-of-family, 4 panoramas in each of some homes."""
-    # Traced by embree, which only the extra `oracle` brings.
+    """Measure walls and openings in furnished test and out-of-distribution homes, 4 panoramas per home."""
+    # Needs embree, from the extra `oracle`.
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
     encoders = Encoders(bundle, threads=1)
     homes = min(homes, _MAX_HOMES)
-    datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "out_of_family": HeldoutScenes(homes=homes)}
+    datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "heldout": HeldoutScenes(homes=homes)}
     return {family: azimuth_figures(encoders, dataset) for family, dataset in datasets.items()}
 
 
 def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
-    """`AzimuthSummary` of a data set's test split, and `confusion`: of each true class, the share taken for each.
+    """Return the `AzimuthSummary` of a data set's test split, and its `confusion`: shares by true and predicted class.
 
     Raises:
         BundleError: the model predicts no wall profile.
@@ -46,7 +46,7 @@ def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
         for camera in scene.cameras:
             image = camera.photographs[appearance].image(encoders.manifest.image_height, encoders.manifest.image_width)
             measures.append(_measure(encoders, scene.plan, camera, image))
-    confusions = [one.confusion for one in measures if one.confusion is not None]
+    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
     confusion = None
     if confusions:
         counts = np.sum(confusions, axis=0)
@@ -59,7 +59,7 @@ def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
 
 
 def _measure(encoders: Encoders, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> AzimuthMeasures:
-    """Compare what is read from a panorama with what the plan has around the camera."""
+    """Compare the predictions from a panorama with the plan around the camera."""
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
     pose = (camera.position_m[None], heading, room, plan.geometry, len(log_m), camera.camera_height_m)

@@ -1,4 +1,4 @@
-"""Where the time of a query goes: the production path in this process under cProfile."""
+"""Profile of a query: the production path in this process under cProfile."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _STAGES = ("encode", "retrieve", "vdr", "lpo")
 
 
 def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
-    """A table of the stages of queries in the home nearest 100 m², one thread, and one of the dearest functions.
+    """Return tables of the stages and of the slowest functions of queries in a home of 100 m², in one thread.
 
-    Stages are timed without the profiler, medians over the queries; functions with it, by the time spent in themselves.
+    Stages are timed without the profiler, as medians over the queries; functions with it, by their own time.
     """
     home = home_of_area(100.0)
     shots = sample_shots(home, queries, np.random.default_rng(1), "full")
@@ -40,7 +40,7 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
     latents = not encoders.predicts_profile
     grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m, latents=latents)
 
-    def ask(index: int, *, known: bool) -> dict[str, float]:
+    def time_query(index: int, *, known: bool) -> dict[str, float]:
         clock, shot = StageClock(), shots[index]
         with clock.stage("encode"):
             heading = shot.heading if known else None
@@ -50,8 +50,8 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
 
     lines = [f"| stage, median of {queries} queries | known heading | unknown heading |", "|---|---|---|"]
     for known in (True, False):
-        ask(0, known=known)
-    timings = {known: [ask(index, known=known) for index in range(queries)] for known in (True, False)}
+        time_query(0, known=known)
+    timings = {known: [time_query(index, known=known) for index in range(queries)] for known in (True, False)}
     for stage in _STAGES:
         medians = [statistics.median(timing[stage] for timing in timings[known]) for known in (True, False)]
         lines.append(f"| {stage} | {medians[0]:.1f} ms | {medians[1]:.1f} ms |")
@@ -59,16 +59,16 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
         profiler = cProfile.Profile()
         profiler.enable()
         for index in range(queries):
-            ask(index, known=known)
+            time_query(index, known=known)
         profiler.disable()
         title = "known" if known else "unknown"
-        lines += ["", f"| function, {title} heading | calls per query | ms per query, itself |", "|---|---|---|"]
-        lines += _dearest(profiler, queries)
+        lines += ["", f"| function, {title} heading | calls per query | own ms per query |", "|---|---|---|"]
+        lines += _slowest(profiler, queries)
     return "\n".join(lines)
 
 
-def _dearest(profiler: cProfile.Profile, queries: int) -> list[str]:
-    """Rows of the functions that took the most time themselves."""
+def _slowest(profiler: cProfile.Profile, queries: int) -> list[str]:
+    """Return rows of the functions with the most time of their own."""
     ranked = sorted(profiler.getstats(), key=lambda entry: -entry.inlinetime)[:_FUNCTIONS]
     return [
         f"| {_name(entry.code)} | {entry.callcount / queries:.0f} | {1e3 * entry.inlinetime / queries:.2f} |"
@@ -77,5 +77,5 @@ def _dearest(profiler: cProfile.Profile, queries: int) -> list[str]:
 
 
 def _name(code: CodeType | str) -> str:
-    """Where a function stands; of those that are not written in Python the profiler has a description."""
+    """Return file and name of a function, or the profiler's description of a built-in one."""
     return f"`{code}`" if isinstance(code, str) else f"`{Path(code.co_filename).name}` {code.co_qualname}"

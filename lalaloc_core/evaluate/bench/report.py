@@ -1,4 +1,4 @@
-"""All groups of figures in one report."""
+"""Report of all groups of benchmarks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,14 @@ from lalaloc_core.localise.bundle import Bundle
 
 
 def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure the named groups of figures with one bundle."""
+    """Measure groups of figures with one bundle.
+
+    Args:
+        bundle_folder: folder of the bundle.
+        groups: names of the groups.
+        homes: number of test homes.
+        textures: folder of textures for the renderer.
+    """
     bundle = Bundle.open(bundle_folder)
     measure: Mapping[str, Callable[[], dict[str, Any]]] = {
         "rendering": lambda: bench_rendering(bundle),

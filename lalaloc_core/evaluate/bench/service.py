@@ -1,4 +1,4 @@
-"""What the running service takes: latency over real HTTP, and memory."""
+"""Latency of the running service over HTTP, and its memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SMALL_PROCESS_MB = 50.0
 
 
 def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
-    """Latency of `POST /localise` from one client over real HTTP, and memory of the service's processes."""
+    """Measure the latency of `POST /localise` from one client, and the memory of the service's processes."""
     home = home_of_area(100.0)
     shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
     materials = MaterialLibrary.create(np.random.default_rng(1), textures)
@@ -40,37 +40,37 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
         plan_id = _upload(client, home.plan)
         report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
         for name, known in (("known_heading", True), ("unknown_heading", False)):
-            answers = []
+            responses = []
             for index, (shot, picture) in enumerate([(shots[0], pictures[0]), *zip(shots, pictures, strict=True)]):
                 data = {"floorplan_id": plan_id, "camera_height_m": f"{shot.home.plan.camera_height_m}"}
                 if known:
                     data["heading_deg"] = f"{np.degrees(shot.heading):.3f}"
                 begin = time.perf_counter()
-                answer = client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
-                answer.raise_for_status()
-                # The first request warms up and is not counted.
+                response = client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+                response.raise_for_status()
+                # The first request is a warm-up.
                 if index:
-                    answers.append(((time.perf_counter() - begin) * 1e3, answer.json()))
-            times = [milliseconds for milliseconds, _ in answers]
+                    responses.append(((time.perf_counter() - begin) * 1e3, response.json()))
+            times = [milliseconds for milliseconds, _ in responses]
             report[name] = {
                 "p50_ms": statistics.median(times),
                 "p95_ms": float(np.quantile(times, 0.95)),
-                "stages": sorted({answer["stage"] for _, answer in answers}),
+                "stages": sorted({answer["stage"] for _, answer in responses}),
                 "median_stage_ms": {
-                    stage: statistics.median(answer["timings_ms"][stage] for _, answer in answers)
-                    for stage in answers[0][1]["timings_ms"]
+                    stage: statistics.median(answer["timings_ms"][stage] for _, answer in responses)
+                    for stage in responses[0][1]["timings_ms"]
                 },
             }
         report["service_resident_mb"] = resident_mb(process.pid)
         sizes = [resident_mb(pid) for pid in children_of(process.pid)]
-        # Besides the workers there is Python's own small resource tracker.
+        # The smaller child is Python's resource tracker.
         report["workers_resident_mb"] = [size for size in sizes if size > _SMALL_PROCESS_MB]
     return report
 
 
 @contextmanager
 def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
-    """The production service on a free port with a temporary data folder; stopped at the end."""
+    """Run the production service on a free port with a temporary data folder."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -81,7 +81,7 @@ def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subproc
         process = subprocess.Popen(command, env=environment)
         try:
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
-                _wait_until(lambda: _is_ready(client), "the service did not become ready")
+                _wait_until(lambda: _is_ready(client), f"the service is not ready after {_STARTUP_SECONDS:g} s")
                 yield client, process
         finally:
             process.terminate()
@@ -89,7 +89,7 @@ def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subproc
 
 
 def resident_mb(pid: int) -> float:
-    """Resident memory of a process in MB, as Linux reports it."""
+    """Return the resident memory (MB) of a process (Linux)."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024.0
@@ -97,16 +97,18 @@ def resident_mb(pid: int) -> float:
 
 
 def children_of(pid: int) -> list[int]:
-    """Process ids of the direct children of a process (Linux)."""
+    """Return the ids of the direct children of a process (Linux)."""
     listings = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children")]
     return [int(child) for listing in listings for child in listing.split()]
 
 
 def _upload(client: httpx.Client, plan: FloorPlan) -> str:
-    answer = client.post("/floorplans", json=plan.to_dict())
-    answer.raise_for_status()
-    plan_id = answer.json()["id"]
-    _wait_until(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready", "the plan did not get ready")
+    response = client.post("/floorplans", json=plan.to_dict())
+    plan_id = response.raise_for_status().json()["id"]
+    _wait_until(
+        lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready",
+        f"the plan is not ready after {_STARTUP_SECONDS:g} s",
+    )
     return plan_id
 
 
@@ -117,11 +119,11 @@ def _is_ready(client: httpx.Client) -> bool:
         return False
 
 
-def _wait_until(condition: Callable[[], bool], complaint: str) -> None:
+def _wait_until(condition: Callable[[], bool], message: str) -> None:
     deadline = time.monotonic() + _STARTUP_SECONDS
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError(complaint)
+            raise TimeoutError(message)
         time.sleep(0.1)
 
 

@@ -39,13 +39,13 @@ from lalaloc_core.render.sampling import pose_grid, random_poses
 
 
 def home_of_area(area_m2: float) -> Home:
-    """The test home whose area comes nearest, among the first hundred."""
+    """Return the test home with the nearest area, among the first hundred."""
     homes = (home_of(TEST, 0, index)[0] for index in range(100))
     return min(homes, key=lambda home: abs(home.plan.area_m2 - area_m2))
 
 
 def median_ms(call: Callable[[], object], repeats: int = 9) -> float:
-    """Median milliseconds of a call, after one that is not counted."""
+    """Return the median duration (ms) of a call, after a warm-up."""
     call()
     times = []
     for _ in range(repeats):
@@ -59,12 +59,12 @@ _GRID_STEP_M = 0.5
 
 
 def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
-    """Closed-form layout depth against the ray-casting oracle in the same run, and the grid of a 100 m² home."""
+    """Measure layout depth in closed form and by ray casting, and the pose grid of a 100 m² home."""
     home = home_of_area(100.0)
     plan = home.plan
-    drawn = random_poses(plan, poses, np.random.default_rng(0))
-    camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[drawn.room_index]
-    arrays = (drawn.position_m, np.zeros(poses), plan.walls_m[drawn.room_index], camera, ceiling)
+    sampled = random_poses(plan, poses, np.random.default_rng(0))
+    camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[sampled.room_index]
+    arrays = (sampled.position_m, np.zeros(poses), plan.walls_m[sampled.room_index], camera, ceiling)
     position, heading, walls, cameras, ceilings = (torch.tensor(a, dtype=torch.float32) for a in arrays)
 
     def closed_form() -> None:
@@ -74,8 +74,8 @@ def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
 
     def oracle() -> None:
         for index in sample:
-            room = plan.rooms[drawn.room_index[index]]
-            reference_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
+            room = plan.rooms[sampled.room_index[index]]
+            reference_depth(room, sampled.position_m[index], 0.0, 1.5, 128, 256)
 
     encoders = Encoders(bundle)
     closed_form_ms = median_ms(closed_form) / poses
@@ -96,9 +96,9 @@ _GRID_STEP_M = 0.5
 
 
 def bench_methods(bundle: Bundle) -> dict[str, Any]:
-    """Seconds per query of ICP and of LaLaLoc, in the home nearest 100 m², furnished, heading known.
+    """Measure seconds per query of ICP and of LaLaLoc in a furnished home of 100 m², heading known.
 
-    What belongs to the plan (ICP's cloud of the walls, LaLaLoc's latent grid) is made before and not counted.
+    The plan's wall cloud (ICP) and pose grid (LaLaLoc) are prepared before and not counted.
     """
     home = home_of_area(100.0)
     shots = sample_shots(home, _QUERIES + 1, np.random.default_rng(2), "full")
@@ -114,7 +114,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
                 position_m=shot.position_m,
                 room_index=shot.room_index,
                 heading=shot.heading,
-                # One height, so that one latent grid serves all.
+                # One height, so that all share one pose grid.
                 camera_height_m=shots[0].camera_height_m,
                 photographs={},
             ),
@@ -136,7 +136,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
 
 
 def _mean_seconds(method: Method, questions: Sequence[Question]) -> float:
-    """Mean over all questions but the first, which warms up."""
+    """Return the mean time over all questions but the first, a warm-up."""
     answers = [method.locate(question) for question in questions]
     return float(np.mean([sum(answer.timings_ms.values()) for answer in answers[1:]])) / 1e3
 
@@ -147,9 +147,9 @@ _QUERIES = 300
 
 
 def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
-    """Write synthetic test scenes, read their annotations again and again, and localise 300 of their panoramas.
+    """Measure writing synthetic test scenes, reading their annotations, and localising 300 panoramas.
 
-    Each takes a process per core.
+    Each takes one process per core.
     """
     cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
@@ -162,7 +162,7 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
         dataset = Structured3D(root)
         names = dataset.scenes("test")
         with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
-            # Every process reads once before it counts.
+            # Warm-up of every process.
             list(pool.map(_count_cameras, [root] * 4 * cores, names[: 4 * cores]))
             begin = time.perf_counter()
             cameras = list(pool.map(_count_cameras, [root] * len(names), names, chunksize=2))

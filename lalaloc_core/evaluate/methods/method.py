@@ -12,8 +12,8 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Photograph
-from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.render.sweep import profiles_at
 
 # "layout": the query is the error-free layout of the true pose; "panorama": a photograph, or its depth for ICP.
 QueryKind = Literal["layout", "panorama"]

@@ -23,8 +23,8 @@ from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.render.sweep import profiles_at
 
 LayoutMetric = Literal["edges", "depth", "relative-depth", "chamfer"]
 LAYOUT_METRICS: tuple[LayoutMetric, ...] = get_args(LayoutMetric)

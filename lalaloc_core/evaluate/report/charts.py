@@ -1,4 +1,4 @@
-"""What is charted: error curves, calibration, outcomes and times."""
+"""Charts of a report: error curves, calibration, outcomes and times."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _TICKS = {0.001: "0.1 cm", 0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m", 10.0: "10 m"}
 _WIDTH_INCHES = 5.6
 _BAR_INCHES = 0.3
 _LEGEND_CHARACTERS = 84
-# Blue for what went right; the failures in colours that stay apart for colour-blind eyes too.
+# Blue for located; the failures in colours that colour-blind readers can distinguish.
 OUTCOME_COLOURS = dict(zip(Outcome, (SERIES[0], SERIES[4], SERIES[1], MUTED), strict=True))
 
 
 def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
-    """The charts that these runs have something for, by name."""
+    """Draw the charts for which the runs have data, by name."""
     answered = [run for run in runs if run.predictions]
     charts = []
     with chart_style():
@@ -52,7 +52,7 @@ def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
 
 
 def curves(runs: Sequence[Run]) -> dict[str, Float[np.ndarray, "n"]]:
-    """Position errors (m; NaN: no answer) by the curve's name: the stages of a single run, or the answer of each."""
+    """Return position errors (m; NaN without an answer) by curve: stages of a single run, or final poses of each."""
     if len(runs) == 1 and len(runs[0].stages) > 1:
         return {stage: position_errors_m(runs[0].predictions, stage) for stage in runs[0].stages}
     return {run.name: position_errors_m(run.predictions) for run in runs}
@@ -74,12 +74,12 @@ def _error_curves(runs: Sequence[Run]) -> Chart:
     axes.set_xlabel("position error")
     _percent(axes, "y", "queries within")
     _legend(figure, axes.get_lines(), list(lines))
-    what = "after each stage" if len(runs) == 1 else "of each run's answers"
+    poses = "after each stage" if len(runs) == 1 else "with the final pose of each run"
     return finish(
         figure,
         name="error-curves",
         title="Cumulative position error",
-        description=f"Share of all queries {what} by how far they are from the true position, from 0.1 cm to 20 m on a "
+        description=f"Share of all queries {poses} by position error, from 0.1 cm to 20 m on a "
         "logarithmic axis. The table below the chart has the same figures.",
     )
 
@@ -91,19 +91,20 @@ def _calibration(runs: Sequence[Run]) -> Chart:
     for run, style in zip(runs, line_styles(len(runs)), strict=True):
         assert run.scores is not None
         bins = run.scores.reliability
-        points = [100.0 * one.confidence for one in bins], [100.0 * one.frequency for one in bins]
+        points = [100.0 * part.confidence for part in bins], [100.0 * part.frequency for part in bins]
         diagram.plot(*points, linewidth=1.2, **style)
-        most = max(one.count for one in bins)
+        largest = max(part.count for part in bins)
         diagram.scatter(
             *points,
-            s=[10.0 + 50.0 * one.count / most for one in bins],
+            s=[10.0 + 50.0 * part.count / largest for part in bins],
             color=style["color"],
             edgecolor=PAPER,
             zorder=3,
             clip_on=False,
         )
         edges = np.linspace(0.0, 100.0, CONFIDENCE_BINS + 1)
-        confidence = [100.0 * one.confidence for one in run.predictions if one.confidence is not None]
+        confidences = (prediction.confidence for prediction in run.predictions)
+        confidence = [100.0 * confidence for confidence in confidences if confidence is not None]
         count, _ = np.histogram(confidence, edges)
         histogram.stairs(100.0 * count / len(confidence), edges, fill=len(runs) == 1, linewidth=1.5, **style)
     diagram.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")
@@ -118,9 +119,9 @@ def _calibration(runs: Sequence[Run]) -> Chart:
         figure,
         name="calibration",
         title="Calibration of the confidence",
-        description="Left: share of answers within 1 m against their mean confidence, in ten bins; on the dashed "
-        "diagonal a confidence is what it says, and larger dots hold more queries. Right: how often each confidence is "
-        "given. The table below the chart has the same figures.",
+        description="Left: share of answers within 1 m against their mean confidence, in ten bins; the dashed "
+        "diagonal is perfect calibration, and larger dots have more queries. Right: distribution of the confidence. "
+        "The table below the chart has the same figures.",
     )
 
 
@@ -136,8 +137,8 @@ def _outcomes(runs: Sequence[Run]) -> Chart:
         figure,
         name="outcomes",
         title="Located and failed queries",
-        description="Share of queries that were located, misaligned in the right room, put in a wrong room, or not "
-        "answered, one bar per run. The table below the chart has the same figures.",
+        description="Share of queries located, misaligned in the right room, in a wrong room, or without an answer, "
+        "one bar per run. The table below the chart has the same figures.",
     )
 
 
@@ -159,7 +160,7 @@ def _times(runs: Sequence[Run]) -> Chart:
 
 
 def _stacked_bars(rows: dict[str, dict[str, float]], colours: dict[str, str]) -> Figure:
-    """One horizontal bar per row, first on top, cut into the parts that `colours` lists."""
+    """Draw one horizontal bar per row, the first on top, with the parts that `colours` lists."""
     height = 0.7 + _BAR_INCHES * len(rows) + _legend_inches(list(colours))
     figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
     axes = figure.subplots()
@@ -193,7 +194,7 @@ def _legend(figure: Figure, marks: Sequence[Any], names: Sequence[str]) -> None:
 
 
 def _legend_columns(names: Sequence[str]) -> int:
-    """As many as the longest name leaves room for."""
+    """Return the number of columns for which the longest name leaves room."""
     return max(1, min(4, len(names), _LEGEND_CHARACTERS // (max(map(len, names)) + 6)))
 
 

@@ -1,4 +1,4 @@
-"""The charts of a report, drawn once by matplotlib: for the page, which colours them, and as pictures of their own."""
+"""Style and formats of charts: drawn once by matplotlib, inlined in the page and saved as pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-# Every colour of a chart by the name of the page's variable for it; the page knows another set for the dark.
+# Colours of charts by the page's CSS variable; the page has a second set for dark mode.
 INK, MUTED, RULE, PAPER = "#1c2128", "#59626d", "#d5dbe1", "#ffffff"
 SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
 COLOURS = {
@@ -27,7 +27,7 @@ _DASHES = ("-", "--", ":", "-.")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "lalaloc",
-    # Names of runs may hold dollar signs.
+    # Names of runs can contain dollar signs.
     "text.parse_math": False,
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -55,13 +55,13 @@ _PNG_DPI = 160
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Chart:
-    """A drawn chart.
+    """Drawn chart.
 
     Attributes:
-        name: of its files.
-        title, description: what a reader who does not see it is told.
-        figure: what was drawn.
-        svg: a file of its own, on white.
+        name: name of its files.
+        title, description: text for screen readers.
+        figure: matplotlib's figure.
+        svg: the chart as an SVG file, on white.
     """
 
     name: str
@@ -71,14 +71,14 @@ class Chart:
     svg: str
 
     def png(self) -> bytes:
-        """The chart as pixels, on white."""
+        """Return the chart as PNG, on white."""
         content = io.BytesIO()
         with chart_style():
             self.figure.savefig(content, format="png", dpi=_PNG_DPI)
         return content.getvalue()
 
     def inline(self) -> str:
-        """The SVG as part of an HTML page that defines the variables of `COLOURS`; text in it is escaped."""
+        """Return the SVG for an HTML page that defines the variables of `COLOURS`; text is escaped."""
         root = ElementTree.fromstring(self.svg)
         _without_namespaces(root)
         for parent in list(root.iter()):
@@ -105,21 +105,21 @@ class Chart:
 
 @contextmanager
 def chart_style() -> Iterator[None]:
-    """How charts look; draw and `finish` them inside."""
+    """Apply the style of charts; draw and `finish` them inside."""
     with mpl.rc_context(_STYLE):
         yield
 
 
 def finish(figure: Figure, *, name: str, title: str, description: str) -> Chart:
-    """A figure as a chart."""
+    """Return a figure as a chart."""
     svg = io.StringIO()
-    # No date: the same runs give the same report.
+    # Without a date, equal runs give equal reports.
     figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     return Chart(name=name, title=title, description=description, figure=figure, svg=svg.getvalue())
 
 
 def line_styles(count: int) -> list[dict[str, Any]]:
-    """Colour and dash of each of `count` lines; no two of the first 32 are alike."""
+    """Return colour and dash of each line; the first 32 differ."""
     return [
         {"color": SERIES[index % len(SERIES)], "linestyle": _DASHES[index // len(SERIES) % len(_DASHES)]}
         for index in range(count)
@@ -127,19 +127,19 @@ def line_styles(count: int) -> list[dict[str, Any]]:
 
 
 def bar_colours(names: Sequence[str]) -> dict[str, str]:
-    """One colour per name."""
+    """Return one colour per name."""
     return dict(zip(names, islice(cycle(SERIES), len(names)), strict=True))
 
 
 def _without_namespaces(root: ElementTree.Element) -> None:
-    """HTML knows SVG by its tags."""
+    """Remove namespaces, which inline SVG in HTML does not have."""
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
         element.attrib = {name.rpartition("}")[2]: value for name, value in element.attrib.items()}
 
 
 def _rename_identifiers(root: ElementTree.Element, prefix: str) -> None:
-    """Keep only identifiers that something refers to, each with the chart's name: a page holds several charts."""
+    """Prefix referenced identifiers with the chart's name and remove others: a page has several charts."""
     references = {
         value[1:] if value.startswith("#") else value[5:-1]
         for element in root.iter()

@@ -1,4 +1,4 @@
-"""The queries worth looking at: which they are, and their pictures, for which data set and model are opened again."""
+"""Gallery of a report: the best, median and worst queries with pictures, drawn with the run's data set and model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lalaloc_core.evaluate.report.pictures import (
     draw_panorama,
 )
 from lalaloc_core.evaluate.report.reading import Run
-from lalaloc_core.evaluate.report.reopening import ask_again, find_camera, open_model
+from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
@@ -32,15 +32,15 @@ from lalaloc_core.localise.matching_cost import latent_distances
 
 PER_GROUP = 3
 BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"
-# Methods that compare latents somewhere on their way.
+# Methods that compare latents.
 _LATENT_METHODS = ("lalaloc", "decode")
-# Cells of the maps; larger in plans that would have more of them than this.
+# Side of the maps' cells, larger in plans with more than the maximum number.
 _CELL_M, _MAX_CELLS = 0.2, 5000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Card:
-    """One query of the gallery; errors are None where there is no answer."""
+    """Query of the gallery; errors are None without an answer."""
 
     scene: str
     camera: str
@@ -54,13 +54,13 @@ class Card:
 
     @property
     def bytes(self) -> int:
-        """Size of its pictures."""
+        """Size of the pictures."""
         return sum(len(picture.content) for picture in self.pictures)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gallery:
-    """Cards by group, in order, and a sentence for everything that was left out."""
+    """Cards by group, in order, and a sentence for each omission."""
 
     groups: dict[str, list[Card]]
     left_out: tuple[str, ...] = ()
@@ -72,10 +72,10 @@ class Gallery:
 
 
 def choose_queries(predictions: list[Prediction]) -> dict[str, list[int]]:
-    """Numbers of up to three queries per group, none twice.
+    """Return indices of up to three queries per group, none twice.
 
-    The best and the median ones have an answer; the worst may have none. A fourth group has the worst alignments in
-    the right room, which seldom are among the worst of all.
+    Best and median queries have an answer, the worst may have none. A fourth group has the worst alignments in the
+    right room, which are rarely among the worst of all.
     """
     errors_m = position_errors_m(predictions)
     order = [int(index) for index in np.argsort(np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")]
@@ -98,10 +98,7 @@ def choose_queries(predictions: list[Prediction]) -> dict[str, list[int]]:
 
 
 def build_gallery(run: Run) -> Gallery:
-    """Draw the queries of a run that are worth looking at.
-
-    What is needed and gone leaves the gallery, or a part of it, out, and is named in `left_out`.
-    """
+    """Draw the gallery of a run; parts whose data or model is missing are named in `left_out`."""
     left_out: list[str] = []
     try:
         writer = _CardWriter(run, left_out)
@@ -118,13 +115,13 @@ def build_gallery(run: Run) -> Gallery:
 
 
 class _CardWriter:
-    """Data set and model of a run, opened to draw its queries; what is gone is told in `left_out`."""
+    """Data set and model of a run, opened to draw its queries; missing parts are added to `left_out`."""
 
     def __init__(self, run: Run, left_out: list[str]) -> None:
-        """Open them.
+        """Open data set and model.
 
         Raises:
-            DatasetError, InvalidInputError: the data set is not there, or not the one it was.
+            DatasetError, InvalidInputError: the data set is missing or has changed.
         """
         self._run = run
         self._dataset = build_dataset(run.info)
@@ -139,26 +136,26 @@ class _CardWriter:
         """Draw one query.
 
         Raises:
-            DatasetError: its scene is gone or has changed.
+            DatasetError: the scene is missing or has changed.
         """
         prediction = self._run.predictions[index]
         scene, camera = find_camera(self._dataset, prediction)
-        question = ask_again(self._run.info, scene, camera, self._appearance)
-        found = prediction.final_pose
+        question = repeat_question(self._run.info, scene, camera, self._appearance)
+        pose = prediction.final_pose
         return Card(
             scene=prediction.scene,
             camera=prediction.camera,
             room=prediction.room,
-            found_room=None if found is None else scene.plan.rooms[found.room_index].name,
+            found_room=None if pose is None else scene.plan.rooms[pose.room_index].name,
             outcome=self._outcomes[index],
-            error_m=None if found is None else float(self._errors_m[index]),
-            heading_error_deg=None if found is None else float(self._heading_errors_deg[index]),
+            error_m=None if pose is None else float(self._errors_m[index]),
+            heading_error_deg=None if pose is None else float(self._heading_errors_deg[index]),
             confidence=prediction.confidence,
             pictures=(
                 *self._panorama(scene, camera, prediction),
                 *(
-                    draw_map(scene.plan, one, prediction.truth, found)
-                    for one in _maps(question, self._encoders, self._left_out)
+                    draw_map(scene.plan, drawn, prediction.truth, pose)
+                    for drawn in _maps(question, self._encoders, self._left_out)
                 ),
             ),
         )
@@ -173,7 +170,7 @@ class _CardWriter:
 
 
 def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
-    """The run's own model, None where there is none that the method compares latents with."""
+    """Return the run's model, or None if the method compares no latents or the model is missing."""
     if info.method not in _LATENT_METHODS:
         left_out.append(f"Method “{info.method}” compares no latents, so there is no map of latent distances.")
         return None
@@ -185,7 +182,7 @@ def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
 
 
 def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) -> list[DrawnMap]:
-    """How far the query is from every place of the plan: by latents where there is a model, and by true layouts."""
+    """Return maps of the query's distance to every place of the plan: by latent, and by true layout."""
     plan, camera = question.plan, question.camera
     cells = Cells.cover(plan, max(_CELL_M, math.sqrt(plan.area_m2 / _MAX_CELLS)))
     maps = []
@@ -197,7 +194,7 @@ def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) ->
         else:
             heading = np.full(len(cells.poses), query.frame_heading)
             latents, _ = encoders.poses(plan, cells.poses, heading, camera.camera_height_m)
-            # At the best hypothesis of how the camera was turned.
+            # The best heading hypothesis of each place.
             distances = latent_distances(latents, query.latents).min(axis=0)
             maps.append(DrawnMap("latent distance", "latent distance (log scale)", cells, distances))
     layouts = ChamferGrid(plan, cells.poses, camera.camera_height_m)

@@ -17,20 +17,20 @@ from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.files import atomic_write
 
-# Of all galleries together; as text they take a third more, and the page is to stay below 5 MB.
+# Limit of all galleries; base64 adds a third, and the page stays below 5 MB.
 GALLERY_BYTES = 3_400_000
 
 
 def write_report(runs: Sequence[Path], out: Path, *, pictures: Path | None = None) -> None:
-    """Write the page about some runs.
+    """Write the report on some runs.
 
     Args:
         runs: folders of runs.
-        out: the page.
-        pictures: a folder that the page's pictures are written to as well, as files.
+        out: file of the page.
+        pictures: folder for the page's pictures as files; None for none.
 
     Raises:
-        RunError: a folder that holds no run.
+        RunError: a folder holds no run.
     """
     opened = open_runs(runs)
     charts = draw_charts(opened)
@@ -42,7 +42,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pictures: Path | None = Non
 
 
 def _build_galleries(runs: Sequence[Run]) -> dict[int, Gallery]:
-    """Galleries by number of the run, of the first runs, as far as they fit on the page."""
+    """Return galleries by number of the run, of as many runs as fit on the page."""
     galleries: dict[int, Gallery] = {}
     left = GALLERY_BYTES
     for run in runs:
@@ -79,11 +79,12 @@ _GROUPS = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Part:
-    """One run on the page.
+    """Section of one run.
 
     Attributes:
-        facts: what was asked, by name.
-        gallery: None where it would have made the page too large, or nothing was answered.
+        run: the run.
+        facts: description of the run, by name.
+        gallery: None if the page would be too large or the run has no predictions.
     """
 
     run: Run
@@ -92,11 +93,7 @@ class Part:
 
 
 def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Mapping[int, Gallery]) -> str:
-    """The whole page.
-
-    Args:
-        galleries: by number of the run.
-    """
+    """Return the page; galleries are by number of the run."""
     environment = Environment(
         loader=PackageLoader("lalaloc_core.evaluate.report", "template"),
         autoescape=True,
@@ -131,7 +128,7 @@ def _title(runs: Sequence[Run]) -> str:
 
 
 def _facts(run: Run) -> dict[str, str]:
-    """What was asked, as words."""
+    """Return the description of a run as text."""
     info = run.info
     facts = {
         "Method": info.method,

@@ -43,7 +43,7 @@ from lalaloc_core.localise.encoders import Encoders
 
 _HEIGHT, _WIDTH = 256, 512
 CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}
-# Rows (pixels) of the bars that show the classes along the top of a picture: the true ones, the predicted ones.
+# Rows (pixels) of the bars with the true and the predicted classes along the top of a picture.
 _TRUE_BAR, _PREDICTED_BAR, _BAR_WIDTH = 4.0, 13.0, 6.0
 _KEY = {TRUE_COLOUR: "annotated walls", PREDICTED_COLOUR: "predicted walls"} | {
     colour: f"{name} (annotated above predicted)" for name, colour in CLASS_COLOURS.items()
@@ -53,33 +53,29 @@ _KEY = {TRUE_COLOUR: "annotated walls", PREDICTED_COLOUR: "predicted walls"} | {
 def draw_photographs(
     title: str, read: Sequence[ReadPhotograph], answers: Mapping[str, Sequence[GalleryAnswer]]
 ) -> Image.Image:
-    """One sheet with every photograph, the worst walls first.
-
-    Args:
-        answers: in galleries, by what they were asked with; part of the captions.
-    """
-    ordered = sorted(read, key=lambda one: -one.measures.median_error)
-    return draw_sheet(title, _KEY, [Thumbnail(_picture(one), _caption(one, answers)) for one in ordered])
+    """Draw one sheet with every photograph, the worst walls first; captions have the gallery answers by heading."""
+    ordered = sorted(read, key=lambda photograph: -photograph.measures.median_error)
+    return draw_sheet(title, _KEY, [Thumbnail(_picture(item), _caption(item, answers)) for item in ordered])
 
 
-def _caption(one: ReadPhotograph, answers: Mapping[str, Sequence[GalleryAnswer]]) -> list[str]:
-    measures, name = one.measures, one.photograph.name
-    located = (f"{heading} {describe_answers(some, name)}" for heading, some in answers.items())
+def _caption(read: ReadPhotograph, answers: Mapping[str, Sequence[GalleryAnswer]]) -> list[str]:
+    measures, name = read.measures, read.photograph.name
+    located = (f"{heading} {describe_answers(results, name)}" for heading, results in answers.items())
     return [
-        f"{name} ({one.photograph.quality})",
+        f"{name} ({read.photograph.quality})",
         f"|Δ log d| {measures.median_error:.3f}, 90 % below {measures.error_90:.2f}, bias {measures.bias:+.3f}, "
         f"{measures.scale_ratio:.1f} times its scale",
         "in galleries, heading " + ", ".join(located),
     ]
 
 
-def _picture(one: ReadPhotograph) -> Image.Image:
-    """The photograph with floor and ceiling lines of both walls, and bars for what is in them."""
-    photograph = one.photograph
-    true_m = photograph.profile_m(one.measures.outline, _WIDTH)
-    # Predicted at fewer columns than the picture has.
-    at, known = ((np.arange(count) + 0.5) / count for count in (_WIDTH, len(one.profile_m)))
-    predicted_m = np.exp(np.interp(at, known, np.log(one.profile_m), period=1.0))
+def _picture(read: ReadPhotograph) -> Image.Image:
+    """Draw a photograph with floor and ceiling lines of true and predicted walls, and bars of their openings."""
+    photograph = read.photograph
+    true_m = photograph.profile_m(read.measures.outline, _WIDTH)
+    # The prediction has fewer columns than the picture.
+    column, known = ((np.arange(count) + 0.5) / count for count in (_WIDTH, len(read.profile_m)))
+    predicted_m = np.exp(np.interp(column, known, np.log(read.profile_m), period=1.0))
     rises_m = [-CAMERA_HEIGHT_M]
     if photograph.has_flat_ceiling:
         rises_m.append(photograph.outlines[0].ceiling_height_m - CAMERA_HEIGHT_M)
@@ -88,14 +84,14 @@ def _picture(one: ReadPhotograph) -> Image.Image:
         for profile, colour, width in ((true_m, TRUE_COLOUR, 3.0), (predicted_m, PREDICTED_COLOUR, 1.5))
     ]
     strokes += _bars(photograph.classes(_WIDTH), _TRUE_BAR)
-    if one.class_scores is not None:
-        likeliest = one.class_scores.argmax(axis=1)
+    if read.class_scores is not None:
+        likeliest = read.class_scores.argmax(axis=1)
         strokes += _bars(likeliest[np.arange(_WIDTH) * len(likeliest) // _WIDTH], _PREDICTED_BAR)
     return draw_strokes(photograph.photograph.image(_HEIGHT, _WIDTH), strokes)
 
 
 def _bars(classes: Int[np.ndarray, "w"], row: float) -> list[Stroke]:
-    """A bar for every stretch of columns of one class, along a row of the picture; walls have none."""
+    """Return a bar for every run of columns of one class, along a row of the picture; none for walls."""
     edges = [0, *(np.flatnonzero(np.diff(classes)) + 1).tolist(), len(classes)]
     return [
         Stroke([np.array([[first, row], [last, row]])], CLASS_COLOURS[OPENING_CLASSES[classes[first]]], _BAR_WIDTH, 8.0)
@@ -110,36 +106,37 @@ _HEADINGS = {"known": True, "unknown": False}
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PhotographResults:
-    """A model on annotated photographs.
+    """Results of a model on annotated photographs.
 
     Attributes:
-        answers: in galleries, by what is said of the heading: "known" or "unknown".
+        read: predictions of walls and openings.
+        answers: results in galleries by heading, "known" or "unknown".
     """
 
     read: Sequence[ReadPhotograph]
     answers: Mapping[str, Sequence[GalleryAnswer]]
 
     def figures(self) -> dict[str, Any]:
-        """All figures as plain data; those over photographs are of the ones that count."""
-        counting = [one.measures for one in self.read if one.photograph.counts]
-        scores = {heading: dataclasses.asdict(score_galleries(some)) for heading, some in self.answers.items()}
+        """Return all figures as plain data; summaries are over the photographs that count."""
+        counting = [read.measures for read in self.read if read.photograph.counts]
+        scores = {heading: dataclasses.asdict(score_galleries(results)) for heading, results in self.answers.items()}
         return without_infinity(
             {
                 "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
                 "galleries": scores,
-                "photographs": [self._figures_of(one) for one in self.read],
+                "photographs": [self._figures(read) for read in self.read],
             }
         )
 
-    def _figures_of(self, one: ReadPhotograph) -> dict[str, Any]:
-        measures, name = one.measures, one.photograph.name
+    def _figures(self, read: ReadPhotograph) -> dict[str, Any]:
+        measures, name = read.measures, read.photograph.name
         galleries = {
-            heading: [dataclasses.asdict(answer) for answer in some if answer.photograph == name]
-            for heading, some in self.answers.items()
+            heading: [dataclasses.asdict(answer) for answer in results if answer.photograph == name]
+            for heading, results in self.answers.items()
         }
         return {
             "name": name,
-            "quality": one.photograph.quality,
+            "quality": read.photograph.quality,
             "outline": measures.outline,
             "median_error": measures.median_error,
             "error_90": measures.error_90,
@@ -149,56 +146,62 @@ class PhotographResults:
         }
 
     def markdown(self) -> str:
-        """The figures as two tables: all photographs together, and each of them."""
-        azimuths = summarise_azimuths([one.measures for one in self.read if one.photograph.counts], OPENING_CLASSES)
+        """Return the figures as two Markdown tables: all photographs together, and each photograph."""
+        counting = [read.measures for read in self.read if read.photograph.counts]
+        azimuths = summarise_azimuths(counting, OPENING_CLASSES)
         within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
         rows = [
             ("photographs, good or fair", str(azimuths.n)),
             ("median of the median error of log distance", _number(azimuths.median_error)),
-            ("… of what nine in ten errors are below", _number(azimuths.error_90)),
+            ("… of the 90th percentile of its error", _number(azimuths.error_90)),
             ("errors within quantiles of the predicted scale", within),
-            ("errors by what the predicted scale says", f"{_number(azimuths.scale_ratio)} times as large"),
+            ("error relative to the predicted scale", _number(azimuths.scale_ratio)),
             ("openings, balanced accuracy", _classes(azimuths.classes)),
         ]
-        for heading, some in self.answers.items():
-            scores = score_galleries(some)
+        for heading, results in self.answers.items():
+            scores = score_galleries(results)
             rows += [
                 (f"galleries, heading {heading}: located", f"{percent(scores.located)} of {scores.galleries}"),
-                ("… located, but turned by more than 10°", percent(scores.turned)),
+                ("… located, heading error above 10°", percent(scores.turned)),
                 ("… right room", percent(scores.right_room)),
                 ("… right room among the first three candidates", percent(scores.among_3)),
                 ("… expected calibration error of confidence", _number(scores.calibration_error)),
             ]
-        columns = ["photograph", "quality", "median", "9 in 10", "bias", "by scale", *self.answers]
-        return _table(["what", "measured"], rows) + "\n" + _table(columns, [self._cells(one) for one in self.read])
+        columns = ["photograph", "quality", "median", "90 %", "bias", "by scale", *self.answers]
+        return _table(["figure", "measured"], rows) + "\n" + _table(columns, [self._cells(read) for read in self.read])
 
-    def _cells(self, one: ReadPhotograph) -> list[str]:
-        measures, name = one.measures, one.photograph.name
+    def _cells(self, read: ReadPhotograph) -> list[str]:
+        measures, name = read.measures, read.photograph.name
         numbers = (measures.median_error, measures.error_90, measures.bias, measures.scale_ratio)
-        located = (describe_answers(some, name) for some in self.answers.values())
-        return [name, one.photograph.quality, *map(_number, numbers), *located]
+        located = (describe_answers(results, name) for results in self.answers.values())
+        return [name, read.photograph.quality, *map(_number, numbers), *located]
 
 
 def evaluate_photographs(
     data: Path, bundle: Path, out: Path, *, galleries: int, workers: int | None, command: str = ""
 ) -> PhotographResults:
-    """Measure a model on annotated photographs, and write everything to a folder; galleries that are there stay.
+    """Evaluate a model on annotated photographs and write the results to a folder; existing gallery runs resume.
 
     Args:
         data: folder of `AnnotatedPhotographs`.
-        galleries: of every photograph, and for either heading.
-        workers: processes that answer in galleries, as in `run_evaluation`.
-        command: how to run it again.
+        bundle: folder of the model.
+        out: folder of the results.
+        galleries: number of galleries of every photograph, for each heading.
+        workers: processes, as in `run_evaluation`.
+        command: command that repeats the evaluation.
 
     Raises:
         DatasetError: the photographs cannot be used.
-        BundleError: the model is gone, or predicts no wall profile.
+        BundleError: the model is missing, or predicts no wall profile.
         RunError: `out` holds other runs.
-        InvalidInputError: no photograph is good enough for figures.
+        InvalidInputError: all photographs are of quality "poor".
     """
     dataset = AnnotatedPhotographs(data)
-    if not any(one.counts for one in dataset.photographs):
-        raise InvalidInputError(f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'")
+    if not any(photograph.counts for photograph in dataset.photographs):
+        raise InvalidInputError(
+            f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'; "
+            "at least one must be 'fair' or 'good'"
+        )
     read = read_photographs(Encoders(Bundle.open(bundle), threads=1), dataset.photographs)
     answers = {}
     for heading, known in _HEADINGS.items():

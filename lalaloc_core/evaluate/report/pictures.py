@@ -1,4 +1,4 @@
-"""The pictures of one query: its panorama with layouts drawn over it, and its plan with maps of distances."""
+"""Pictures of one query: its panorama with layouts, and its plan with maps of distances."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from lalaloc_core.render.sweep import profiles_at
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
 TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = TRUE, FOUND, "#ffd60a"
 _JPEG_QUALITY = 82
-# Pixels of a map: its width, and what stands above and below the plan.
+# Pixels of a map: width, header, footer and margin.
 _MAP_WIDTH, _MAP_HEAD, _MAP_FOOT, _MAP_PAD = 640, 32, 84, 12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EncodedPicture:
-    """An encoded picture: `kind` is "jpeg" or "png", `name` what it is among a query's, `alt` says what it shows."""
+    """Encoded picture: its name among the query's pictures, its kind ("jpeg" or "png"), and its alternative text."""
 
     name: str
     content: bytes
@@ -38,18 +38,18 @@ class EncodedPicture:
 
     @property
     def file_name(self) -> str:
-        """What its file is called."""
+        """Name of its file."""
         return self.name + (".jpg" if self.kind == "jpeg" else ".png")
 
     @property
     def data_uri(self) -> str:
-        """The picture as an address of its own."""
+        """The picture as a data URI."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.content).decode()}"
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnMap:
-    """Distances of `cells.poses`, with the words that go with them."""
+    """Map of the distances of `cells.poses`, with title and scale."""
 
     title: str
     scale: str
@@ -60,9 +60,9 @@ class DrawnMap:
 def draw_panorama(
     image: UInt8[np.ndarray, "h w 3"], plan: FloorPlan, camera_height_m: float, truth: Pose, found: Pose | None
 ) -> EncodedPicture:
-    """A panorama with the wall-floor and wall-ceiling lines of the true pose's layout, and of the found one's."""
+    """Draw a panorama with the floor and ceiling lines of the true and the found layout."""
     height, width, _ = image.shape
-    # The truth is broader and lies below, so that both show where they agree.
+    # The true lines are wider and below, so that both are visible where they coincide.
     strokes = [
         Stroke(layout_lines(plan, pose, camera_height_m, height, width), colour, line_width, edge_width)
         for pose, colour, line_width, edge_width in ((truth, TRUE_COLOUR, 5.0, 7.0), (found, FOUND_COLOUR, 2.0, 3.0))
@@ -70,15 +70,15 @@ def draw_panorama(
     ]
     buffer = io.BytesIO()
     draw_strokes(image, strokes).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
-    what = "the true layout" if found is None else "the true and the found layout"
-    alt = f"Panorama with the outlines of {what} drawn over it"
+    shown = "the true layout" if found is None else "the true and the found layout"
+    alt = f"Panorama with the outlines of {shown} drawn over it"
     return EncodedPicture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
 
 
 def layout_lines(
     plan: FloorPlan, pose: Pose, camera_height_m: float, height: int, width: int
 ) -> list[Float[np.ndarray, "{width} 2"]]:
-    """Where the floor and the ceiling of a pose's room meet its walls, as pixels (x, y) of its panorama."""
+    """Return the floor and ceiling lines of a pose's room, as pixels (x, y) of its panorama."""
     position_m, heading = np.array([[pose.x_m, pose.y_m]]), np.array([heading_from_degrees(pose.heading_deg)])
     profile = profiles_at(plan, position_m, np.array([pose.room_index]), heading, width)[0]
     over_floor, under_ceiling = camera_height_m, float(plan.ceiling_heights_m[pose.room_index]) - camera_height_m
@@ -86,7 +86,7 @@ def layout_lines(
 
 
 def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) -> EncodedPicture:
-    """A plan with a map of distances, the true position (×) and the found pose (dot and heading)."""
+    """Draw a plan with a map of distances, the true position (×) and the found pose (dot and heading)."""
     extent = extent_m(plan)
     heat = distance_map(drawn.cells, drawn.distance, drawn.scale)
     marks = [draw_cross(truth.x_m, -truth.y_m, extent / 45.0)]
@@ -95,12 +95,12 @@ def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) 
     width, height = _MAP_WIDTH, _MAP_HEAD + round(_MAP_WIDTH / shape_of(plan)) + _MAP_FOOT
     box = (_MAP_PAD, _MAP_HEAD, width - 2 * _MAP_PAD, height - _MAP_HEAD - _MAP_FOOT)
     middle, foot = 0.5 * width, height - _MAP_FOOT + 16
-    said = "true ×" if found is None else "found ●   true ×"
+    legend = "true ×" if found is None else "found ●   true ×"
     parts = [
         words(middle, 22, drawn.title, 17, anchor="middle"),
         plan_part(plan, box, "".join(marks[::-1]), heat=heat_image(heat, plan)),
         colour_bar(heat, _MAP_PAD, foot, 0.6 * width),
-        words(width - _MAP_PAD, foot + 36, said, 15, anchor="end"),
+        words(width - _MAP_PAD, foot + 36, legend, 15, anchor="end"),
     ]
     content = rasterise(document(width, height, drawn.title, parts))
     alt = f"Floor plan coloured by {drawn.title}"

@@ -17,12 +17,15 @@ _MAX_LABEL = 48
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Run:
-    """One run of a report.
+    """Run of a report.
 
     Attributes:
-        number: its place in the report, from 1.
-        name: what tables and figures call it: its label, shortened, with its number where there are several runs.
-        scores: None where nothing was answered yet.
+        number: position in the report, from 1.
+        name: shortened label, with the number if there are several runs.
+        folder: folder of the run.
+        info: description of the run.
+        predictions: all predictions.
+        scores: None without predictions.
     """
 
     number: int
@@ -34,12 +37,12 @@ class Run:
 
     @property
     def stages(self) -> list[str]:
-        """Stages that any of its queries went through, in order."""
+        """Stages that any query passed, in order."""
         return list(self.scores.stages) if self.scores is not None else []
 
     @property
     def key(self) -> str:
-        """A name for files and anchors."""
+        """Name for files and anchors."""
         return f"run-{self.number}"
 
 
@@ -47,7 +50,7 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
     """Read and score runs.
 
     Raises:
-        RunError: no folder given, or one that holds no run.
+        RunError: there is no folder, or a folder holds no run.
     """
     if not folders:
         raise RunError("a report needs at least one run")
@@ -74,7 +77,7 @@ TOTAL = "total"
 
 @dataclass(frozen=True, kw_only=True)
 class StageTime:
-    """Milliseconds of one stage over the queries that went through it."""
+    """Duration of one stage over the queries that passed it."""
 
     count: int
     median_ms: float
@@ -82,7 +85,7 @@ class StageTime:
 
 
 def stage_times(predictions: Sequence[Prediction]) -> dict[str, StageTime]:
-    """Times by stage, and under `TOTAL` of whole queries; empty where nothing was timed."""
+    """Return times by stage, and of whole queries under `TOTAL`; empty without times."""
     timed = [prediction.timings_ms for prediction in predictions if prediction.timings_ms]
     names = list(dict.fromkeys(name for timings in timed for name in timings))
     times = {name: _summary([timings[name] for timings in timed if name in timings]) for name in names}

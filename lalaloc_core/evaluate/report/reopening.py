@@ -1,4 +1,4 @@
-"""Finding a run's queries and its model again, to draw them: what has changed since is refused."""
+"""Data set and model of a finished run, reopened to draw its queries; changed data is refused."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ _SAME_PLACE_M = 1e-3
 
 
 def open_model(info: RunInfo) -> Encoders:
-    """The run's own model.
+    """Return the model of a run.
 
     Raises:
-        BundleError: it is gone, or another one stands in its place.
-        InvalidInputError: the run had none.
+        BundleError: the model is missing or another one.
+        InvalidInputError: the run has no model.
     """
     bundle = require_bundle(info)
     if info.model is not None and info.model.get("sha256") not in (None, bundle.sha256):
-        raise BundleError(f"'{info.bundle}' holds another model now, with SHA-256 {bundle.sha256}")
+        raise BundleError(f"'{info.bundle}' holds another model than the run used: its SHA-256 is {bundle.sha256}")
     return Encoders(bundle)
 
 
 def find_camera(dataset: Dataset, prediction: Prediction) -> tuple[Scene, Camera]:
-    """The scene and the camera of a query.
+    """Return the scene and the camera of a query.
 
     Raises:
-        DatasetError: they are gone, or the camera stands elsewhere now.
+        DatasetError: the camera is missing or has another position.
     """
     scene = dataset.load(prediction.scene, [])
-    camera = next((one for one in scene.cameras if one.name == prediction.camera), None)
+    camera = next((item for item in scene.cameras if item.name == prediction.camera), None)
     if camera is None:
-        raise DatasetError(f"no camera '{prediction.camera}' any more", scene=scene.name)
+        raise DatasetError(f"camera '{prediction.camera}' is missing: the data set has changed", scene=scene.name)
     moved_m = float(np.hypot(*(camera.position_m - [prediction.truth.x_m, prediction.truth.y_m])))
     if moved_m > _SAME_PLACE_M or camera.room_index != prediction.truth.room_index:
         raise DatasetError(
-            f"camera '{camera.name}' stands {moved_m:.3f} m from where the run saw it: the data set has changed",
+            f"camera '{camera.name}' is {moved_m:.3f} m from its position in the run: the data set has changed",
             scene=scene.name,
         )
     return scene, camera
 
 
-def ask_again(info: RunInfo, scene: Scene, camera: Camera, appearance: Appearance) -> Question:
-    """The query as the run asked it.
+def repeat_question(info: RunInfo, scene: Scene, camera: Camera, appearance: Appearance) -> Question:
+    """Return the query of a camera in a run.
 
     Raises:
         DatasetError: there is no such photograph.

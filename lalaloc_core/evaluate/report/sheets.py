@@ -1,4 +1,4 @@
-"""Contact sheets: many small pictures on one page, each with a few words below it."""
+"""Contact sheets: small pictures with captions on one page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 COLUMNS, ROWS = 4, 5
 PER_SHEET = COLUMNS * ROWS
-# A panorama this large shows a door, and four side by side still fit on a screen.
+# Large enough to show a door, small enough for four side by side on a screen.
 PICTURE_HEIGHT, PICTURE_WIDTH = 192, 384
 _TEXT_LINES, _LINE = 4, 15
 _FONT_SIZE, _CHARACTERS = 12, 58
@@ -21,21 +21,22 @@ _PAPER, _INK = "white", "#20242c"
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A picture and the lines below it; what does not fit is cut."""
+    """Picture with the lines of its caption, cut to fit."""
 
     picture: Image.Image
     caption: Sequence[str]
 
 
 def draw_sheet(title: str, key: Mapping[str, str], thumbnails: Sequence[Thumbnail]) -> Image.Image:
-    """One page.
+    """Draw one page.
 
     Args:
-        key: what each colour of the pictures' lines means, by colour.
-        thumbnails: row by row, their pictures all of one size.
+        title: title of the page.
+        key: meaning of the lines' colours, by colour.
+        thumbnails: pictures of one size, row by row.
     """
     width, height = thumbnails[0].picture.size if thumbnails else (PICTURE_WIDTH, PICTURE_HEIGHT)
-    assert all(one.picture.size == (width, height) for one in thumbnails), "pictures of a sheet are all of one size"
+    assert all(item.picture.size == (width, height) for item in thumbnails), "pictures differ in size"
     cell_width, cell_height = width + _GAP, height + _TEXT_LINES * _LINE + _GAP
     characters = _CHARACTERS * width // PICTURE_WIDTH
     rows = -(-len(thumbnails) // COLUMNS)

@@ -1,4 +1,4 @@
-"""The tables of a report: figures as text."""
+"""Tables of a report: figures as text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOTHING = "–"
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure and, in small below it, its interval or share."""
+    """Figure, with its interval or share in small type below."""
 
     text: str
     below: str = ""
@@ -28,7 +28,7 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One line of a table; `strong` for the one that counts."""
+    """Row of a table; `strong` for the most important one."""
 
     run: str
     part: str
@@ -37,7 +37,7 @@ class Row:
 
 
 def metric_rows(runs: Sequence[Run]) -> list[Row]:
-    """Per run one row per stage, and one for the answer where it is not simply what the last stage gave."""
+    """Return one row per stage of each run, and one for the final pose where it differs from the last stage."""
     rows = []
     for run in runs:
         scores = run.scores
@@ -49,14 +49,14 @@ def metric_rows(runs: Sequence[Run]) -> list[Row]:
         if scores.final not in parts.values():
             parts["answer"] = scores.final
         for place, (stage, figures) in enumerate(parts.items()):
-            # What retrieval chose is a property of its own stage, the first.
+            # Recall belongs to the first stage, retrieval.
             cells = (Cell(str(scores.n)), *(recalls if place == 0 else none), *_metrics(figures))
             rows.append(Row(run=run.name, part=stage, cells=cells, strong=place == len(parts) - 1))
     return rows
 
 
 def curve_rows(runs: Sequence[Run]) -> list[Row]:
-    """Share of queries within each of `CURVE_POINTS_M`, per curve of the chart."""
+    """Return the share of queries within each of `CURVE_POINTS_M`, per curve of the chart."""
     rows = []
     for name, errors_m in curves([run for run in runs if run.predictions]).items():
         shares = [float(np.mean(errors_m <= limit_m)) for limit_m in CURVE_POINTS_M]
@@ -65,7 +65,7 @@ def curve_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def outcome_rows(runs: Sequence[Run]) -> list[Row]:
-    """How many queries had each outcome: by the first stage's pose where there are several, and by the answer."""
+    """Return the number of queries by outcome, for the first of several stages and for the final pose."""
     rows = []
     for run in runs:
         parts: list[tuple[str, str | None]] = [(run.stages[0], run.stages[0])] if len(run.stages) > 1 else []
@@ -77,7 +77,7 @@ def outcome_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def slice_rows(runs: Sequence[Run]) -> list[Row]:
-    """Per run with known facts one row per fact, the worst first, and all queries beside them."""
+    """Return one row per fact, the worst first, and one for all queries, for each run with facts."""
     rows = []
     for run in runs:
         if run.scores is None or not run.scores.slices:
@@ -97,21 +97,21 @@ def slice_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def reliability_rows(runs: Sequence[Run]) -> list[Row]:
-    """The bins of the reliability diagrams."""
+    """Return the bins of the reliability diagrams."""
     return [
         Row(
             run=run.name,
-            part=f"{100 * one.low:.0f}–{100 * one.high:.0f} %",
-            cells=(Cell(str(one.count)), Cell(percent(one.confidence)), Cell(percent(one.frequency))),
+            part=f"{100 * part.low:.0f}–{100 * part.high:.0f} %",
+            cells=(Cell(str(part.count)), Cell(percent(part.confidence)), Cell(percent(part.frequency))),
         )
         for run in runs
         if run.scores is not None
-        for one in run.scores.reliability
+        for part in run.scores.reliability
     ]
 
 
 def time_rows(runs: Sequence[Run]) -> list[Row]:
-    """Median and 95th percentile of each stage, and of whole queries."""
+    """Return median and 95th percentile of each stage and of whole queries."""
     return [
         Row(
             run=run.name,
@@ -125,17 +125,17 @@ def time_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def percent(share: float) -> str:
-    """A share in percent, not broken into two lines."""
+    """Format a share in percent, with a no-break space."""
     return f"{100.0 * share:.1f}\N{NO-BREAK SPACE}%"
 
 
 def number(value: float) -> str:
-    """Three digits that count, at most two of them after the point; ∞ where half of the queries have no answer."""
+    """Format a number with three digits, at most two of them after the point; ∞ for infinity."""
     return "< 0.01" if 0.0 < value < 0.005 else _rounded(value)
 
 
 def distance(distance_m: float) -> str:
-    """Metres, or centimetres below one."""
+    """Format a distance in metres, or in centimetres below 1 m."""
     return f"{number(distance_m)} m" if distance_m >= 1.0 else f"{number(100.0 * distance_m)} cm"
 
 

@@ -1,7 +1,7 @@
-"""The worst queries of a run: as contact sheets to look at, and as counts of what they have in common.
+"""The worst queries of a run: contact sheets, and statistics of their common features.
 
 FOLDER/worst-01.png ...   panoramas with the true, the found and the predicted layout, the worst first
-FOLDER/worst.json         what they have in common, and every one of them
+FOLDER/worst.json         common features, and every query
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lalaloc_core.evaluate.report.pictures import (
     TRUE_COLOUR,
     layout_lines,
 )
-from lalaloc_core.evaluate.report.reopening import ask_again, find_camera, open_model
+from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
 from lalaloc_core.evaluate.report.sheets import (
     PER_SHEET,
     PICTURE_HEIGHT,
@@ -47,8 +47,8 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.render.sweep import profiles_at
 
 SUMMARY_FILE = "worst.json"
 _KEY = {TRUE_COLOUR: "true layout", FOUND_COLOUR: "found layout", PREDICTED_COLOUR: "predicted walls' floor line"}
@@ -59,14 +59,18 @@ class WorstQuery:
     """One of the worst queries.
 
     Attributes:
-        error_m: None where there is no answer.
-        first_error_m: of the first stage's pose.
-        symmetric: the right room, taken for its mirror image; see `failures.is_symmetric`.
-        symmetric_by_chance: how probable that is for a wrong position anywhere in the room.
-        true_cost, found_cost: how badly the layouts of the true and of the found pose fit the predicted wall profile,
-            as in `localise.matching_cost`, or, for a layout query, the true one; None where the model predicts none. A true
-            pose that costs less was missed by the search; one that costs more is no longer to be found by any.
-        distance_bias: by how much walls are predicted too far (as a share; negative: too near), in the median azimuth.
+        scene, camera, room: names of the query's scene, camera and room.
+        found_room: name of the final pose's room; None without an answer.
+        outcome: kind of failure.
+        error_m: position error; None without an answer.
+        first_error_m: position error after the first stage.
+        confidence: predicted confidence, if any.
+        facts: known difficulties of the photograph.
+        symmetric: whether the pose fits the mirrored room; see `failures.is_symmetric`.
+        symmetric_by_chance: probability of that for a random wrong position in the room.
+        true_cost, found_cost: matching cost of the true and of the found pose; None if the model predicts no wall
+            profile. The search missed a true pose with a lower cost; no search finds one with a higher cost.
+        distance_bias: median relative error of the predicted distance of walls; negative for too near.
     """
 
     scene: str
@@ -86,39 +90,41 @@ class WorstQuery:
 
     @property
     def caption(self) -> list[str]:
-        """What stands below its picture."""
-        where = f"{self.scene}/{self.camera} {self.room}"
+        """Lines below its picture."""
+        place = f"{self.scene}/{self.camera} {self.room}"
         if self.outcome is Outcome.WRONG_ROOM:
-            where += f", found in {self.found_room}"
-        how = "no answer" if self.error_m is None else f"{distance(self.error_m)} off"
+            place += f", found in {self.found_room}"
+        result = "no answer" if self.error_m is None else f"{distance(self.error_m)} off"
         if self.symmetric:
-            how += ", mirrored"
+            result += ", mirrored"
         if self.confidence is not None:
-            how += f", confidence {percent(self.confidence)}"
+            result += f", confidence {percent(self.confidence)}"
         if self.true_cost is not None and self.found_cost is not None:
-            how += f", cost {self.found_cost:.2f} (true {self.true_cost:.2f})"
+            result += f", cost {self.found_cost:.2f} (true {self.true_cost:.2f})"
         if self.distance_bias is not None:
-            how += f", walls {100.0 * self.distance_bias:+.0f} %"
-        return [where, how, " ".join(self.facts)]
+            result += f", walls {100.0 * self.distance_bias:+.0f} %"
+        return [place, result, " ".join(self.facts)]
 
 
 def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
-    """Draw the worst queries of a run and say what they have in common.
+    """Draw the worst queries of a run and summarise their common features.
 
     Args:
-        count: how many; those without an answer come first, then by error.
+        run: folder of the run.
+        out: folder of the sheets and the summary.
+        count: number of queries; those without an answer come first, then by error.
 
     Returns:
-        what is written to `SUMMARY_FILE`, without the queries.
+        the content of `SUMMARY_FILE`, without the queries.
 
     Raises:
-        RunError: no run there, or one without answers.
-        DatasetError, BundleError: data set or model are gone, or not what they were.
+        RunError: the folder holds no run, or one without predictions.
+        DatasetError, BundleError: data set or model are missing or have changed.
     """
     folder = RunFolder(run)
     info, predictions = folder.read_info(), folder.read_predictions()
     if not predictions:
-        raise RunError(f"the run at '{run}' has no answers yet")
+        raise RunError(f"the run at '{run}' has no predictions; run `lalaloc evaluate` first")
     chosen = choose_worst(predictions, count)
     analyser = _QueryAnalyser(info)
     queries: list[WorstQuery] = []
@@ -146,7 +152,7 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
 
 
 def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
-    """The queries without an answer, then those that are farthest off, at most `count`."""
+    """Return up to `count` queries: first those without an answer, then by decreasing error."""
     errors_m = position_errors_m(predictions)
     order = np.argsort(-np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")
     return [predictions[index] for index in order[:count]]
@@ -155,22 +161,24 @@ def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Predicti
 def summarise(
     predictions: Sequence[Prediction], chosen: Sequence[Prediction], examined: Sequence[WorstQuery]
 ) -> dict[str, Any]:
-    """What the worst queries have in common, as plain data.
+    """Return the common features of the worst queries as plain data.
 
     Args:
-        predictions: all of the run.
+        predictions: all predictions of the run.
         chosen: the worst of them.
-        examined: those of `chosen` that could be looked at again.
+        examined: the queries of `chosen` whose data could be opened.
     """
     errors_m = position_errors_m(chosen)
     answered = errors_m[~np.isnan(errors_m)]
-    misaligned = [one for one in examined if one.outcome is Outcome.WRONG_ALIGNMENT]
+    misaligned = [query for query in examined if query.outcome is Outcome.WRONG_ALIGNMENT]
     costs = [
-        (one.true_cost, one.found_cost) for one in examined if one.true_cost is not None and one.found_cost is not None
+        (query.true_cost, query.found_cost)
+        for query in examined
+        if query.true_cost is not None and query.found_cost is not None
     ]
-    biases = [one.distance_bias for one in examined if one.distance_bias is not None]
+    biases = [query.distance_bias for query in examined if query.distance_bias is not None]
     kinds = outcomes(chosen)
-    first = next((name for one in predictions for name in one.stages), None)
+    first = next((name for prediction in predictions for name in prediction.stages), None)
     started_m = position_errors_m(chosen, first) if first is not None else np.full(len(chosen), np.nan)
     return {
         "queries": len(predictions),
@@ -178,8 +186,8 @@ def summarise(
         "error_m": {"least": float(answered.min()), "most": float(answered.max())} if len(answered) else None,
         "outcomes": {kind.value: kinds.count(kind) for kind in Outcome},
         "mirrored": {
-            "among_wrong_alignment": sum(one.symmetric for one in misaligned),
-            "expected_by_chance": sum(one.symmetric_by_chance for one in misaligned),
+            "among_wrong_alignment": sum(query.symmetric for query in misaligned),
+            "expected_by_chance": sum(query.symmetric_by_chance for query in misaligned),
         },
         "lost_after_first_stage": int(((started_m < 1.0) & ~(errors_m < 1.0)).sum()),
         "true_pose_fits": {
@@ -193,28 +201,28 @@ def summarise(
 
 
 def predicted_profile_m(query: Query, columns: int) -> Float[np.ndarray, "{columns}"]:
-    """The predicted wall profile (m) as seen by the photograph, which the query has turned by its first roll."""
+    """Return the predicted wall profile (m) in the frame of the photograph, without the query's first roll."""
     assert query.profile is not None
     known = column_azimuths(query.profile.log_m.shape[1])
     return np.exp(np.interp(column_azimuths(columns) + query.roll[0], known, query.profile.log_m[0], period=TWO_PI))
 
 
 def _lifts(predictions: Sequence[Prediction], chosen: Sequence[Prediction]) -> dict[str, dict[str, float]]:
-    """By fact: its share among the worst and among all, and how many times larger the first is, largest first."""
+    """Return, by fact, its share among the worst and among all queries, and their ratio, largest first."""
     lifts = {}
-    for fact in sorted({fact for one in predictions for fact in one.facts}):
-        worst, every = (sum(fact in one.facts for one in some) / len(some) for some in (chosen, predictions))
-        lifts[fact] = {"worst": worst, "all": every, "lift": worst / every}
+    for fact in sorted({fact for prediction in predictions for fact in prediction.facts}):
+        worst, total = (sum(fact in query.facts for query in part) / len(part) for part in (chosen, predictions))
+        lifts[fact] = {"worst": worst, "all": total, "lift": worst / total}
     return dict(sorted(lifts.items(), key=lambda item: -item[1]["lift"]))
 
 
 def _mean_confidence(predictions: Sequence[Prediction]) -> float | None:
-    known = [one.confidence for one in predictions if one.confidence is not None]
+    known = [prediction.confidence for prediction in predictions if prediction.confidence is not None]
     return float(np.mean(known)) if known else None
 
 
 class _QueryAnalyser:
-    """Data set and model of a run, opened to look at its queries again."""
+    """Data set and model of a run, reopened to analyse its queries."""
 
     def __init__(self, info: RunInfo) -> None:
         self._info = info
@@ -224,10 +232,10 @@ class _QueryAnalyser:
         self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
 
     def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
-        """What became of a query, and its picture.
+        """Return the analysis of a query, and its picture.
 
         Raises:
-            DatasetError: it is gone, or has changed.
+            DatasetError: the query is missing or has changed.
         """
         scene, camera = find_camera(self._dataset, prediction)
         image = scene.photograph(camera, self._appearance).image(PICTURE_HEIGHT, PICTURE_WIDTH)
@@ -264,7 +272,7 @@ class _QueryAnalyser:
         return worst, draw_strokes(image, strokes)
 
     def _encode(self, encoders: Encoders, scene: Scene, camera: Camera) -> Query:
-        question = ask_again(self._info, scene, camera, self._appearance)
+        question = repeat_question(self._info, scene, camera, self._appearance)
         return encode(encoders, question, read_image(encoders, question))
 
 
@@ -274,7 +282,7 @@ def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width
 
 
 def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> float:
-    """How badly the layout of a pose fits what is predicted."""
+    """Return the matching cost of a pose."""
     assert query.profile is not None
     config = MatchingConfig()
     poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
@@ -285,14 +293,14 @@ def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> f
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
-    """By how much walls are predicted too far, as a share, in the median azimuth."""
+    """Return the median over azimuths of the relative error of the predicted distance."""
     assert query.profile is not None
     log_m = query.profile.log_m[0]
     return float(np.expm1(np.median(log_m - _log_profile(query, scene, truth, len(log_m))[0])))
 
 
 def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
-    """Log wall profile (m) of a pose, turned as the query's first hypothesis is."""
+    """Return the log wall profile (m) of a pose, in the frame of the query's first hypothesis."""
     heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
     position_m, room = np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index])
     return np.log(profiles_at(scene.plan, position_m, room, heading, columns))

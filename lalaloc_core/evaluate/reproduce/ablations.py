@@ -1,7 +1,7 @@
-"""The trained variants that the paper compares (section 6.2), each for a budget, and training one on a data set.
+"""Trained variants that the paper compares (section 6.2), by budget, and their training on a data set.
 
-"full" is the paper's schedule. "small" fits a CPU: narrower ResNets, smaller inputs, fewer neighbours and a schedule
-that learns fast from scratch, the same for every row of a table.
+"full" is the paper's schedule. "small" fits a CPU: narrower ResNets, smaller inputs, fewer neighbours and a shorter
+schedule, the same for every row of a table.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _VALIDATION_SCENES = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """A trained variant.
+    """Trained variant.
 
     Attributes:
-        config: by budget.
-        stages: what is trained for it.
-        layout_from: the variant whose layout encoder it uses; None: its own, or that of end-to-end training.
+        config: configuration by budget.
+        stages: trained stages.
+        layout_from: variant whose layout encoder it uses; None for its own.
     """
 
     config: dict[Budget, TrainConfig]
@@ -72,13 +72,13 @@ _SMALL = TrainConfig(
 )
 _BASES: dict[Budget, TrainConfig] = {
     "small": _SMALL,
-    # Queries of the paper come at a known heading, so nothing is turned.
+    # The paper's queries have a known heading, so panoramas are not turned.
     "full": dataclasses.replace(PRESETS["paper"], turns="none"),
 }
 
 
 def _varied(name: str, **parts: dict[str, Any]) -> dict[Budget, TrainConfig]:
-    """The base of every budget with some settings of its parts replaced."""
+    """Return the base of every budget with some settings of its parts replaced."""
 
     def varied(base: TrainConfig) -> TrainConfig:
         changed = {part: dataclasses.replace(getattr(base, part), **changes) for part, changes in parts.items()}
@@ -88,7 +88,7 @@ def _varied(name: str, **parts: dict[str, Any]) -> dict[Budget, TrainConfig]:
 
 
 def _following_layout(name: str, **weights: float) -> dict[Budget, TrainConfig]:
-    """Variants with neighbours train by the routine of the layout branch (section A.1.3); small ones by their own."""
+    """Return variants with neighbours: trained as the layout branch (section A.1.3), or with the small routine."""
     configs = _varied(name, image=weights)
     full = configs["full"]
     routine = dataclasses.replace(
@@ -134,27 +134,27 @@ def train_ablation(
 ) -> Bundle:
     """Train a variant on a data set and export it to `out/<name>/bundle`.
 
-    What is finished is not done again, and what was interrupted goes on. Variants of the image branch use the layout
-    encoder of another variant, whose stage 1 is trained first where that has not been done.
+    Finished stages are skipped and interrupted ones resume. Variants of the image branch use the layout encoder of
+    another variant, whose stage 1 is trained first if needed.
 
     Args:
         name: a key of `ABLATIONS`.
-        budget: how much to spend.
-        dataset: its training scenes are learnt from, its validation scenes only looked at.
+        budget: size of networks and schedule.
+        dataset: training scenes to learn from, validation scenes to monitor.
         out: folder of all variants of one data set and budget.
-        device: where to train.
-        workers: processes that make batches; 0 makes them in this process.
+        device: device of the training.
+        workers: processes that make batches; 0 for this process.
         resume: False trains this variant's own stages anew.
-        skip_bad: pass over files that cannot be used, naming each once.
+        skip_bad: skip unusable files, naming each once.
 
     Raises:
-        ConfigError: no such variant.
+        ConfigError: there is no such variant.
         CheckpointError: `out` holds variants of another budget, configuration or data set.
         DatasetError: a file of the data set cannot be used.
     """
     ablation = ABLATIONS.get(name)
     if ablation is None:
-        raise ConfigError(f"no variant '{name}', there are {', '.join(ABLATIONS)}")
+        raise ConfigError(f"there is no variant '{name}'; choose one of: {', '.join(ABLATIONS)}")
     config, folder = ablation.config[budget], out / name
     data = TrainingData(dataset=dataset, skip_bad=skip_bad, validation_scenes=_VALIDATION_SCENES)
     common: dict[str, Any] = {"data": data, "device": device, "workers": workers}
@@ -162,16 +162,16 @@ def train_ablation(
     if ablation.layout_from is not None:
         teacher = out / ablation.layout_from
         _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, True, train_layout, common)
-    worked = False
+    trained = False
     for stage in ablation.stages:
         if stage == "layout":
-            worked |= _finish(stage, config, folder, resume, train_layout, common)
+            trained |= _finish(stage, config, folder, resume, train_layout, common)
         elif stage == "image":
-            worked |= _finish(stage, config, folder, resume, train_image, {**common, "teacher": teacher})
+            trained |= _finish(stage, config, folder, resume, train_image, {**common, "teacher": teacher})
         else:
-            worked |= _finish(stage, config, folder, resume, train_end_to_end, common)
+            trained |= _finish(stage, config, folder, resume, train_end_to_end, common)
     bundle = folder / _BUNDLE
-    if not worked and (bundle / MANIFEST_NAME).exists():
+    if not trained and (bundle / MANIFEST_NAME).exists():
         return Bundle.open(bundle)
     return export_run(
         folder,
@@ -181,7 +181,7 @@ def train_ablation(
         notes={"budget": budget},
         layout_from=teacher,
         layout_only=ablation.stages == ("layout",),
-        # Variants are compared after the same training, not each at its best.
+        # Variants are compared after equal training, not at their best checkpoints.
         last=True,
     )
 
@@ -194,16 +194,16 @@ def _finish(
     train: Callable[..., Checkpoint],
     arguments: dict[str, Any],
 ) -> bool:
-    """Train a stage to its end; False when there was nothing left to do."""
+    """Train a stage to its end; return False if it already was."""
     path = folder / f"{stage}.pt"
-    begun = resume and path.exists()
-    if begun:
+    exists = resume and path.exists()
+    if exists:
         checkpoint = Checkpoint.load(path, stage=stage)
         steps = config.layout.steps if stage == "layout" else config.image.steps
         source = arguments["data"].source(config)
         if checkpoint.config == config and checkpoint.data == source.data and checkpoint.step >= steps:
             return False
-    # What was exported before is no longer what lies here.
+    # The earlier export is out of date.
     (folder / _BUNDLE / MANIFEST_NAME).unlink(missing_ok=True)
-    train(config, folder, resume=begun, **arguments)
+    train(config, folder, resume=exists, **arguments)
     return True

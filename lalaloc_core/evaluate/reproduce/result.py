@@ -21,7 +21,7 @@ Budget = Literal["small", "full"]
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A measured figure, with its 95 % bootstrap interval where it has one; None: infinite (too many misses)."""
+    """Measured figure with its 95 % bootstrap interval, if any; None for infinity, after too many misses."""
 
     value: float | None
     low: float | None = None
@@ -30,7 +30,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class RowResult:
-    """One row: n queries, our figures and the paper's by column, and the model that answered."""
+    """Row with n queries, our figures and the paper's by column, and the model."""
 
     group: str
     name: str
@@ -43,7 +43,7 @@ class RowResult:
 
 @dataclass(frozen=True, kw_only=True)
 class TableResult:
-    """One table; `dataset` names what our figures were measured on, the paper's are of Structured3D."""
+    """Table; our figures are measured on `dataset`, the paper's on Structured3D."""
 
     name: str
     title: str
@@ -56,27 +56,27 @@ class TableResult:
     rows: tuple[RowResult, ...]
 
     def to_json(self) -> str:
-        """As indented JSON text."""
+        """Return the table as indented JSON."""
         return json.dumps(without_infinity(dataclasses.asdict(self)), indent=1, allow_nan=False) + "\n"
 
     @classmethod
     def read(cls, path: Path) -> TableResult:
-        """A table from its file.
+        """Read a table from its file.
 
         Raises:
-            RunError: missing, or not a table.
+            RunError: the file is missing or not a table.
         """
         try:
             return build_config(cls, json.loads(path.read_text(encoding="utf-8")), path=path.name)
         except (OSError, ValueError, ConfigError) as error:
-            raise RunError(f"'{path}' is no table of results: {error}") from error
+            raise RunError(f"'{path}' is not a table of results: {error}") from error
 
 
 _PAPER_DATA = "Structured3D"
 
 
 def markdown(table: TableResult) -> str:
-    """A table as Markdown: in each cell our figure, then in italics the paper's."""
+    """Return a table as Markdown, with our figure and, in italics, the paper's in each cell."""
     same = table.dataset == _PAPER_DATA and table.budget == "full"
     lines = [
         f"**{table.title}** (`{table.source}`, `lalaloc reproduce --table {table.name}`). Upright: ours, on "
@@ -113,25 +113,25 @@ def _number(column: str, value: float | None) -> str:
         return f"{100.0 * value:.1f} %"
     if column.startswith("seconds"):
         return f"{value:.2g}" if value < 10.0 else f"{value:.1f}"
-    # Layout queries end well below a millimetre.
+    # Errors of layout queries are below a millimetre.
     return f"{value:.1f}" if value >= 1.0 else f"{value:.2f}" if value >= 0.01 else "< 0.01"
 
 
 def _bound(column: str, value: float | None) -> str:
-    """An end of an interval, as exact as it deserves."""
+    """Format an end of an interval."""
     if value is not None and column in SHARES:
         return f"{100.0 * value:.0f}"
     return _number(column, value)
 
 
 def _median_cm(row: RowResult) -> float:
-    """Median error; infinite, and then not drawn, where half of the queries have no answer."""
+    """Return the median error; infinite, and not drawn, if half of the queries have no answer."""
     value = row.figures["median_cm"].value
     return math.inf if value is None else value
 
 
 def draw_vogel_samples(table: TableResult, path: Path) -> None:
-    """The paper's figure of Vogel disc samples: median error by number of samples, with and without LPO."""
+    """Draw the paper's figure of Vogel disc samples: median error by number of samples, with and without LPO."""
     figure = matplotlib.figure.Figure(figsize=(6.0, 3.6), layout="constrained")
     axes = figure.add_subplot()
     for name, style in (("VDR", "o-"), ("VDR + LPO", "s-")):

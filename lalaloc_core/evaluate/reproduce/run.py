@@ -1,11 +1,10 @@
-"""Running a table: train what it needs, ask what its rows ask, and put our figures beside the paper's.
+"""Tables of the paper, made again: train the models, evaluate the rows, set our figures beside the paper's.
 
-Everything is kept in one folder and used again: models by name, runs by what they asked. A run that was interrupted
-goes on.
+Models and runs are stored in one folder and reused. An interrupted run resumes.
 
-    OUT/models/NAME/        trained variants (`training.ablations`), each with its bundle
-    OUT/runs/NAME/          evaluation runs (`evaluation.predictions`), shared by the tables
-    OUT/tables/NAME.json    figures with intervals, n, data set, command (`TableResult`); NAME.md shows them
+    OUT/models/NAME/        trained variants (`ablations.py`), each with its bundle
+    OUT/runs/NAME/          evaluation runs (`evaluate/runs/predictions.py`), shared by the tables
+    OUT/tables/NAME.json    figures with intervals, n, data set, command (`TableResult`); NAME.md as Markdown
 """
 
 from __future__ import annotations
@@ -29,22 +28,24 @@ from lalaloc_core.evaluate.runs.score import Estimate, Scores, score
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 
-# Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
+# Queries per row: enough to compare methods at a small budget, and few for times, which run one query at a time.
 _SMALL_LIMIT = 75
 _TIMED_LIMIT = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableMaker:
-    """Where tables are made.
+    """Maker of tables.
 
     Attributes:
         data: folder of the data set.
         out: folder of models, runs and tables.
+        budget: size of networks and schedule of the trained variants.
         shipped: bundle of the rows `ring`.
-        limit: queries per row; None for the budget's own.
-        workers: processes; None takes one per core.
-        command: recorded in the tables.
+        limit: queries per row; None for the budget's default.
+        workers: processes; None for one per core.
+        skip_bad: whether unusable scenes and cameras are skipped.
+        command: command recorded in the tables.
     """
 
     data: Path
@@ -57,11 +58,11 @@ class TableMaker:
     command: str = ""
 
     def make(self, table: Table) -> TableResult:
-        """Make one table and write it down."""
+        """Make one table and write its files."""
         bundles = {name: self._train(name) for name in table.models} | {SHIPPED: self.shipped}
         rows = []
         for row in table.rows:
-            info, predictions = self._ask(table, row.ask, bundles)
+            info, predictions = self._evaluate(table, row.query, bundles)
             rows.append(_row_result(row, table, info, predictions))
         result = TableResult(
             name=table.name,
@@ -92,45 +93,45 @@ class TableMaker:
             workers=1 if self.workers is None else self.workers,
         ).folder
 
-    def _ask(self, table: Table, ask: RowQuery, bundles: Mapping[str, Path]) -> tuple[RunInfo, list[Prediction]]:
-        """The run of a row; tables that ask the same share it, except that times are taken one query at a time."""
+    def _evaluate(self, table: Table, query: RowQuery, bundles: Mapping[str, Path]) -> tuple[RunInfo, list[Prediction]]:
+        """Return the run of a row, shared by tables with equal queries; timed tables run one query at a time."""
         timed = table.form == "times"
-        bundle = None if ask.model is None else bundles[ask.model]
+        bundle = None if query.model is None else bundles[query.model]
         dataset = open_dataset(self.data)
-        appearance = choose_appearance(dataset, ask.furniture, None) if ask.kind == "panorama" else None
+        appearance = choose_appearance(dataset, query.furniture, None) if query.kind == "panorama" else None
         limit = self.limit or (_SMALL_LIMIT if self.budget == "small" else None)
         info = RunInfo(
-            label=" ".join(filter(None, (ask.method, ask.model, ask.kind, ask.furniture))),
-            method=ask.method,
-            kind=ask.kind,
+            label=" ".join(filter(None, (query.method, query.model, query.kind, query.furniture))),
+            method=query.method,
+            kind=query.kind,
             dataset=dataset.description,
             split=table.split,
-            settings=ask.run_settings,
+            settings=query.run_settings,
             data=str(self.data),
             furniture=appearance and appearance.furniture,
             lighting=appearance and appearance.lighting,
-            grid_step_m=ask.grid_step_m,
+            grid_step_m=query.grid_step_m,
             limit=min(limit or _TIMED_LIMIT, _TIMED_LIMIT) if timed else limit,
             bundle=None if bundle is None else str(bundle),
             model=None if bundle is None else describe_model(bundle),
             skip_bad=self.skip_bad,
             command=self.command,
         )
-        folder = RunFolder(self.out / "runs" / _folder_name(ask, info, timed))
+        folder = RunFolder(self.out / "runs" / _folder_name(query, info, timed))
         predictions = run_evaluation(folder, info, workers=0 if timed else self.workers)
-        # As the run left it: with what it skipped.
+        # Read again, because the run records skipped scenes.
         return folder.read_info(), predictions
 
 
-def _folder_name(ask: RowQuery, info: RunInfo, timed: bool) -> str:
-    """Readable, and different for everything that asks something else."""
-    asked = {
+def _folder_name(query: RowQuery, info: RunInfo, timed: bool) -> str:
+    """Return a readable name that is unique to the description of the run."""
+    description = {
         key: value
         for key, value in dataclasses.asdict(info).items()
         if key not in ("label", "command", "limit", "skipped", "bundle", "data")
     }
-    digest = hashlib.sha256(json.dumps([asked, timed], sort_keys=True).encode()).hexdigest()[:8]
-    return "-".join(filter(None, (ask.method, ask.model, ask.kind, info.split, digest)))
+    digest = hashlib.sha256(json.dumps([description, timed], sort_keys=True).encode()).hexdigest()[:8]
+    return "-".join(filter(None, (query.method, query.model, query.kind, info.split, digest)))
 
 
 def _row_result(row: Row, table: Table, info: RunInfo, predictions: list[Prediction]) -> RowResult:

@@ -1,4 +1,4 @@
-"""What a table of the paper consists of: rows that ask something of a method, and the paper's own figures."""
+"""Structure of the paper's tables: rows with the query of a method and the paper's figures."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.predictions import MethodName
 from lalaloc_core.learn.data.dataset import Split
 
-# What the columns of tables are called: fields of `evaluation.score.Scores` and of its `StageScores`, or seconds per
-# query of a stage ("seconds:vdr"), of all together ("seconds").
+# Columns: fields of `evaluate.runs.score.Scores` and its `StageScores`, or seconds per query of a stage
+# ("seconds:vdr") or of all stages ("seconds").
 Column = str
 
 COLUMN_TITLES: Mapping[Column, str] = {
@@ -30,12 +30,12 @@ COLUMN_TITLES: Mapping[Column, str] = {
 }
 SHARES = frozenset({"layout_recall", "pose_recall", "correct_room", *(c for c in COLUMN_TITLES if c[:6] == "within")})
 
-# A trained model by name: the bundle that ships, or one of the variants in `reproduce.ablations`.
+# Name of the bundle that ships; other models are the variants in `reproduce.ablations`.
 SHIPPED = "ring"
 
 
-# The paper's plans show bare walls, its cameras' heights and headings are exact. Structured3D's annotation has openings
-# and types of rooms as well, which our search would weigh.
+# The paper's plans have walls only and exact camera heights and headings. Structured3D's annotation also has openings
+# and room types, which our search would use.
 PAPER_SETTING: Mapping[str, Any] = {
     "openings": False,
     "see_through": False,
@@ -48,11 +48,15 @@ PAPER_SETTING: Mapping[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RowQuery:
-    """What a row asks.
+    """Query of a row.
 
     Attributes:
+        method: name of the method.
+        kind: kind of the queries.
         model: `SHIPPED` or the name of a trained variant; None for methods without a model.
-        furniture: of the photographs; None for the data set's usual.
+        settings: settings of the method.
+        grid_step_m: step of the pose grid.
+        furniture: furniture of the photographs; None for the data set's default.
     """
 
     method: MethodName = "lalaloc"
@@ -64,35 +68,41 @@ class RowQuery:
 
     @property
     def run_settings(self) -> dict[str, Any]:
-        """Settings of the run: the paper's setting, and what the row says of its own."""
+        """Settings of the run: the paper's, overridden by the row's."""
         return {**(PAPER_SETTING if self.method == "lalaloc" else {}), **self.settings}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row.
+    """Row of a table.
 
     Attributes:
-        group: what the row belongs to, such as the type of query.
-        stage: the stage whose poses are scored; None for the answer.
-        paper: the paper's figures by column, shares from 0 to 1; empty for what the paper does not have.
+        group: group of rows, such as the kind of query.
+        name: name of the row.
+        query: query of the row.
+        stage: stage whose poses are scored; None for the final pose.
+        paper: the paper's figures by column, shares from 0 to 1; empty for rows of our own.
     """
 
     group: str
     name: str
-    ask: RowQuery
+    query: RowQuery
     stage: str | None = None
     paper: Mapping[Column, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """One table of the paper.
+    """Table of the paper.
 
     Attributes:
-        name: what `lalaloc reproduce --table` calls it.
+        name: name for `lalaloc reproduce --table`.
+        title: title of the table.
         source: label of the paper's table or figure.
-        form: a "figure" is drawn as well; of "times", queries are asked one at a time.
+        split: split of the queries.
+        columns: columns of the table.
+        rows: rows of the table.
+        form: a "figure" is also drawn; "times" runs one query at a time.
     """
 
     name: str
@@ -105,6 +115,6 @@ class Table:
 
     @property
     def models(self) -> tuple[str, ...]:
-        """Trained variants that the rows need, besides the bundle that ships."""
-        names = [row.ask.model for row in self.rows if row.ask.model not in (None, SHIPPED)]
+        """Names of the trained variants that the rows need."""
+        names = [row.query.model for row in self.rows if row.query.model not in (None, SHIPPED)]
         return tuple(dict.fromkeys(name for name in names if name is not None))

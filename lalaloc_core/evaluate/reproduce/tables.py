@@ -1,6 +1,6 @@
-"""The tables of the paper and their figures, all measured by its authors on Structured3D.
+"""Tables of the paper with its figures, which its authors measured on Structured3D.
 
-Shares are written as fractions. Rows of our own ("ours") have no figure there.
+Shares are fractions. Rows of our own have no figure.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def _paper(columns: Sequence[Column], *figures: float | None) -> dict[Column, fl
     return {column: figure for column, figure in zip(columns, figures, strict=True) if figure is not None}
 
 
-def _lalaloc(model: str, kind: QueryKind = "panorama", **asked: Any) -> RowQuery:
-    return RowQuery(method="lalaloc", model=model, kind=kind, **asked)
+def _lalaloc(model: str, kind: QueryKind = "panorama", **query: Any) -> RowQuery:
+    return RowQuery(method="lalaloc", model=model, kind=kind, **query)
 
 
 def _localisation() -> Table:
@@ -33,48 +33,48 @@ def _localisation() -> Table:
         Row(
             group="",
             name="Oracle (nearest layout by Chamfer)",
-            ask=RowQuery(method="oracle", kind="layout"),
+            query=RowQuery(method="oracle", kind="layout"),
             paper=_paper(columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
         ),
         Row(
             group=_LAYOUT,
             name="2D ICP",
-            ask=RowQuery(method="icp", kind="layout"),
+            query=RowQuery(method="icp", kind="layout"),
             paper=_paper(columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
         ),
         Row(
             group=_LAYOUT,
             name="Explicit layout + localisation",
-            ask=RowQuery(method="explicit", kind="layout", model=SHIPPED),
+            query=RowQuery(method="explicit", kind="layout", model=SHIPPED),
         ),
-        Row(group=_LAYOUT, name="VDR + decode, `ring`", ask=RowQuery(method="decode", kind="layout", model=SHIPPED)),
+        Row(group=_LAYOUT, name="VDR + decode, `ring`", query=RowQuery(method="decode", kind="layout", model=SHIPPED)),
         Row(
             group=_LAYOUT,
             name="LaLaLoc `paper`",
-            ask=_lalaloc("paper", "layout"),
+            query=_lalaloc("paper", "layout"),
             paper=_paper(columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
         ),
-        Row(group=_LAYOUT, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, "layout")),
+        Row(group=_LAYOUT, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, "layout")),
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
-            ask=RowQuery(method="icp"),
+            query=RowQuery(method="icp"),
             paper=_paper(columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
         ),
         Row(
             group=_PANORAMA,
             name="Explicit layout + localisation (paper: HorizonNet)",
-            ask=RowQuery(method="explicit", model=SHIPPED),
+            query=RowQuery(method="explicit", model=SHIPPED),
             paper=_paper(columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
         ),
-        Row(group=_PANORAMA, name="VDR + decode, `ring`", ask=RowQuery(method="decode", model=SHIPPED)),
+        Row(group=_PANORAMA, name="VDR + decode, `ring`", query=RowQuery(method="decode", model=SHIPPED)),
         Row(
             group=_PANORAMA,
             name="LaLaLoc `paper`",
-            ask=_lalaloc("paper"),
+            query=_lalaloc("paper"),
             paper=_paper(columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
         ),
-        Row(group=_PANORAMA, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED)),
+        Row(group=_PANORAMA, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED)),
     ]
     return Table(
         name="localisation",
@@ -93,35 +93,35 @@ def _coarse_grid() -> Table:
         Row(
             group="",
             name="Retrieval oracle",
-            ask=RowQuery(method="oracle", kind="layout", **coarse),
+            query=RowQuery(method="oracle", kind="layout", **coarse),
             paper=_paper(columns, 42.7, 0.0, 0.029, 0.757),
         ),
         Row(
             group=_LAYOUT,
             name="2D ICP",
-            ask=RowQuery(method="icp", kind="layout", **coarse),
+            query=RowQuery(method="icp", kind="layout", **coarse),
             paper=_paper(columns, 0.7, 0.769, 0.994, 0.996),
         ),
         Row(
             group=_LAYOUT,
             name="LaLaLoc `paper`",
-            ask=_lalaloc("paper", "layout", **coarse),
+            query=_lalaloc("paper", "layout", **coarse),
             paper=_paper(columns, 0.5, 0.561, 0.705, 0.843),
         ),
-        Row(group=_LAYOUT, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, "layout", **coarse)),
+        Row(group=_LAYOUT, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, "layout", **coarse)),
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
-            ask=RowQuery(method="icp", **coarse),
+            query=RowQuery(method="icp", **coarse),
             paper=_paper(columns, 21.7, 0.073, 0.347, 0.694),
         ),
         Row(
             group=_PANORAMA,
             name="LaLaLoc `paper`",
-            ask=_lalaloc("paper", **coarse),
+            query=_lalaloc("paper", **coarse),
             paper=_paper(columns, 11.5, 0.026, 0.461, 0.795),
         ),
-        Row(group=_PANORAMA, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, **coarse)),
+        Row(group=_PANORAMA, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, **coarse)),
     ]
     return Table(
         name="coarse-grid",
@@ -146,16 +146,16 @@ def _furniture() -> Table:
             Row(
                 group=group,
                 name="2D ICP on furnished depth",
-                ask=RowQuery(method="icp", furniture=level),
+                query=RowQuery(method="icp", furniture=level),
                 paper={"median_cm": icp},
             ),
             Row(
                 group=group,
                 name="LaLaLoc `paper`",
-                ask=_lalaloc("paper", furniture=level),
+                query=_lalaloc("paper", furniture=level),
                 paper=_paper(_RETRIEVAL, *lalaloc),
             ),
-            Row(group=group, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, furniture=level)),
+            Row(group=group, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, furniture=level)),
         ]
     return Table(
         name="furniture",
@@ -180,7 +180,7 @@ def _refinement() -> Table:
         Row(
             group=f"`{model}`",
             name=name,
-            ask=RowQuery(method=method, model=model, settings=settings),
+            query=RowQuery(method=method, model=model, settings=settings),
             stage=stage,
             paper=_paper(columns, *paper) if model == "paper" else {},
         )
@@ -199,13 +199,13 @@ def _refinement() -> Table:
 
 def _vogel_samples() -> Table:
     columns = ("median_cm", "within_10cm")
-    rows = [Row(group="without VDR", name="Retrieval", ask=_lalaloc(SHIPPED), stage="retrieval")]
-    rows += [Row(group="without VDR", name="LPO", ask=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}))]
+    rows = [Row(group="without VDR", name="Retrieval", query=_lalaloc(SHIPPED), stage="retrieval")]
+    rows += [Row(group="without VDR", name="LPO", query=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}))]
     for samples in (10, 25, 50, 100, 200):
         settings = {} if samples == 200 else {"vdr_samples": samples}
         for name, stage in (("VDR", "vdr"), ("VDR + LPO", None)):
-            ask = _lalaloc(SHIPPED, settings=settings)
-            rows.append(Row(group=f"{samples} samples", name=name, ask=ask, stage=stage))
+            query = _lalaloc(SHIPPED, settings=settings)
+            rows.append(Row(group=f"{samples} samples", name=name, query=query, stage=stage))
     return Table(
         name="vogel-samples",
         title="Samples of the Vogel disc, with and without LPO",
@@ -225,7 +225,7 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
         Row(
             group="",
             name="Pose (nearest grid pose)",
-            ask=RowQuery(method="pose-oracle", **common),
+            query=RowQuery(method="pose-oracle", **common),
             paper=_paper(columns, *figures["pose"]),
         )
     ]
@@ -233,7 +233,7 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
         Row(
             group="",
             name=title,
-            ask=RowQuery(method="similarity", settings={"metric": metric}, **common),
+            query=RowQuery(method="similarity", settings={"metric": metric}, **common),
             paper=_paper(columns, *figures[metric]),
         )
         for metric, title in titles.items()
@@ -252,15 +252,15 @@ def _oracle(paper: tuple[float, float, float]) -> Row:
     return Row(
         group="",
         name="Oracle (nearest layout by Chamfer)",
-        ask=RowQuery(method="oracle", kind="layout"),
+        query=RowQuery(method="oracle", kind="layout"),
         paper=_paper(_RETRIEVAL, *paper),
     )
 
 
 def _trained(group: str, name: str, model: str, kind: QueryKind, *paper: float) -> Row:
-    """A row that compares trained models by their retrieval alone, as the paper's ablations do."""
-    ask = _lalaloc(model, kind, settings=_NO_REFINEMENT)
-    return Row(group=group, name=name, ask=ask, paper=_paper(_RETRIEVAL, *paper))
+    """Return a row that compares trained models by retrieval alone, as the paper's ablations do."""
+    query = _lalaloc(model, kind, settings=_NO_REFINEMENT)
+    return Row(group=group, name=name, query=query, paper=_paper(_RETRIEVAL, *paper))
 
 
 def _ablation(name: str, title: str, source: str, *rows: Row) -> Table:
@@ -342,25 +342,25 @@ TABLES: tuple[Table, ...] = (
         split="test",
         columns=("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds"),
         rows=(
-            Row(group="", name="2D ICP on furnished depth", ask=RowQuery(method="icp"), paper={"seconds": 20.1}),
+            Row(group="", name="2D ICP on furnished depth", query=RowQuery(method="icp"), paper={"seconds": 20.1}),
             Row(
                 group="`paper`",
                 name="LaLaLoc without VDR",
-                ask=_lalaloc("paper", settings={"vdr_candidates": 0}),
+                query=_lalaloc("paper", settings={"vdr_candidates": 0}),
                 paper={"seconds:retrieve": 0.05, "seconds:lpo": 2.33, "seconds": 2.38},
             ),
             Row(
                 group="`paper`",
                 name="LaLaLoc",
-                ask=_lalaloc("paper"),
+                query=_lalaloc("paper"),
                 paper={"seconds:retrieve": 0.05, "seconds:vdr": 2.87, "seconds:lpo": 1.73, "seconds": 4.65},
             ),
             Row(
                 group="`ring`",
                 name="LaLaLoc without VDR",
-                ask=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}),
+                query=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}),
             ),
-            Row(group="`ring`", name="LaLaLoc", ask=_lalaloc(SHIPPED)),
+            Row(group="`ring`", name="LaLaLoc", query=_lalaloc(SHIPPED)),
         ),
         form="times",
     ),
