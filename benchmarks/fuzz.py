@@ -60,7 +60,7 @@ class Outcome:
 
     @property
     def most_processed(self) -> bool:
-        """Whether the service processed most requests of every kind instead of refusing them as busy."""
+        """True if the service processed most requests of every kind instead of refusing them as busy."""
         return all(2 * found["503"] < sum(found.values()) for found in self.statuses.values())
 
     def note(self, kind: str, send: Callable[[], httpx.Response]) -> None:

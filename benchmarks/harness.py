@@ -75,7 +75,7 @@ def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[str
         process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True)
         url = f"http://127.0.0.1:{port}"
         try:
-            # The processes share the port, so several answers in a row are needed to have asked all of them.
+            # The processes share the port, so only several answers in a row show that all are ready.
             ready, deadline = 0, time.monotonic() + _START_S
             while ready < 10 * processes:
                 ready = ready + 1 if _is_ready(url) else 0

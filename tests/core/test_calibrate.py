@@ -97,15 +97,15 @@ class TestConfidence:
         odds = rng.uniform(0.0, 5.0, 400)
         own = [result(0.2 if rng.random() < 1.0 / (1.0 + math.exp(-each)) else 3.0, each) for each in odds]
         mismatched = [result(0.2, rng.uniform(0.0, 5.0), cost=0.6) for _ in range(100)]
-        plain, taught = (
+        plain, fitted_model = (
             fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
             for others in ([], mismatched)
         )
-        assert np.mean([confidence(plain, one) for one in mismatched]) > 0.5
-        assert np.mean([confidence(taught, one) for one in mismatched]) < 0.1
+        assert np.mean([confidence(plain, prediction) for prediction in mismatched]) > 0.5
+        assert np.mean([confidence(fitted_model, prediction) for prediction in mismatched]) < 0.1
         # Confidence in the home itself stays calibrated.
         share = np.mean(position_errors_m(own) < 1.0)
-        assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(share, abs=0.03)
+        assert np.mean([confidence(fitted_model, prediction) for prediction in own]) == pytest.approx(share, abs=0.03)
 
     def test_chance_fit_has_low_confidence(self) -> None:
         rng = np.random.default_rng(7)
@@ -113,8 +113,8 @@ class TestConfidence:
         others = [result(3.0, 6.0, cost, answer_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
         model = fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
         assert model.answer_to_chance < 0.0
-        assert np.mean([confidence(model, one) for one in own]) > 0.95
-        assert np.mean([confidence(model, one) for one in others]) < 0.1
+        assert np.mean([confidence(model, prediction) for prediction in own]) > 0.95
+        assert np.mean([confidence(model, prediction) for prediction in others]) < 0.1
 
     def test_fit_like_right_disturbed_photographs_is_confident(self) -> None:
         rng = np.random.default_rng(3)
@@ -122,13 +122,13 @@ class TestConfidence:
         disturbed = [result(0.2, 6.0, cost) for cost in rng.uniform(0.2, 0.55, 200)]
         others = [result(3.0, 6.0, cost) for cost in rng.uniform(0.6, 1.5, 200)]
         between = result(0.2, 6.0, 0.5)
-        plain, taught = (
+        plain, fitted_model = (
             fit_confidence(Answers(own=own, disturbed=also, mismatched=others), Answers(own=own)).known_heading["lpo"]
             for also in ([], disturbed)
         )
         assert confidence(plain, between) < 0.6
-        assert confidence(taught, between) > 0.8
-        assert np.mean([confidence(taught, one) for one in others]) < 0.1
+        assert confidence(fitted_model, between) > 0.8
+        assert np.mean([confidence(fitted_model, prediction) for prediction in others]) < 0.1
 
     def test_disturbed_photographs_do_not_change_covariance(self) -> None:
         offsets = np.random.default_rng(5).normal(0.0, 0.1, (200, 2))
@@ -148,16 +148,16 @@ class TestConfidence:
     def test_older_models_use_their_own_signals(self) -> None:
         weights = {"cost": -2.0, "uncertainty": -0.5, "latent_distance": -4.0, "cost_to_chance": -3.0}
         model = LogisticModel(bias=1.0, log_odds=0.0, **weights)
-        told = {"log_odds": 0.0, "cost": 0.3, "uncertainty": -2.0, "latent_distance": 0.1, "cost_to_chance": -0.4}
-        logit = 1.0 + sum(weights[name] * told[name] for name in weights)
+        signals = {"log_odds": 0.0, "cost": 0.3, "uncertainty": -2.0, "latent_distance": 0.1, "cost_to_chance": -0.4}
+        logit = 1.0 + sum(weights[name] * signals[name] for name in weights)
         for more in ({}, {"answer_to_chance": -9.0}):
-            assert model.probability(**told, **more) == pytest.approx(1.0 / (1.0 + math.exp(-logit)))
+            assert model.probability(**signals, **more) == pytest.approx(1.0 / (1.0 + math.exp(-logit)))
 
     def test_cross_validation_uses_other_homes(self) -> None:
         # Costs differ in meaning between homes, so a fit on the others is wrong here.
         def of_home(number: int, cost: float, *, right: bool) -> Prediction:
-            one = result(0.2 if right else 3.0, 6.0, cost)
-            return dataclasses.replace(one, scene=f"home-{number}")
+            prediction = result(0.2 if right else 3.0, 6.0, cost)
+            return dataclasses.replace(prediction, scene=f"home-{number}")
 
         alike = [of_home(number, 0.1 + 0.2 * (k % 2), right=k % 2 == 0) for number in range(5) for k in range(40)]
         assert cross_validate(Answers(own=alike))["calibration_error"] < 0.05
@@ -183,8 +183,8 @@ class TestConfidence:
         own += [result(3.0, wrong_log_odds, cost=0.1) for _ in range(10) if wrong_log_odds is not None]
         mismatched = [result(0.2, rng.normal() + 3.0, cost=0.6) for _ in range(160)]
         model = fit_confidence(Answers(own=own, mismatched=mismatched), Answers(own=own)).known_heading["lpo"]
-        assert np.mean([confidence(model, one) for one in own]) > 0.9
-        assert np.mean([confidence(model, one) for one in mismatched]) < 0.1
+        assert np.mean([confidence(model, prediction) for prediction in own]) > 0.9
+        assert np.mean([confidence(model, prediction) for prediction in mismatched]) < 0.1
 
     @given(seeds())
     @settings(max_examples=10)
@@ -198,8 +198,8 @@ class TestConfidence:
     def test_confidences_are_frequencies(self) -> None:
         model = fitted(believable(4000, 1))
         fresh = believable(4000, 2)
-        told = np.array([confidence(model, one) for one in fresh])
-        assert expected_calibration_error(told, position_errors_m(fresh) < 1.0) < 0.04
+        confidences = np.array([confidence(model, prediction) for prediction in fresh])
+        assert expected_calibration_error(confidences, position_errors_m(fresh) < 1.0) < 0.04
 
     @pytest.mark.parametrize("right", [True, False])
     def test_equal_outcomes_give_a_finite_model(self, right: bool) -> None:
@@ -215,22 +215,22 @@ class TestConfidence:
     def test_headings_and_stages_have_their_own_models(self) -> None:
         early = [
             dataclasses.replace(
-                one,
-                stages={"retrieval": dataclasses.replace(TRUTH, x_m=5.0), **one.stages},
-                signals={"retrieval": one.signals["lpo"], **one.signals},
+                prediction,
+                stages={"retrieval": dataclasses.replace(TRUTH, x_m=5.0), **prediction.stages},
+                signals={"retrieval": prediction.signals["lpo"], **prediction.signals},
             )
-            for one in (result(0.1) for _ in range(20))
+            for prediction in (result(0.1) for _ in range(20))
         ]
         model = both(early, [result(5.0) for _ in range(20)])
         signals = result(0.0).signals["lpo"]
-        told = {
+        probabilities = {
             (stage, known): model.fit_probability(stage, signals, heading_known=known)
             for stage, known in (("lpo", True), ("retrieval", True), ("lpo", False), ("retrieval", False))
         }
-        assert (told["lpo", True] or 0.0) > 0.5
-        assert (told["retrieval", True] or 1.0) < 0.5
-        assert (told["lpo", False] or 1.0) < 0.5
-        assert told["retrieval", False] is None
+        assert (probabilities["lpo", True] or 0.0) > 0.5
+        assert (probabilities["retrieval", True] or 1.0) < 0.5
+        assert (probabilities["lpo", False] or 1.0) < 0.5
+        assert probabilities["retrieval", False] is None
 
     def test_unanswered_queries_are_ignored(self) -> None:
         some = believable(100, 0)
@@ -282,9 +282,9 @@ class TestMatchingWeights:
         rng = np.random.default_rng(1)
         queries = []
         for _ in range(50):
-            one = self.choice(rng, np.array([12.0, 0.0, 0.0, 0.0]))
-            rivals = tuple(dataclasses.replace(r, terms={**r.terms, "openings": 0.0}) for r in one.candidates)
-            queries.append(dataclasses.replace(one, candidates=rivals))
+            prediction = self.choice(rng, np.array([12.0, 0.0, 0.0, 0.0]))
+            rivals = tuple(dataclasses.replace(r, terms={**r.terms, "openings": 0.0}) for r in prediction.candidates)
+            queries.append(dataclasses.replace(prediction, candidates=rivals))
         model = fit_matching_weights(queries)
         default = MatchingWeights()
         assert model.openings * model.temperature == pytest.approx(default.openings * default.temperature, rel=1e-3)

@@ -36,7 +36,7 @@ def layout_run(tiny_bundle: Path) -> RunInfo:
 
 
 def without_times(predictions: list[Prediction]) -> list[Prediction]:
-    return [dataclasses.replace(one, timings_ms={}) for one in predictions]
+    return [dataclasses.replace(prediction, timings_ms={}) for prediction in predictions]
 
 
 class TestGeneratedScenes:
@@ -79,7 +79,7 @@ class TestRunning:
         scores = score(predictions)
         assert scores.layout_recall is not None
         assert scores.layout_recall.value > 0.3
-        assert [one.scene for one in predictions[::3]] == list(build_dataset(info).scenes("test"))
+        assert [prediction.scene for prediction in predictions[::3]] == list(build_dataset(info).scenes("test"))
 
     @pytest.mark.parametrize("heading_known", [True, False])
     def test_every_panorama_is_answered(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
@@ -91,12 +91,12 @@ class TestRunning:
         assert RunFolder(tmp_path).read_predictions() == predictions
         # Facts come from the generator's shots.
         scenes = build_dataset(info)
-        for one in predictions:
-            camera = next(c for c in scenes.load(one.scene).cameras if c.name == one.camera)
+        for prediction in predictions:
+            camera = next(c for c in scenes.load(prediction.scene).cameras if c.name == prediction.camera)
             (photograph,) = camera.photographs.values()
             assert isinstance(photograph, RenderedPhotograph)
-            assert one.facts == tuple(sorted(facts_of(photograph.shot)))
-        assert any(one.facts for one in predictions)
+            assert prediction.facts == tuple(sorted(facts_of(photograph.shot)))
+        assert any(prediction.facts for prediction in predictions)
 
     def test_workers_do_not_change_predictions(self, layout_run: RunInfo, tmp_path: Path) -> None:
         here = run_evaluation(RunFolder(tmp_path / "here"), layout_run, workers=0)
@@ -125,13 +125,13 @@ class TestRunning:
         assert len(run_evaluation(folder, dataclasses.replace(layout_run, limit=2), workers=0)) == 2
 
     def test_predictions_without_facts_are_read(self, layout_run: RunInfo, tmp_path: Path) -> None:
-        (asked,) = run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
-        assert asked.facts == ()
+        (prediction,) = run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
+        assert prediction.facts == ()
         path = tmp_path / PREDICTIONS_FILE
         line = json.loads(path.read_text(encoding="utf-8"))
         del line["facts"]
         path.write_text(json.dumps(line) + "\n", encoding="utf-8")
-        assert RunFolder(tmp_path).read_predictions() == [asked]
+        assert RunFolder(tmp_path).read_predictions() == [prediction]
 
     def test_other_description_in_the_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
         run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
@@ -158,8 +158,8 @@ class TestCommandLine:
     def test_score_needs_only_predictions(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        asked = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
-        assert main(["evaluate", *asked, "--out", str(tmp_path / "run"), "--json"]) == 0
+        arguments = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
+        assert main(["evaluate", *arguments, "--out", str(tmp_path / "run"), "--json"]) == 0
         printed = json.loads(capsys.readouterr().out)
         assert printed["n"] == 4
         assert 0.0 <= printed["final"]["within_1m"]["value"] <= 1.0
@@ -177,8 +177,8 @@ class TestCommandLine:
     def test_empty_split_leaves_no_folder(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        asked = ["--data", str(OWN_DATA), "--split", "train", "--bundle", str(tiny_bundle)]
-        assert main(["evaluate", *asked, "--out", str(tmp_path / "run")]) == 2
+        arguments = ["--data", str(OWN_DATA), "--split", "train", "--bundle", str(tiny_bundle)]
+        assert main(["evaluate", *arguments, "--out", str(tmp_path / "run")]) == 2
         assert "split 'train'" in capsys.readouterr().err
         assert not (tmp_path / "run").exists()
 

@@ -104,9 +104,9 @@ def prediction(index: int = 0, error_m: float | None = 0.02, **changes: Any) -> 
     return Prediction(**(values | changes))
 
 
-def in_room(one: Prediction, room_index: int) -> Prediction:
+def in_room(query: Prediction, room_index: int) -> Prediction:
     """Return the prediction with another room."""
-    return replace(one, stages={name: replace(pose, room_index=room_index) for name, pose in one.stages.items()})
+    return replace(query, stages={name: replace(pose, room_index=room_index) for name, pose in query.stages.items()})
 
 
 def mixed() -> list[Prediction]:
@@ -116,7 +116,7 @@ def mixed() -> list[Prediction]:
         prediction(k, error_m, layout_hit=k % 2 == 0, pose_hit=k % 3 == 0, confidence=0.95 - 0.07 * k)
         for k, error_m in enumerate(errors_m)
     ]
-    return [in_room(one, 1) if k in (9, 10) else one for k, one in enumerate(some)]
+    return [in_room(query, 1) if k in (9, 10) else query for k, query in enumerate(some)]
 
 
 def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Path:
@@ -155,7 +155,7 @@ def generated_run(path: Path, bundle: str | None, **changes: Any) -> Path:
         heading_deg=heading_to_degrees(camera.heading),
     )
     found = replace(truth, x_m=truth.x_m + 0.12, heading_deg=(truth.heading_deg + 30.0) % 360.0)
-    one = prediction(
+    query = prediction(
         scene=scene.name,
         camera=camera.name,
         room=scene.plan.rooms[camera.room_index].name,
@@ -164,7 +164,7 @@ def generated_run(path: Path, bundle: str | None, **changes: Any) -> Path:
         stages={"lpo": found},
     )
     values = {"data": None, "generated": {"homes": 1, "shots_per_home": 1}, "furniture": "full", "bundle": bundle}
-    return run_folder(path, [one], **(values | changes))
+    return run_folder(path, [query], **(values | changes))
 
 
 @pytest.fixture(scope="module")
@@ -196,10 +196,10 @@ class TestFailures:
         assert outcomes([in_room(prediction(error_m=0.0), 1)]) == [Outcome.WRONG_ROOM]
 
     def test_stage_outcome_uses_its_own_pose(self) -> None:
-        one = prediction(error_m=0.4 * ALIGNMENT_LIMIT_M + 0.1)
-        assert outcomes([one]) == [Outcome.LOCATED]
-        assert outcomes([one], "retrieval") == [Outcome.WRONG_ALIGNMENT]
-        assert outcomes([one], "vdr") == [Outcome.NO_ANSWER]
+        query = prediction(error_m=0.4 * ALIGNMENT_LIMIT_M + 0.1)
+        assert outcomes([query]) == [Outcome.LOCATED]
+        assert outcomes([query], "retrieval") == [Outcome.WRONG_ALIGNMENT]
+        assert outcomes([query], "vdr") == [Outcome.NO_ANSWER]
 
     def test_outcome_counts_sum_to_all_queries(self) -> None:
         assert count_outcomes(mixed()) == dict(zip(Outcome, (7, 2, 2, 1), strict=True))
@@ -215,13 +215,13 @@ class TestFigures:
         assert head[:4] == ["stage", "n", "Layout R@1", "Pose R@1"]
         assert scores.layout_recall is not None
         assert scores.pose_recall is not None
-        recalls = [f"{100 * one.value:.1f} %" for one in (scores.layout_recall, scores.pose_recall)]
+        recalls = [f"{100 * estimate.value:.1f} %" for estimate in (scores.layout_recall, scores.pose_recall)]
         for row, stage, chosen in ((retrieval, "retrieval", recalls), (lpo, "lpo", ["–", "–"])):
             figures = scores.stages[stage]
             shares = (figures.within_1cm, figures.within_5cm, figures.within_10cm, figures.within_1m)
             assert row[:4] == [stage, "12", *chosen]
             assert math.isclose(float(row[4].removesuffix(" cm")), figures.median_cm.value, rel_tol=0.01)
-            assert row[5:9] == [f"{100 * one.value:.1f} %" for one in shares]
+            assert row[5:9] == [f"{100 * estimate.value:.1f} %" for estimate in shares]
             assert row[9] == f"{100 * figures.correct_room.value:.1f} %"
             assert row[10] == "2.00°"
 
@@ -298,7 +298,7 @@ class TestFigures:
 
     def test_stage_times_skip_other_queries(self) -> None:
         timings_ms: list[dict[str, float]] = [{"a": 1.0}, {"a": 3.0, "b": 5.0}, {}]
-        times = stage_times([prediction(k, timings_ms=one) for k, one in enumerate(timings_ms)])
+        times = stage_times([prediction(k, timings_ms=query) for k, query in enumerate(timings_ms)])
         assert (times["a"].count, times["a"].median_ms) == (2, 2.0)
         assert (times["b"].count, times["b"].median_ms, times["b"].p95_ms) == (1, 5.0, 5.0)
         assert times[TOTAL].median_ms == np.median([1.0, 8.0])
@@ -335,14 +335,14 @@ class TestPage:
     def test_charts_have_descriptions(self, page: Page) -> None:
         drawings = [attributes for tag, attributes in page.tags if tag == "svg"]
         assert len(drawings) == 4
-        assert all(one["role"] == "img" and one["aria-labelledby"] for one in drawings)
+        assert all(drawing["role"] == "img" and drawing["aria-labelledby"] for drawing in drawings)
 
     def test_text_from_files_is_escaped(self, tmp_path: Path) -> None:
-        one = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
-        one = replace(one, stages={NASTY: one.stages["lpo"], "lpo": one.stages["lpo"]}, confidence=0.5)
+        query = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
+        query = replace(query, stages={NASTY: query.stages["lpo"], "lpo": query.stages["lpo"]}, confidence=0.5)
         run = run_folder(
             tmp_path / "run",
-            [one],
+            [query],
             label=NASTY,
             dataset=NASTY,
             command=f"lalaloc {NASTY}",
@@ -401,7 +401,7 @@ class TestRuns:
         assert [row[0] for row in page.table("Accuracy")[1:]] == ["2. a run", "lpo"]
 
     def test_calibration_is_absent_without_confidence(self, tmp_path: Path) -> None:
-        some = [replace(one, confidence=None) for one in mixed()]
+        some = [replace(query, confidence=None) for query in mixed()]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert "nothing to calibrate" in page.text
         assert sum(tag == "svg" for tag, _ in page.tags) == 3
@@ -417,9 +417,9 @@ class TestGallery:
         every = [index for indices in chosen.values() for index in indices]
         assert len(set(every)) == len(every)
         assert all(1 <= len(indices) <= PER_GROUP for indices in chosen.values())
-        ranked = sorted(math.inf if one is None else one for one in errors_m)
+        ranked = sorted(math.inf if error_m is None else error_m for error_m in errors_m)
         found = [errors_m[index] for index in chosen.get("best", [])]
-        assert found == [one for one in ranked[:PER_GROUP] if one < math.inf]
+        assert found == [error_m for error_m in ranked[:PER_GROUP] if error_m < math.inf]
         if len(errors_m) >= 2 * PER_GROUP:
             worst = [math.inf if errors_m[index] is None else errors_m[index] for index in chosen["worst"]]
             assert worst == ranked[::-1][:PER_GROUP]
@@ -429,7 +429,7 @@ class TestGallery:
         write_report([run], tmp_path / "report.html", pictures=pictures)
         page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
         drawn = [attributes for tag, attributes in page.tags if tag == "img"]
-        assert [one["src"].partition(";")[0] for one in drawn] == [
+        assert [picture["src"].partition(";")[0] for picture in drawn] == [
             "data:image/jpeg",
             "data:image/png",
             "data:image/png",

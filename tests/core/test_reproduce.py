@@ -89,20 +89,20 @@ class TestTables:
 
     def test_main_table_has_both_architectures(self) -> None:
         (table,) = (table for table in TABLES if table.name == "localisation")
-        asked = {(row.query.method, row.query.kind, row.query.model) for row in table.rows}
+        queries = {(row.query.method, row.query.kind, row.query.model) for row in table.rows}
         for kind in ("layout", "panorama"):
-            assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= asked
-            assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= asked
-        assert ("oracle", "layout", None) in asked
+            assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= queries
+            assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= queries
+        assert ("oracle", "layout", None) in queries
 
 
 class TestPaperSetting:
     def test_all_rows_have_the_paper_setting(self) -> None:
-        asked = [row.query for table in TABLES for row in table.rows if row.query.method == "lalaloc"]
-        assert len(asked) > 20
-        for ask in asked:
-            assert ask.run_settings.items() >= PAPER_SETTING.items()
-            assert ask.run_settings.items() >= ask.settings.items()
+        queries = [row.query for table in TABLES for row in table.rows if row.query.method == "lalaloc"]
+        assert len(queries) > 20
+        for query in queries:
+            assert query.run_settings.items() >= PAPER_SETTING.items()
+            assert query.run_settings.items() >= query.settings.items()
         assert RowQuery(method="icp").run_settings == {}
 
     def test_plan_openings_are_ignored(self, tiny_bundle: Path) -> None:
@@ -123,7 +123,7 @@ class TestPaperSetting:
             )
             method = build_method(info)
             answers = [method.locate(question_at(plan, (1.3, 1.4))) for plan in plans]
-            costs.append([[one.pose.distance for one in answer.candidates] for answer in answers])
+            costs.append([[candidate.pose.distance for candidate in answer.candidates] for answer in answers])
         in_the_paper, usual = costs
         assert in_the_paper[0] == in_the_paper[1]
         assert usual[0] != usual[1]
@@ -177,9 +177,9 @@ class TestCommand:
         for split in ("validation", "test"):
             assert main(["synth", "--scenes", "1", "--split", split, "--out", data, "--height", "64"]) == 0
         tables = ["similarity", "vogel-samples"]
-        asked = [word for name in tables for word in ("--table", name)]
+        names = [word for name in tables for word in ("--table", name)]
         common = ["--data", data, "--out", str(out), "--bundle", str(tiny_bundle), "--limit", "3", "--workers", "0"]
-        assert main(["reproduce", *asked, *common]) == 0
+        assert main(["reproduce", *names, *common]) == 0
         printed = capsys.readouterr().out
         assert "Layout-similarity metric" in printed
         similarity = TableResult.read(out / "tables" / "similarity.json")

@@ -92,9 +92,9 @@ class TestScores:
         assert score([plain]).layout_recall is None
 
     def test_slices_are_sorted_worst_first(self) -> None:
-        both, one = ("corridor", "mirror"), ("corridor",)
+        both, query = ("corridor", "mirror"), ("corridor",)
         scores = score(
-            [prediction(0.04, facts=both), prediction(facts=both), prediction(0.3, facts=one), prediction(0.02)]
+            [prediction(0.04, facts=both), prediction(facts=both), prediction(0.3, facts=query), prediction(0.02)]
         )
         assert list(scores.slices) == ["mirror", "corridor"]
         mirror, corridor = scores.slices.values()
@@ -130,8 +130,8 @@ class TestScores:
         predictions = [prediction(error, scene=str(k % 7)) for k, error in enumerate(errors)]
         first, again = (score(predictions, seed) for _ in range(2))
         assert first == again
-        for one in (first.final.within_1m, first.final.median_cm):
-            assert one.low <= one.high
+        for estimate in (first.final.within_1m, first.final.median_cm):
+            assert estimate.low <= estimate.high
         assert 0.0 <= first.final.within_1m.low <= first.final.within_1m.value <= first.final.within_1m.high <= 1.0
 
     def test_interval_shrinks_with_scenes(self) -> None:
@@ -176,10 +176,10 @@ class TestCalibration:
     def test_diagram_has_every_query_once(self, queries: list[tuple[float, bool]]) -> None:
         confidence, correct = (np.array(column) for column in zip(*queries, strict=True))
         bins = reliability_bins(confidence, correct)
-        assert sum(one.count for one in bins) == len(queries)
-        for one in bins:
-            assert one.low <= one.confidence <= one.high
-            assert 0.0 <= one.frequency <= 1.0
+        assert sum(part.count for part in bins) == len(queries)
+        for part in bins:
+            assert part.low <= part.confidence <= part.high
+            assert 0.0 <= part.frequency <= 1.0
         assert 0.0 <= expected_calibration_error(confidence, correct) <= 1.0
 
     def test_calibration_needs_confidence(self) -> None:

@@ -101,14 +101,14 @@ class TestChamfer:
     def test_search_skips_most_poses(self, monkeypatch: pytest.MonkeyPatch) -> None:
         plan = plan_of(rectangle(4.0, 3.0), rectangle(6.0, 5.0, (5.0, 0.0)), rectangle(3.0, 8.0, (12.0, 0.0)))
         poses = some_poses(plan, 3, 200)
-        grid, asked = ChamferGrid(plan, poses, CAMERA_M), []
+        grid, searched = ChamferGrid(plan, poses, CAMERA_M), []
         counted = similarity._Comparison.from_query
         monkeypatch.setattr(
-            similarity._Comparison, "from_query", lambda self, index: asked.append(index) or counted(self, index)
+            similarity._Comparison, "from_query", lambda self, index: searched.append(index) or counted(self, index)
         )
         query = layout_at(plan, np.array([2.0, 1.2]), grid.columns)
         assert grid.nearest(query) == int(np.linalg.norm(poses.position_m - [2.0, 1.2], axis=1).argmin())
-        assert len(asked) < 0.1 * len(poses)
+        assert len(searched) < 0.1 * len(poses)
 
 
 class TestDepth:
@@ -124,7 +124,7 @@ class TestDepth:
             return depth / depth.max() if relative else depth
 
         layouts = [layout_at(plan, position, COLUMNS) for position in poses.position_m]
-        expected = [sum(abs(image(one) - image(query))) / (ROWS * COLUMNS) for one in layouts]
+        expected = [sum(abs(image(layout) - image(query))) / (ROWS * COLUMNS) for layout in layouts]
         grid = DepthGrid(plan, poses, CAMERA_M, relative=relative, rows=ROWS, columns=COLUMNS)
         np.testing.assert_allclose(grid.distances(query), expected, atol=1e-5)
 

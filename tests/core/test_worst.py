@@ -57,8 +57,8 @@ class TestFailures:
     def test_chance_is_share_of_mirrored_positions(self) -> None:
         rng = np.random.default_rng(0)
         everywhere = [found_at(x, y) for x, y in rng.uniform((0.0, 0.0), (6.0, 4.0), (2000, 2))]
-        wrong = [one for one in everywhere if outcomes([one]) == [Outcome.WRONG_ALIGNMENT]]
-        share = np.mean([is_symmetric(PLAN, one) for one in wrong])
+        wrong = [pose for pose in everywhere if outcomes([pose]) == [Outcome.WRONG_ALIGNMENT]]
+        share = np.mean([is_symmetric(PLAN, pose) for pose in wrong])
         assert symmetric_by_chance(PLAN, wrong[0]) == pytest.approx(share, abs=0.02)
 
 
@@ -119,17 +119,17 @@ class TestPages:
         summary = write_worst(layout_run, tmp_path, 3)
         content = json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8"))
         predictions = RunFolder(layout_run).read_predictions()
-        expected = [(one.scene, one.camera) for one in choose_worst(predictions, 3)]
+        expected = [(query.scene, query.camera) for query in choose_worst(predictions, 3)]
         worst = content.pop("worst")
         assert content == summary
-        assert [(one["scene"], one["camera"]) for one in worst] == expected
+        assert [(query["scene"], query["camera"]) for query in worst] == expected
         assert worst[0]["outcome"] == Outcome.NO_ANSWER
         assert worst[0]["error_m"] is None
         # Costs of a layout query are zero except at doors, which can be seen through.
-        for one in worst:
-            assert one["true_cost"] < 0.2
-            assert abs(one["distance_bias"]) < 1e-3
-            assert one["found_cost"] is None or one["found_cost"] > one["true_cost"]
+        for query in worst:
+            assert query["true_cost"] < 0.2
+            assert abs(query["distance_bias"]) < 1e-3
+            assert query["found_cost"] is None or query["found_cost"] > query["true_cost"]
         assert summary["true_pose_fits"] == {"compared": 2, "better_than_found": 2}
         assert summary["pages"] == ["worst-01.png"]
         with Image.open(tmp_path / "worst-01.png") as page:
@@ -147,7 +147,7 @@ class TestPages:
     def test_missing_query_is_named(self, layout_run: Path, tmp_path: Path) -> None:
         run = RunFolder(tmp_path / "run")
         run.write_info(RunFolder(layout_run).read_info())
-        run.append([replace(one, camera="gone") for one in RunFolder(layout_run).read_predictions()[:1]])
+        run.append([replace(query, camera="gone") for query in RunFolder(layout_run).read_predictions()[:1]])
         summary = write_worst(run.path, tmp_path / "out", 1)
         assert "no camera 'gone'" in summary["left_out"][0]
         assert summary["pages"] == []
