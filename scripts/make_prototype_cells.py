@@ -21,8 +21,8 @@ from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, nearest
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
-from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.render.sweep import profiles_at
 
 _STEP_M, _CAMERA_HEIGHT_M = 0.5, 1.5
 # Share of scaled homes, and range of the logarithm of their factor.
