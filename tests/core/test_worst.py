@@ -149,7 +149,7 @@ class TestPages:
         run.write_info(RunFolder(layout_run).read_info())
         run.append([replace(query, camera="gone") for query in RunFolder(layout_run).read_predictions()[:1]])
         summary = write_worst(run.path, tmp_path / "out", 1)
-        assert "no camera 'gone'" in summary["left_out"][0]
+        assert "camera 'gone' is missing" in summary["left_out"][0]
         assert summary["pages"] == []
 
     def test_run_without_predictions_is_refused(self, layout_run: Path, tmp_path: Path) -> None:
