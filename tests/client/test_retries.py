@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import parse_qs
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lalaloc_client import (
@@ -29,6 +29,8 @@ from lalaloc_client import (
 from lalaloc_client.retry import Safety, may_retry, retry_after_s
 from tests.client.conftest import FailingServer, MakeClient, Planned
 
+# The first example may take long on a busy machine.
+NO_DEADLINE = settings(deadline=None)
 QUICK = RetryPolicy(attempts=4, total_s=10.0, first_s=0.01)
 LATER = Planned(503, {"type": "urn:lalaloc:problem:overloaded", "detail": "too much"}, {"X-Request-ID": "r-9"})
 GONE = Planned(None)
@@ -262,6 +264,7 @@ def test_invalid_address_is_rejected(address: str) -> None:
         Client(address)
 
 
+@NO_DEADLINE
 @given(
     st.integers(1, 12),
     st.floats(0.0, 100.0),
@@ -283,6 +286,7 @@ def test_waits_are_bounded_and_follow_retry_after(
     assert after_s is not None or wait_s <= policy.longest_s
 
 
+@NO_DEADLINE
 @given(st.integers(0, 10**6))
 def test_retry_after_date_counts_from_the_answer_date(seconds: int) -> None:
     date = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
@@ -294,6 +298,7 @@ def test_retry_after_date_counts_from_the_answer_date(seconds: int) -> None:
     assert retry_after_s(str(seconds), None, wrong_clock) == seconds
 
 
+@NO_DEADLINE
 @given(st.text(max_size=40), st.none() | st.text(max_size=40))
 def test_malformed_retry_after_is_ignored(value: str, date: str | None) -> None:
     wait_s = retry_after_s(value, date, datetime(2026, 1, 1, tzinfo=UTC))
