@@ -294,9 +294,9 @@ def test_confidence_does_not_depend_on_top_k(
     found = _retrieved(tiny_bundle, panorama, heading)
     expected = found.confidence(model)
     assert expected is not None
-    assert 0.0 < expected < 1.0
+    assert 0.0 < expected.position < 1.0
     # Opposite places of a rectangular room tie up to rounding, and their order changes a few per cent.
-    for name, value in (("confidence", expected), ("heading_confidence", found.heading_confidence(model))):
+    for name, value in (("confidence", expected.position), ("heading_confidence", expected.heading)):
         assert len({answer[name] for answer in answers}) == 1
         assert answers[0][name] == pytest.approx(value, rel=0.05, abs=1e-4)
     shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]
