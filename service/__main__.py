@@ -10,7 +10,7 @@ from service.settings import settings_table
 
 
 def main() -> None:
-    """Do as `lalaloc-service serve` does."""
+    """Run `lalaloc-service serve`."""
     parser = argparse.ArgumentParser(prog="python -m service", description=__doc__)
     add_serve_arguments(parser)
     parser.add_argument("--settings", action="store_true", help="print all settings as a Markdown table and exit")

@@ -1,6 +1,6 @@
 """The application: `uvicorn service.app:app`.
 
-Making the app does no work; settings are read, the model loaded and the LPO pool started when it starts.
+Creating the app does no work; at start-up it reads the settings, loads the model and starts the LPO pool.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
 from service.http.api_description import describe_api
+from service.http.fields import check_parameters
 from service.http.middleware import (
     AdmissionMiddleware,
     AuthorisationMiddleware,
@@ -25,7 +26,6 @@ from service.http.middleware import (
     SecurityHeadersMiddleware,
     TelemetryMiddleware,
 )
-from service.http.fields import check_parameters
 from service.http.problems import install_problem_handlers
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS
@@ -36,20 +36,19 @@ from service.telemetry import Telemetry, configure_logging
 _DESCRIPTION = (
     "Localises 360° panoramas in floor plans. Lengths are metres in the plan frame (x to the right, y up on the "
     "drawing), headings are degrees clockwise from the plan's +y. Errors are `application/problem+json` (RFC 9457). "
-    "Every GET may be a HEAD as well. What a route does not know, part of a form or query parameter, is refused by its "
-    "name."
+    "Every GET route also answers HEAD. Unknown form fields and query parameters are refused."
 )
 
 
 def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACKENDS) -> FastAPI:
-    """Make an application.
+    """Create an application.
 
     Args:
-        settings: by default read from the environment when the application starts.
-        backends: what may be in other processes.
+        settings: settings of the service. Default: read from the environment at start-up.
+        backends: builders of the components that can run in other processes.
     """
     telemetry = Telemetry()
-    # Shown as 0 from the start, so that the first one is a rise.
+    # Exported as 0 from the start, so that the first one shows as an increase.
     for kind in (*PROBLEMS.values(), *HTTP_PROBLEMS.values()):
         telemetry.rejections.labels(kind.slug)
     app = FastAPI(
@@ -58,7 +57,7 @@ def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACK
         description=_DESCRIPTION,
         dependencies=[Depends(check_parameters)],
         lifespan=partial(_lifespan, settings, telemetry, backends),
-        # The stock documentation pages load their scripts from elsewhere; `routes.pages` has one that does not.
+        # The framework's documentation pages load scripts from a CDN; `routes.pages` has one that does not.
         docs_url=None,
         redoc_url=None,
     )
@@ -72,11 +71,11 @@ def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACK
 
 
 def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGIApp:
-    """The app's layers, outermost first: log, headers, CORS, framing, HEAD, keys, admission, the framework's.
+    """Return the app with its middlewares, outermost first: log, headers, CORS, framing, HEAD, keys, admission.
 
-    Middleware that is added to an app lies inside the layer that answers unexpected errors, and never sees those.
+    `FastAPI.add_middleware` would put them inside the layer that answers unexpected errors.
     """
-    # Keys first: it is tenants that slots are shared between.
+    # Keys come before admission, because slots are shared between tenants.
     admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app))))
     named = [route for route in routes if isinstance(route, Route)]
     return TelemetryMiddleware(SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, named)
@@ -94,7 +93,7 @@ async def _lifespan(
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control
         yield
-        logger.info("service stops")
+        logger.info("service is stopping")
     logger.info("service stopped")
 
 

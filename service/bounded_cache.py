@@ -1,4 +1,4 @@
-"""A cache that is bounded in bytes: what was used least recently makes room."""
+"""Cache with a limit in bytes and least-recently-used eviction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ V = TypeVar("V")
 
 
 class _CountingLruCache(LRUCache[K, V]):
-    """Counts what it drops to make room."""
+    """LRU cache that counts evictions."""
 
     evictions = 0
 
@@ -23,7 +23,12 @@ class _CountingLruCache(LRUCache[K, V]):
 
 
 class BoundedCache(Generic[K, V]):
-    """`cachetools.LRUCache` with what it leaves to its user: a lock, and values that are larger than all of it."""
+    """Thread-safe `cachetools.LRUCache` that ignores values larger than the whole cache.
+
+    Args:
+        limit_bytes: size of the cache.
+        size: function that returns the bytes of a value.
+    """
 
     def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:
         self._values: _CountingLruCache[K, V] = _CountingLruCache(limit_bytes, size)
@@ -31,20 +36,16 @@ class BoundedCache(Generic[K, V]):
 
     @property
     def bytes(self) -> int:
-        """What the values in it take."""
+        """Bytes of all values."""
         return int(self._values.currsize)
 
     def get(self, key: K) -> V | None:
-        """A value, which now counts as used."""
+        """Return a value and mark it as used."""
         with self._lock:
             return self._values.get(key)
 
     def put(self, key: K, value: V) -> int:
-        """Keep a value; one that is larger than the whole cache is not kept, and pushes nothing out.
-
-        Returns:
-            how many others had to make room.
-        """
+        """Store a value, unless it is larger than the whole cache; return the number of evictions."""
         with self._lock:
             self._values.pop(key, None)
             before = self._values.evictions
@@ -53,17 +54,17 @@ class BoundedCache(Generic[K, V]):
             return self._values.evictions - before
 
     def drop(self, unwanted: Callable[[K, V], bool]) -> None:
-        """Forget some of the values."""
+        """Remove the values that `unwanted` selects."""
         with self._lock:
             for key, value in self._items():
                 if unwanted(key, value):
                     del self._values[key]
 
     def items(self) -> list[tuple[K, V]]:
-        """Keys and values as they are now; none of them counts as used by that."""
+        """Return keys and values without marking them as used."""
         with self._lock:
             return self._items()
 
     def _items(self) -> list[tuple[K, V]]:
-        # Looked up past the least-recently-used order, which would count each as used.
+        # Bypasses the subclass, which would mark each value as used.
         return [(key, Cache.__getitem__(self._values, key)) for key in self._values]

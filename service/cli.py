@@ -1,6 +1,6 @@
-"""The command line of the service: `lalaloc-service serve`, and `lalaloc-service keys create|list|revoke`.
+"""Command line of the service: `lalaloc-service serve` and `lalaloc-service keys create|list|revoke`.
 
-Keys are kept in the database that the settings name, so these commands work while the service runs as well.
+Keys are in the database of the settings, so these commands also work while the service runs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from service.storage import Store, open_store
 from service.storage.records import ApiKey
 from service.telemetry.tracing import otlp_exporter
 
-# Connections that the kernel accepts while the service is busy; it answers all of them, if only with a 503.
+# Connections that the kernel accepts while the service is busy.
 _BACKLOG = 1024
 _TENANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_NAME = 200
@@ -32,11 +32,7 @@ _MAX_RATE = 10**6
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    Returns:
-        the exit status: 0, or 1 when it could not be done; one that cannot be understood ends the process with 2.
-    """
+    """Run a command and return the exit status: 0, or 1 after an error; a usage error exits with 2."""
     parsed = build_parser().parse_args(arguments)
     try:
         return parsed.run(parsed)
@@ -52,19 +48,19 @@ def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(arguments: argparse.Namespace) -> int:
-    """Bind, say where, serve until told to stop.
+    """Bind, print the address, and serve until stopped.
 
     Raises:
-        ConfigError: a setting is wrong, or the address would let others in without keys.
+        ConfigError: an invalid setting, or a public address without keys.
     """
     settings = Settings.load()
     with _listener(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]
         check_address(host, settings)
         _check_parts(settings)
-        # Bound already: whoever reads this line can connect, and is answered once the service has started.
+        # The socket is bound, so clients can connect now; they are answered after the start.
         print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
-        # Takes a second or two, which those who only ask for help or keys need not wait.
+        # Imported late, because it takes a second that help and keys do not need.
         from service.app import create_app
         from service.http.server import Server, server_config
 
@@ -74,11 +70,11 @@ def serve(arguments: argparse.Namespace) -> int:
 
 
 def _check_parts(settings: Settings) -> None:
-    """Open what the service cannot do without, so that who started it is told in a line, and not by its log.
+    """Check model, database and exporter before the start, so that errors are one line and not a log.
 
     Raises:
-        BundleError: there is no usable model.
-        ConfigError, StoreUnavailableError: the database cannot be used, or spans cannot be exported.
+        BundleError: no usable model.
+        ConfigError, StoreUnavailableError: no usable database or exporter.
     """
     if settings.otlp_endpoint is not None:
         otlp_exporter(settings.otlp_endpoint).shutdown()
@@ -95,36 +91,41 @@ def _listener(host: str, port: int) -> socket.socket:
 
 
 def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog="lalaloc-service", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     serving = commands.add_parser("serve", help="run the service")
     add_serve_arguments(serving)
     serving.set_defaults(run=serve)
-    keys = commands.add_parser("keys", help="make, list and revoke API keys").add_subparsers(required=True)
+    keys = commands.add_parser("keys", help="create, list and revoke API keys").add_subparsers(required=True)
 
-    create = keys.add_parser("create", help="make a key and print it: once, it cannot be read back")
-    create.add_argument("--tenant", required=True, type=_tenant, help="whose floor plans it gives access to")
-    create.add_argument("--name", required=True, type=_name, help="what it is for, to tell it from others")
+    create = keys.add_parser("create", help="create a key and print it; it cannot be shown again")
+    create.add_argument(
+        "--tenant", required=True, type=_tenant, help="tenant whose floor plans the key gives access to"
+    )
+    create.add_argument("--name", required=True, type=_name, help="name of the key, for your own records")
     create.add_argument(
         "--scope",
         dest="scopes",
         action="append",
         required=True,
         choices=[str(permission) for permission in Permission],
-        help="what it may do; give it again for more",
+        help="scope of the key; repeat the option for several",
     )
     create.add_argument(
-        "--rate-per-minute", type=_rate, help="requests per minute, 0 for any number; by default as the settings say"
+        "--rate-per-minute",
+        type=_rate,
+        help="rate limit in requests per minute; 0: no limit (default: LALALOC_RATE_PER_MINUTE)",
     )
     create.set_defaults(run=_create)
 
-    listing = keys.add_parser("list", help="show the keys there are, revoked ones as well, without their secrets")
-    listing.add_argument("--tenant", type=_tenant, help="only this tenant's")
-    listing.add_argument("--json", action="store_true", help="as JSON instead of a table")
+    listing = keys.add_parser("list", help="list all keys, including revoked ones, without secrets")
+    listing.add_argument("--tenant", type=_tenant, help="list only the keys of this tenant")
+    listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
 
-    revoke = keys.add_parser("revoke", help="end a key; it is refused within a few seconds (LALALOC_KEY_CACHE_S)")
-    revoke.add_argument("id", help="the key's id, the part of it between the underscores")
+    revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within LALALOC_KEY_CACHE_S")
+    revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
     return parser
 
@@ -139,8 +140,8 @@ def _create(arguments: argparse.Namespace) -> int:
             arguments.scopes,
             rate_per_minute=arguments.rate_per_minute,
         )
-    # The key alone goes to standard output, so that it can be piped to where it is kept.
-    print(f"key {key.id} of tenant '{key.tenant}', shown this once:", file=sys.stderr)
+    # Only the key goes to standard output, so that it can be piped.
+    print(f"key {key.id} of tenant '{key.tenant}'; it is shown only once:", file=sys.stderr)
     print(key_text(key.id, secret))
     return 0
 
@@ -158,7 +159,7 @@ def _list(arguments: argparse.Namespace) -> int:
 def _revoke(arguments: argparse.Namespace) -> int:
     with _store() as store:
         if not store.keys.revoke(arguments.id):
-            print(f"lalaloc-service: no key '{arguments.id[:64]}' is in use", file=sys.stderr)
+            print(f"lalaloc-service: no active key '{arguments.id[:64]}'", file=sys.stderr)
             return 1
     print(f"revoked {arguments.id}")
     return 0

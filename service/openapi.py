@@ -13,15 +13,15 @@ from service.app import create_app
 
 
 def openapi_text() -> str:
-    """The API description as YAML; the same for the same code."""
+    """Return the API description as YAML; deterministic."""
     header = "# Written by `python -m service.openapi openapi.yaml`; do not edit.\n"
-    # Through JSON, so that parts which the description shares are written out each time.
+    # Through JSON, so that YAML has no anchors for shared parts.
     document = json.loads(json.dumps(create_app().openapi()))
     return header + yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120)
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", nargs="?", type=Path, help="where to write; standard output when left out")
     file = parser.parse_args().file

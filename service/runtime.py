@@ -1,4 +1,4 @@
-"""The parts of a running service, built once at start-up and taken down in reverse order."""
+"""Components of a running service, built at start-up and closed in reverse order."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
 from service.threads import BoundedReads, Threads
 
-# Queries read little: their plan, and a grid that is not in memory.
+# Queries read little: a plan, and a pose grid that is not in memory.
 _READ_THREADS = 4
-# Small grids are computed on them: more of one tenant would take the cores from queries.
+# They compute small pose grids, so more threads would take cores from queries.
 _UPLOAD_THREADS = with_headroom(2)
-# Poses of the plans of a venue that are searched together, besides a single larger plan: they are copied for a query.
+# Poses of all plans of a venue that are searched together; they are copied for each query. One larger plan is allowed.
 _VENUE_POSES = 40_000
-# Drawings in memory, and revisions that wait to be drawn.
+# Memory for drawings, and number of revisions that can wait to be drawn.
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # Age up to which a plan in memory is used while the database is away.
 _PLAN_CACHE_AGE_S = 600.0
 # Timeout of an event stream; the client then asks again.
 STREAM_DEADLINE_S = 900.0
-# With keys that are not remembered, streams still look no more often.
+# Shortest interval at which streams check their key.
 _MIN_HEARTBEAT_S = 1.0
-# Share of the time for stopping that LPO jobs may go on in.
+# Fraction of the stop deadline for running LPO jobs.
 _LPO_DRAIN = 0.1
 
 
@@ -66,12 +66,12 @@ Part = TypeVar("Part", bound=_Closable)
 
 @dataclass(frozen=True, kw_only=True)
 class Runtime:
-    """Everything that the routes need.
+    """Components that the routes use.
 
     Attributes:
         uploads: threads that check, prepare and store plans.
-        file_uploads: those for plans whose files a converter reads, which is waited for.
-        reads: what queries read of the store.
+        file_uploads: threads for uploads that wait for the converter.
+        reads: store reads of queries.
         drawings: drawings and meshes of plans.
     """
 
@@ -95,18 +95,18 @@ class Runtime:
 
     @property
     def ready(self) -> bool:
-        """Whether workers are warm, as the model is before the first request is taken, and the service goes on."""
+        """True if all workers have started and the service is not stopping."""
         return not self.admission.draining and self.optimiser.state.warmed_up and self.decoder.state.warmed_up
 
 
 @dataclass(frozen=True, kw_only=True)
 class Backends:
-    """What makes those parts that may be in other processes than the service's own and its workers.
+    """Builders of the components that can run in other processes.
 
     Attributes:
-        optimiser: who optimises poses.
-        encoders: the networks, warm.
-        localisers: who answers queries; None: this process.
+        optimiser: builds the pose refinement.
+        encoders: builds the networks, warmed up.
+        localisers: builds the localisers; None: this process computes answers.
     """
 
     optimiser: Callable[[Bundle, Settings, Telemetry], OptimiserBackend]
@@ -117,7 +117,7 @@ class Backends:
 
 
 def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
-    """The networks, each of which has run once; the first run allocates."""
+    """Return the networks after one run of each, because the first run allocates memory."""
     encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     manifest = encoders.manifest
     image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
@@ -126,24 +126,26 @@ def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
     return encoders
 
 
-# None is in another process.
+# All components in this process.
 LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoders=warm_encoders)
 
 
 def start_runtime(
     settings: Settings, telemetry: Telemetry, cleanup: ExitStack, backends: Backends = LOCAL_BACKENDS
 ) -> Runtime:
-    """Open the store, load and warm the model, start the worker processes, and queue unfinished grids.
+    """Open the store, load the model, start the worker processes, and queue unfinished pose grids.
 
-    Blocks for as long as the model loads; the workers warm up in the background.
+    Blocks while the model loads; workers start in the background.
 
     Args:
-        cleanup: takes what has to be closed, also when starting fails half-way.
-        backends: what may be in other processes.
+        settings: settings of the service.
+        telemetry: metrics and tracing.
+        cleanup: receives the components to close, also if the start fails.
+        backends: builders of the components that can run in other processes.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
-        BundleError: there is no usable model.
+        BundleError: no usable model.
     """
     if settings.otlp_endpoint is not None:
         telemetry.tracing = _closing(cleanup, Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
@@ -152,13 +154,13 @@ def start_runtime(
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
     searching = _Searching.start(settings, telemetry, cleanup, backends, bundle, store)
     uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS))
-    # As many as may be read at a time, and after the converter in being closed: what waits for it must be let go first.
+    # As many as the converter reads at a time. Closed after the converter, whose waiting jobs must end first.
     file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.imports.workers)))
     converter = _closing(cleanup, Converter(settings, telemetry))
     grids, localiser = searching.grids, _closing(cleanup, searching.localiser())
     sweeper = Sweeper(store, grids, sweep_s=settings.grids.sweep_s, keep_answers_s=settings.storage.keep_answers_s)
     _closing(cleanup, sweeper).start()
-    # One read at a time, which takes no thread from queries while the database is silent.
+    # One read at a time, so that a silent database takes no thread from queries.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
     venue_localiser = searching.venue_localiser(localiser, _closing(cleanup, searching.venue_plans()))
     if backends.localisers is None:
@@ -189,7 +191,7 @@ def start_runtime(
 
 @dataclass(frozen=True, kw_only=True)
 class _Searching:
-    """What queries are answered with in this process."""
+    """Components of this process that compute answers."""
 
     settings: Settings
     telemetry: Telemetry
@@ -212,8 +214,8 @@ class _Searching:
         bundle: Bundle,
         store: Store,
     ) -> _Searching:
-        """Start the worker processes, which warm up in the background, and load the model."""
-        # The workers first: loading torch in them overlaps with loading the model here.
+        """Start the worker processes in the background and load the model."""
+        # Workers first, so that they load torch while the model loads here.
         optimiser = backends.optimiser(bundle, settings, telemetry)
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry))
@@ -233,7 +235,7 @@ class _Searching:
         )
 
     def localiser(self) -> Localiser:
-        """What answers queries about plans."""
+        """Build the localiser of plans."""
         return Localiser(
             settings=self.settings,
             bundle=self.bundle,
@@ -247,7 +249,7 @@ class _Searching:
         )
 
     def venue_plans(self) -> VenuePlans:
-        """What finds the plans of a venue."""
+        """Build the look-up of a venue's plans."""
         return VenuePlans(
             self.store,
             self.grids,
@@ -259,7 +261,7 @@ class _Searching:
         )
 
     def venue_localiser(self, localiser: Localiser, plans: VenuePlans) -> VenueLocaliser:
-        """What answers queries about venues."""
+        """Build the localiser of venues."""
         return VenueLocaliser(
             settings=self.settings,
             bundle=self.bundle,
@@ -272,7 +274,7 @@ class _Searching:
 
 
 def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
-    """A part, which is closed with everything else."""
+    """Register a component for closing and return it."""
     cleanup.callback(part.close, *arguments)
     return part
 
@@ -282,9 +284,9 @@ def _reads(settings: Settings, *, threads: int, max_pending: int) -> BoundedRead
 
 
 async def runtime_of(request: Request) -> Runtime:
-    """The running service that a request came to.
+    """Return the running service.
 
-    A coroutine only so that the framework does not call it on one of its threads, which slow reads may fill.
+    A coroutine, because the framework would call a plain function on a thread pool that slow reads can fill.
     """
     return request.app.state.runtime
 
@@ -292,7 +294,7 @@ async def runtime_of(request: Request) -> Runtime:
 def _plan_events(
     store: Store, grids: GridProvider, admission: Admission, reads: BoundedReads, settings: Settings
 ) -> PlanEvents:
-    # Their callers' keys are looked at again as often.
+    # The key of a stream is checked at every heartbeat.
     heartbeat_s = (
         max(min(settings.access.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S)
         if settings.access.api_keys

@@ -1,13 +1,13 @@
-"""The service on several machines: a Ray Serve application, `serve run service.on_ray:app`. Needs the extra `ray`.
+"""The service on several machines as a Ray Serve application: `serve run service.on_ray:app`. Needs the extra `ray`.
 
-The ingress is the service as it is, whose queries are answered by others:
+The ingress is the normal service; other deployments compute its queries:
 
-    ingress (the HTTP API)  →  search (plans in memory, the search itself)  →  encoder (the network of images)
-                                                                            →  lpo (the optimiser, on torch)
+    ingress (the HTTP API)  →  search (plans in memory, the search itself)  →  encoder (the image network)
+                                                                            →  lpo (pose refinement, on torch)
 
-Each is a deployment with replicas of its own, more or fewer by what they have to do. The same plan or venue is searched
-by the same replica, by consistent hashing, so that its latent grid stays in memory there. Begin with `application.py`;
-`replicas.py` is what runs in each deployment, `remote.py` how they ask one another.
+Each deployment scales its replicas by load. Consistent hashing sends queries about a plan or venue to the same search
+replica, which keeps its pose grid in memory. Begin with `application.py`; `replicas.py` runs in each deployment,
+`remote.py` connects them.
 """
 
 from service.on_ray.application import RayOptions, app

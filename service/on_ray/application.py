@@ -1,4 +1,4 @@
-"""The application: `serve run service.on_ray:app`, or with other numbers, `... search_max=16 lpo_max=32`."""
+"""Ray Serve application: `serve run service.on_ray:app`, with options such as `search_max=16 lpo_max=32`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from service.settings import Settings
 
 Replicas = Annotated[int, Field(ge=1, le=1000)]
 
-# Of a replica that searches: while one query waits for encoder or optimiser, another is searched for.
+# Queries per search replica: one computes while the other waits for encoder or LPO.
 _SEARCH_THREADS = 2
-# What may be under way in a replica besides what it works on: the next one, so that it has no pause.
+# Requests queued at a replica besides the running one, so that it never idles.
 _NEXT = 1
 
 
 class RayOptions(BaseModel):
-    """How many replicas there are of each deployment, at least and at most."""
+    """Minimum and maximum number of replicas per deployment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,33 +39,35 @@ class RayOptions(BaseModel):
 
 
 def app(arguments: dict[str, str]) -> serve.Application:
-    """The application, of the settings in the environment.
+    """Build the application from the settings in the environment.
 
     Args:
-        arguments: those of `serve run`, by name: see `RayOptions`.
+        arguments: arguments of `serve run`, see `RayOptions`.
 
     Raises:
-        ConfigError: a setting or an argument is wrong, or fewer replicas are allowed than there must be.
-        BundleError: there is no usable model.
+        ConfigError: an invalid setting or argument.
+        BundleError: no usable model.
     """
     try:
         options = RayOptions.model_validate(arguments)
     except ValidationError as error:
-        faults = [f"{'.'.join(map(str, one['loc']))} is {one['input']!r}: {one['msg']}" for one in error.errors()]
+        faults = [
+            f"{'.'.join(map(str, fault['loc']))} is {fault['input']!r}: {fault['msg']}" for fault in error.errors()
+        ]
         raise ConfigError(f"{'; '.join(faults)}; known are {', '.join(RayOptions.model_fields)}") from error
     return application(Settings.load(), options)
 
 
 def application(settings: Settings, options: RayOptions) -> serve.Application:
-    """See `app`; every replica gets the settings, so what they name, such as the bundle, has to be on every machine."""
+    """Build the application; paths in the settings, such as the bundle, must exist on every machine."""
     sha256 = Bundle.open(settings.bundle).sha256
     threads = settings.compute.onnx_threads or 1
-    of_search = settings.with_values(workers=0, compute_threads=_SEARCH_THREADS, onnx_threads=threads)
-    per_search = of_search.query_limit + of_search.requests.max_waiting_queries
-    # As many as all replicas that there may be take: else there would never be more of them.
-    most = settings.requests.max_queries or with_headroom(options.search_max * of_search.query_limit)
-    # Panoramas are decoded where they are searched for.
-    of_ingress = settings.with_values(workers=0, decode_workers=1, max_queries=most)
+    search_settings = settings.with_values(workers=0, compute_threads=_SEARCH_THREADS, onnx_threads=threads)
+    per_search = search_settings.query_limit + search_settings.requests.max_waiting_queries
+    # The capacity of the maximum number of replicas, so that autoscaling can reach it.
+    max_queries = settings.requests.max_queries or with_headroom(options.search_max * search_settings.query_limit)
+    # Panoramas are decoded in the search replicas.
+    ingress_settings = settings.with_values(workers=0, decode_workers=1, max_queries=max_queries)
     single = settings.with_values(onnx_threads=threads)
 
     encoder = serve.deployment(
@@ -81,9 +83,9 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
         max_queued_requests=settings.lpo.queue,
         **_scaled("lpo", options, target=1.0 + _NEXT),
     ).bind(single, sha256)
-    # As without Ray, no workers are no LPO; any other number is a matter of replicas.
+    # 0 workers turn LPO off; any other number is replaced by the number of replicas.
     optimiser = None if settings.compute.workers == 0 else lpo
-    # The class is annotated as what it is not.
+    # The annotation of the router class is wrong.
     routed: dict[str, Any] = {"request_router_class": ConsistentHashRouter}
     search = serve.deployment(
         SearchReplica,
@@ -91,31 +93,35 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
         max_ongoing_requests=per_search,
         request_router_config=RequestRouterConfig(**routed),
         graceful_shutdown_timeout_s=settings.requests.stop_deadline_s,
-        **_scaled("search", options, target=float(of_search.query_limit)),
-    ).bind(of_search, sha256, encoder, optimiser)
+        **_scaled("search", options, target=float(search_settings.query_limit)),
+    ).bind(search_settings, sha256, encoder, optimiser)
     ingress = serve.deployment(
         IngressReplica,
         name="ingress",
-        max_ongoing_requests=of_ingress.pending_limit + settings.requests.max_reads + settings.requests.max_streams,
+        max_ongoing_requests=ingress_settings.pending_limit
+        + settings.requests.max_reads
+        + settings.requests.max_streams,
         graceful_shutdown_timeout_s=settings.requests.stop_deadline_s,
-        **_scaled("ingress", options, target=0.5 * of_ingress.pending_limit),
+        **_scaled("ingress", options, target=0.5 * ingress_settings.pending_limit),
     )
-    return ingress.bind(of_ingress, optimiser, search)
+    return ingress.bind(ingress_settings, optimiser, search)
 
 
 def _scaled(name: str, options: RayOptions, target: float) -> dict[str, Any]:
-    """How many replicas a deployment has.
+    """Return the scaling options of a deployment.
 
     Args:
-        target: requests under way in each of them that there should be on average.
+        name: name of the deployment.
+        options: numbers of replicas.
+        target: average number of ongoing requests per replica.
 
     Raises:
-        ConfigError: the most is less than the least.
+        ConfigError: the maximum is below the minimum.
     """
-    least, most = getattr(options, f"{name}_min"), getattr(options, f"{name}_max")
-    if most < least:
-        raise ConfigError(f"{name}_max is {most}, less than {name}_min, which is {least}")
-    if least == most:
-        return {"num_replicas": least}
-    scaling = AutoscalingConfig(min_replicas=least, max_replicas=most, target_ongoing_requests=target)
+    low, high = getattr(options, f"{name}_min"), getattr(options, f"{name}_max")
+    if high < low:
+        raise ConfigError(f"{name}_max is {high}, less than {name}_min, which is {low}")
+    if low == high:
+        return {"num_replicas": low}
+    scaling = AutoscalingConfig(min_replicas=low, max_replicas=high, target_ongoing_requests=target)
     return {"autoscaling_config": scaling}

@@ -1,4 +1,4 @@
-"""What comes back of a query from another process: an answer, or the error with all that its problem document says."""
+"""Outcome of a query in another process: an answer, or an error with all its attributes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Success(Generic[T]):
-    """An answer."""
+    """Answer."""
 
     value: T
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An error that is meant for whoever asked.
+    """Error for the caller.
 
-    Errors are not sent as they are: pickling makes them anew of the text that they end with, which is seldom what
-    their constructors take.
+    Exceptions are not sent themselves: unpickling calls their constructors with the message, which most of them do not
+    accept.
     """
 
     kind: type[LaLaLocError]
@@ -35,28 +35,28 @@ class Failure:
 
     @classmethod
     def of(cls, error: LaLaLocError) -> Failure:
-        """What an error says."""
+        """Return the failure for an error."""
         return cls(type(error), error.args, dict(error.__dict__))
 
     @property
     def error(self) -> LaLaLocError:
-        """The same error."""
+        """The original error."""
         error = self.kind.__new__(self.kind)
         error.args = self.text
         error.__dict__.update(self.attributes)
         return error
 
 
-def telling_failures(
+def returning_failures(
     method: Callable[Concatenate[S, P], Awaitable[T]],
 ) -> Callable[Concatenate[S, P], Coroutine[Any, Any, Success[T] | Failure]]:
-    """A method of a replica that returns an outcome: what this one returns, or the `LaLaLocError` that it raises."""
+    """Make a replica's method return its answer or the `LaLaLocError` that it raises as an outcome."""
 
     @wraps(method)
-    async def told(self: S, *args: P.args, **kwargs: P.kwargs) -> Success[T] | Failure:
+    async def wrapper(self: S, *args: P.args, **kwargs: P.kwargs) -> Success[T] | Failure:
         try:
             return Success(await method(self, *args, **kwargs))
         except LaLaLocError as error:
             return Failure.of(error)
 
-    return told
+    return wrapper

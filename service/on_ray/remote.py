@@ -1,4 +1,4 @@
-"""What asks the replicas of another deployment, with the face of what does the same in one process."""
+"""Clients of other deployments, with the interfaces of the local components."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
 
-# A replica that dies takes its requests with it; what it was asked stores nothing, so another one is asked.
+# Requests store nothing, so they are retried if a replica dies.
 _ATTEMPTS = 2
-# How much later than the query's own deadline its answer may come: that says more than a deadline does.
+# Extra time for the answer of the remote service, whose own timeout error is more specific.
 _ON_THE_WAY_S = 1.0
 
 T = TypeVar("T")
 
 
 class RemoteEncoders(Encoders):
-    """The networks, of which that of images runs elsewhere."""
+    """Networks with a remote image encoder."""
 
     def __init__(self, bundle: Bundle, settings: Settings, encoder: DeploymentHandle) -> None:
         super().__init__(bundle, threads=settings.cores.onnx_threads)
@@ -53,7 +53,7 @@ class RemoteEncoders(Encoders):
         """See `Encoders.query`; for threads, which wait for the answer.
 
         Raises:
-            DeadlineExceededError: no replica answered, or two died.
+            DeadlineExceededError: no answer in time, or two replicas died.
         """
         for _ in range(_ATTEMPTS):
             response = self._encoder.query.remote(image, heading, camera_height, heading_tolerance)
@@ -68,21 +68,23 @@ class RemoteEncoders(Encoders):
 
 
 class RemoteOptimiser:
-    """LPO elsewhere, whose jobs may fail for any reason: the caller then does without, as with `LpoPool`."""
+    """Remote LPO; a job can fail for any reason, and the query then keeps the VDR pose, as with `LpoPool`.
+
+    Args:
+        lpo: deployment of LPO; None if LPO is off.
+        telemetry: metrics.
+    """
 
     def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
-        """Args:
-        lpo: None: LPO is turned off.
-        """
         self._lpo = lpo
         self._telemetry = telemetry
 
     def start(self) -> None:
-        """Nothing to do: an application runs once all its deployments do."""
+        """Do nothing: Ray starts the replicas."""
 
     @property
     def state(self) -> PoolState:
-        """As one worker that is always warm: Ray starts and replaces the replicas."""
+        """State of one worker that is always ready; Ray starts and replaces the replicas."""
         workers = 0 if self._lpo is None else 1
         return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
 
@@ -108,33 +110,37 @@ class RemoteOptimiser:
         return self._missed("died")
 
     def close(self, drain_s: float = 0.0) -> None:
-        """Nothing to do, as for `start`."""
+        """Do nothing: Ray stops the replicas."""
 
     def _missed(self, reason: LostReason) -> None:
         self._telemetry.lpo_missed.labels(reason).inc()
 
 
 class _SearchCaller:
-    """Asks the replicas that search, the same one about the same plan or venue while there is no change in them."""
+    """Client of the search replicas; equal plans and venues go to the same replica."""
 
     def __init__(self, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
         self._search = search
         self._settings = settings
         self._telemetry = telemetry
 
-    async def _call(self, method: str, of_id: str, context: QueryContext, *arguments: Any) -> Any:
-        """Args:
-            of_id: the plan or venue.
-            context: of the query.
+    async def _call(self, method: str, resource_id: str, context: QueryContext, *arguments: Any) -> Any:
+        """Call a method of a search replica.
+
+        Args:
+            method: name of the method.
+            resource_id: id of the plan or venue, which selects the replica.
+            context: context of the query.
+            *arguments: arguments of the method.
 
         Raises:
-            LaLaLocError: what the replica raised.
-            OverloadedError: as many wait already as may.
-            DeadlineExceededError: no answer came in time, or two replicas died over it.
+            LaLaLocError: raised by the replica.
+            OverloadedError: the replica's queue is full.
+            DeadlineExceededError: no answer in time, or two replicas died.
         """
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
-                call = getattr(self._search.options(session_id=of_id), method)
+                call = getattr(self._search.options(session_id=resource_id), method)
                 response = call.remote(*arguments)
                 try:
                     async with asyncio.timeout(max(context.left_s + _ON_THE_WAY_S, 0.0)):
@@ -152,14 +158,14 @@ class _SearchCaller:
         raise DeadlineExceededError(self._settings.requests.request_deadline_s)
 
     def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
-        """Count an answer here as well, where metrics are asked for."""
+        """Count an answer in this process, whose metrics are scraped."""
         for name, spent_ms in answer.timings_ms.model_dump(exclude_none=True).items():
             self._telemetry.stage_seconds.labels(name).observe(spent_ms / 1e3)
         self._telemetry.answers.labels(answer.stage).inc()
 
 
 class RemoteLocaliser(_SearchCaller):
-    """Answers queries about plans, as `Localiser` does."""
+    """Remote `Localiser`."""
 
     def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
         super().__init__(search, settings, telemetry)
@@ -194,7 +200,7 @@ class RemoteLocaliser(_SearchCaller):
 
 
 class RemoteVenueLocaliser(_SearchCaller):
-    """Answers queries about venues, as `VenueLocaliser` does."""
+    """Remote `VenueLocaliser`."""
 
     async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.localise`."""

@@ -1,4 +1,4 @@
-"""What runs in the replicas of each deployment."""
+"""Replicas of each deployment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.app import create_app
 from service.errors import UnknownFloorPlanError, UnknownVenueError
-from service.on_ray.outcome import telling_failures
+from service.on_ray.outcome import returning_failures
 from service.on_ray.remote import RemoteEncoders, RemoteLocaliser, RemoteOptimiser, RemoteVenueLocaliser
 from service.query import PanoramaQuery, PictureRequest, SequenceQuery
 from service.runtime import Backends, start_runtime, warm_encoders
@@ -30,11 +30,13 @@ from service.workers.lpo import load_refiner
 
 
 class EncoderReplica:
-    """Encodes panoramas."""
+    """Encoder of panoramas."""
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
-        """Raises:
-        RuntimeError: this machine has another bundle than the others.
+        """Load the networks.
+
+        Raises:
+            RuntimeError: this machine has a different bundle.
         """
         self._encoders = warm_encoders(_same_bundle(settings, model_sha256), settings)
 
@@ -50,20 +52,20 @@ class EncoderReplica:
 
 
 class LpoReplica:
-    """Optimises poses, on torch; the body of an LPO worker in a process that Ray watches over."""
+    """Pose refinement on torch: the body of an LPO worker, in a process that Ray supervises."""
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
         """See `EncoderReplica`."""
         self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.cores.worker_threads)
 
     def refine(self, job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
-        """A job's result."""
-        # What comes out of the shared memory may only be read, of which torch warns.
+        """Return the result of a job."""
+        # Copied, because torch warns about the read-only arrays of shared memory.
         return self._refine(deepcopy(job))
 
 
 class SearchReplica:
-    """Answers queries: the service without its HTTP, whose encoder and optimiser are elsewhere."""
+    """Search: the service without HTTP, with remote encoder and LPO."""
 
     def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle, lpo: DeploymentHandle) -> None:
         """See `EncoderReplica`."""
@@ -76,49 +78,49 @@ class SearchReplica:
         self._cleanup = ExitStack()
         self._runtime = start_runtime(settings, Telemetry(), self._cleanup, backends)
 
-    @telling_failures
+    @returning_failures
     async def localise(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
         """See `Localiser.localise`."""
         return await self._runtime.localiser.localise(await self._plan(tenant, plan_id), query)
 
-    @telling_failures
+    @returning_failures
     async def localise_and_draw(
         self, tenant: str, plan_id: str, query: PanoramaQuery, wanted: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, wanted)
 
-    @telling_failures
+    @returning_failures
     async def localise_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:
         """See `Localiser.localise_sequence`."""
         return await self._runtime.localiser.localise_sequence(await self._plan(tenant, plan_id), query)
 
-    @telling_failures
+    @returning_failures
     async def localise_in_venue(self, tenant: str, venue_id: str, query: PanoramaQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.localise`."""
         return await self._runtime.venue_localiser.localise(await self._venue(tenant, venue_id), query)
 
-    @telling_failures
+    @returning_failures
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.localise_near`."""
         return await self._runtime.venue_localiser.localise_near(tenant, place, within_m, query)
 
-    @telling_failures
+    @returning_failures
     async def check_hints(self, tenant: str, venue_id: str, form: LocaliseForm) -> None:
         """See `VenueLocaliser.check_hints`."""
         await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
 
     async def revisions(self) -> frozenset[str]:
-        """The revisions of plans whose latent grids are in memory here."""
+        """Return the revisions of plans whose pose grids are in memory."""
         return frozenset(self._runtime.grids.revisions())
 
     async def _plan(self, tenant: str, plan_id: str) -> PlanRecord:
-        """A plan as it is kept here: with all that has been derived from it."""
+        """Return a plan from this replica's own cache."""
         record = await self._runtime.plan_lookup.find(tenant, plan_id, self._runtime.reads)
         if record is None:
-            # Deleted since the ingress looked.
+            # Deleted meanwhile.
             raise UnknownFloorPlanError(plan_id)
         return record
 
@@ -129,14 +131,14 @@ class SearchReplica:
         return record
 
     def __del__(self) -> None:
-        # What Ray calls when it takes a replica down; it is not there where starting failed early.
+        # Ray calls this when it stops a replica; `_cleanup` is missing if the start failed early.
         if (cleanup := self.__dict__.get("_cleanup")) is not None:
             cleanup.close()
 
 
 @serve.ingress()
 class IngressReplica:
-    """The HTTP API: the service's own application, whose queries the replicas that search answer."""
+    """HTTP API: the normal application, with search replicas as its localisers."""
 
     def __init__(self, settings: Settings, lpo: DeploymentHandle | None, search: DeploymentHandle) -> None:
         self._settings = settings
@@ -155,26 +157,28 @@ class IngressReplica:
             encoders=warm_encoders,
             localisers=localisers,
         )
-        return named_once(create_app(self._settings, backends))
+        return without_request_id(create_app(self._settings, backends))
 
 
-def named_once(app: ASGIApp) -> ASGIApp:
-    """An application that leaves it to Ray's proxy to tell the id of a request, which it adds to every answer."""
+def without_request_id(app: ASGIApp) -> ASGIApp:
+    """Remove `X-Request-ID` from answers, because Ray's proxy adds it."""
 
-    async def without_id(scope: Scope, receive: Receive, send: Send) -> None:
-        async def told(message: Message) -> None:
+    async def strip(scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_stripped(message: Message) -> None:
             if message["type"] == "http.response.start":
                 kept = [(name, value) for name, value in message["headers"] if name.lower() != b"x-request-id"]
                 message = {**message, "headers": kept}
             await send(message)
 
-        await app(scope, receive, told)
+        await app(scope, receive, send_stripped)
 
-    return without_id
+    return strip
 
 
 def _same_bundle(settings: Settings, model_sha256: str) -> Bundle:
     bundle = Bundle.open(settings.bundle)
     if bundle.sha256 != model_sha256:
-        raise RuntimeError(f"the bundle in {settings.bundle} is {bundle.sha256}, elsewhere it is {model_sha256}")
+        raise RuntimeError(
+            f"the bundle in {settings.bundle} has digest {bundle.sha256}; the application uses {model_sha256}"
+        )
     return bundle

@@ -1,12 +1,11 @@
-"""Who may do what: API keys, their scopes and rates, and what holds while there are none.
+"""Access control: API keys, scopes, rate limits, and the rules while keys are off.
 
-access_control  what happens to a request: exposure, key, rate, scope, in this order
-├── exposure        without keys: only over loopback or a Unix socket, unless told otherwise
-├── keys            making, hashing and reading keys
-├── key_cache       which keys are valid: the store's, remembered for a few seconds
-├── client_network  which client addresses count as one
-├── rate_limits     requests per key, and refused keys per client address
-└── permissions     scopes, which route needs which, and on whose behalf a request comes
+access_control  checks of a request: exposure, key, rate, scope, in this order
+├── exposure        without keys: local requests only, unless configured otherwise
+├── keys            creating, hashing and parsing keys
+├── key_cache       valid keys, cached for a few seconds
+├── rate_limits     requests per key, and invalid keys per client address
+└── permissions     scopes, the scope of each route, the caller of a request
 
 Begin with `access_control.py`.
 """

@@ -1,4 +1,4 @@
-"""Decides about every request before its body is read: where it came in, whose key it has, how often, and for what."""
+"""Access checks of every request before its body is read: exposure, API key, rate limit, scope."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.storage.api_keys import ApiKeys
 from service.storage.records import ApiKey
 from service.telemetry import add_log_fields
 
-# What `AuthorisationMiddleware` refuses with, besides 404 and 405.
+# Errors of `AuthorisationMiddleware`, besides 404 and 405.
 REFUSALS = (
     UnauthenticatedError,
     InsufficientScopeError,
@@ -34,17 +34,17 @@ REFUSALS = (
     TooManyRefusedKeysError,
     StoreUnavailableError,
 )
-_NO_KEY = "an API key is needed: send `Authorization: Bearer lalaloc_...`"
-_MALFORMED = "the Authorization header does not hold one API key; it reads `Bearer lalaloc_...`"
-_REFUSED = "the API key is not known here, or was revoked"
+_NO_KEY = "an API key is required: send `Authorization: Bearer lalaloc_...`"
+_MALFORMED = "the Authorization header must be `Bearer lalaloc_...`, with one API key"
+_REFUSED = "the API key is unknown or revoked"
 
 
 class AccessControl:
-    """Lets the requests of one running app in, or refuses them."""
+    """Access checks of one running app."""
 
     def __init__(self, keys: ApiKeys, settings: Settings) -> None:
         self._needs_keys = settings.access.api_keys
-        # A port that is published on this machine alone is reached over an address of a container's network.
+        # A container port that is published locally is reached over a network address of the container.
         published_here = settings.access.published_host is not None and is_local((settings.access.published_host, 0))
         self._allow_anonymous = settings.access.allow_anonymous or published_here
         self._pages = settings.access.cors_origin_set
@@ -57,16 +57,16 @@ class AccessControl:
         self._keys.close()
 
     async def authorise(self, request: Request) -> Caller:
-        """Who sent a request to anything but health.
+        """Return the caller of a request.
 
         Raises:
-            ExposedWithoutKeysError: it came from elsewhere, and there are no keys.
-            UnauthenticatedError: it has no valid key.
-            TooManyRefusedKeysError: its client sent too many keys that are not valid.
-            RateLimitedError: its key sent too many requests.
-            StoreUnavailableError: the database is away, and its key is not known from the last minutes.
-            InsufficientScopeError: its key is not good for this.
-            HTTPException: there is no such route, or it has no such method.
+            ExposedWithoutKeysError: a remote request while keys are off.
+            UnauthenticatedError: no valid key.
+            TooManyRefusedKeysError: too many invalid keys from the client.
+            RateLimitedError: the key exceeded its rate limit.
+            StoreUnavailableError: the database is away, and the key is not cached.
+            InsufficientScopeError: the key lacks the scope.
+            HTTPException: unknown route or method.
         """
         if not self._needs_keys:
             self._check_local(request)
@@ -85,7 +85,7 @@ class AccessControl:
         return caller
 
     async def still_authorised(self, request: Request) -> bool:
-        """Whether the key of a request that was let in is still valid; true where there are no keys."""
+        """Return True while the key of an accepted request is valid, or keys are off."""
         presented = parse_authorization(Headers(scope=request.scope).getlist("authorization"))
         if not self._needs_keys or presented is None:
             return not self._needs_keys
@@ -95,13 +95,15 @@ class AccessControl:
             return False
 
     def _check_local(self, request: Request) -> None:
-        """Raises:
-        ExposedWithoutKeysError: the request came from another machine, or a page from elsewhere made it.
+        """Refuse requests from other machines and from pages of other sites.
+
+        Raises:
+            ExposedWithoutKeysError: such a request.
         """
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
             raise ExposedWithoutKeysError("over a loopback address")
-        # Browsers do not ask over Unix sockets; what does, a proxy, names the service as its own clients do.
+        # Only proxies use Unix sockets, and they pass on the host name that their clients use.
         if server is not None and server[1] is not None:
             headers = Headers(scope=request.scope)
             check_origin(request.method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
@@ -115,7 +117,7 @@ class AccessControl:
         if presented is None:
             await self._rates.count_refused(client)
             raise UnauthenticatedError(_MALFORMED)
-        # Many clients may share an address, so keys that work are not held up by those that do not.
+        # Clients can share an address, so valid keys are not affected by invalid ones.
         if not self._keys.remembers(presented):
             await self._rates.check_refused(client)
         key = await self._keys.find(presented)
@@ -130,15 +132,15 @@ def _client_of(request: Request) -> str:
 
 
 def _needed(request: Request) -> Permission:
-    """What a request's route needs.
+    """Return the scope that a request's route needs.
 
     Raises:
-        HTTPException: there is no such route, or it has no such method.
+        HTTPException: unknown route or method.
     """
     methods = permissions_needed(routed_path(request.scope))
     if not methods:
         raise HTTPException(404)
-    # Where there is HEAD, it is GET without its body.
+    # HEAD needs the scope of GET.
     method = "GET" if request.method == "HEAD" else request.method
     if method not in methods:
         raise HTTPException(405, headers={"Allow": ", ".join(methods)})
@@ -146,6 +148,6 @@ def _needed(request: Request) -> Permission:
 
 
 def routed_path(scope: Scope) -> str:
-    """The path as routes know it: without the prefix that a proxy put before it."""
+    """Return the path without the prefix of a proxy."""
     path, prefix = scope["path"], scope.get("root_path", "")
     return path[len(prefix) :] if prefix and path.startswith(f"{prefix}/") else path

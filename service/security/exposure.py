@@ -1,9 +1,8 @@
-"""Without API keys the service answers its own machine only, unless it is told otherwise.
+"""Rules without API keys: only local requests are answered, unless configured otherwise.
 
-Other machines and other names are let in apart from each other: a container is asked over a network of its own, and yet
-only by programs and pages of the machine that it runs on. A browser on this machine counts as it only under a loopback
-name, and for changes only with a page from here: names of other sites may be made to resolve to 127.0.0.1, and their
-forms may be sent anywhere.
+Addresses and host names are checked separately: a container receives requests over its own network, but only from
+programs and pages of its host. A browser must use a loopback name, and for changes a page of this service: other sites
+can make their names resolve to 127.0.0.1 (DNS rebinding), and can send forms anywhere.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ _CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 def is_local(server: tuple[str, int | None] | None) -> bool:
-    """Whether a connection cannot come from another machine.
+    """Return True if a connection must come from this machine.
 
     Args:
-        server: the address of this end of it: host and port, or path and None; None for a Unix socket as well.
+        server: local address: host and port, or path and None; None for a Unix socket.
     """
     if server is None or server[1] is None:
         return True
@@ -31,16 +30,13 @@ def is_local(server: tuple[str, int | None] | None) -> bool:
         address = ipaddress.ip_address(server[0])
     except ValueError:
         return False
-    # 127.0.0.1 as a socket for both kinds of addresses names it.
+    # A dual-stack socket reports 127.0.0.1 as an IPv4-mapped address.
     mapped = getattr(address, "ipv4_mapped", None)
     return (mapped or address).is_loopback
 
 
-def may_be_named(authority: str, allowed: Set[str] = frozenset()) -> bool:
-    """Whether a host with or without a port is a loopback address, `localhost`, or among those allowed (`*`: any).
-
-    A browser that was sent here by the page of another site, under a name that the site controls, says that name.
-    """
+def is_allowed_host(authority: str, allowed: Set[str] = frozenset()) -> bool:
+    """Return True if a host, with or without port, is loopback, `localhost` or in `allowed` (`*`: any)."""
     try:
         host = urlsplit(f"//{authority}").hostname or ""
     except ValueError:
@@ -55,38 +51,39 @@ def check_origin(
     allowed: Set[str] = frozenset(),
     pages: Set[str] = frozenset(),
 ) -> None:
-    """Refuse what a browser was made to send by a page from elsewhere.
+    """Refuse requests that pages of other sites make a browser send.
 
     Args:
-        hosts: values of `Host`; programs may leave it out, browsers do not.
-        origins: values of `Origin`, which browsers send with whatever changes something.
-        allowed: names besides this machine's that will do, `*` for any.
-        pages: whole origins whose pages will do as well.
+        method: HTTP method.
+        hosts: values of `Host`, which browsers always send.
+        origins: values of `Origin`, which browsers send with changes.
+        allowed: allowed host names besides this machine's, `*` for any.
+        pages: allowed origins.
 
     Raises:
-        ExposedWithoutKeysError: another name, or a change that a page from elsewhere asked for.
+        ExposedWithoutKeysError: another host name, or a change requested by a page of another site.
     """
-    if not all(may_be_named(host, allowed) for host in hosts):
+    if not all(is_allowed_host(host, allowed) for host in hosts):
         raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)")
-    strange = [origin for origin in origins if origin.lower() not in pages]
-    if method in _CHANGING and not all(may_be_named(origin.partition("://")[2], allowed) for origin in strange):
+    foreign = [origin for origin in origins if origin.lower() not in pages]
+    if method in _CHANGING and not all(is_allowed_host(origin.partition("://")[2], allowed) for origin in foreign):
         raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)")
 
 
 def check_address(host: str, settings: Settings) -> None:
-    """Refuse to listen where others could ask without a key.
+    """Refuse to listen on a public address without keys.
 
     Args:
-        host: the numeric address that is listened on; `0.0.0.0` and `::` are all of the machine's. Where the settings
-            say that the port is published on another one, that counts.
+        host: numeric address to listen on; `published_on` in the settings takes precedence.
+        settings: settings of the service.
 
     Raises:
-        ConfigError: not a loopback address, while there are neither keys nor leave to do without.
+        ConfigError: not a loopback address, while keys are off and `allow_anonymous` is not set.
     """
     reached = settings.access.published_host or host
     if not settings.access.api_keys and not settings.access.allow_anonymous and not is_local((reached, 0)):
         raise ConfigError(
-            f"refusing to listen on {reached} without API keys: others than this machine could read, change and delete "
-            "every floor plan. Set LALALOC_API_KEYS=on and make keys with `lalaloc-service keys create`, listen on "
-            "127.0.0.1, or, where something else decides who gets here, set LALALOC_ALLOW_ANONYMOUS=on"
+            f"refusing to listen on {reached} without API keys: anyone on the network could read, change and delete "
+            "every floor plan. Set LALALOC_API_KEYS=on and create keys with `lalaloc-service keys create`, listen on "
+            "127.0.0.1, or, behind your own access control, set LALALOC_ALLOW_ANONYMOUS=on"
         )

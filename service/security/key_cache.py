@@ -1,4 +1,4 @@
-"""Which keys are valid: what the store says, remembered for a few seconds, and longer while the database is away."""
+"""Valid keys, cached for a few seconds, and longer while the database is away."""
 
 from __future__ import annotations
 
@@ -18,33 +18,35 @@ from service.storage.api_keys import ApiKeys
 from service.storage.circuit_breaker import CircuitBreaker
 from service.storage.records import ApiKey
 
-# How long a key goes on working while the database is away.
+# Lifetime of a cached key while the database is away.
 _TRUSTED_S = 600.0
 _TOUCHED_EVERY = timedelta(minutes=1)
-# Look-ups do not wait behind queries and uploads for a thread.
+# Own threads, so that look-ups do not wait behind queries and uploads.
 _THREADS = 2
-# A record with its strings; generous.
+# Upper bound of a record with its strings.
 _RECORD_BYTES = 2048
 _MEMORY_BYTES = 8 * 2**20
 
 
 @dataclass(frozen=True)
 class _Known:
-    """A key that was valid; moments in seconds of the ring's clock."""
+    """Key that was valid; times in seconds of the cache's clock."""
 
     key: ApiKey
     verified_s: float
-    ask_again_s: float
+    refresh_s: float
 
 
 class KeyCache:
-    """Looks keys up."""
+    """Look-up of keys.
+
+    Args:
+        keys: stored keys.
+        fresh_s: lifetime of a cached key; a revoked key is rejected after this delay.
+        clock: current time, seconds.
+    """
 
     def __init__(self, keys: ApiKeys, *, fresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """Args:
-        fresh_s: how long an answer of the store is used; a revoked key is refused at most that much later.
-        clock: seconds.
-        """
         self._keys = keys
         self._fresh_s = fresh_s
         self._clock = clock
@@ -53,24 +55,23 @@ class KeyCache:
         self._breaker = CircuitBreaker(clock)
 
     def remembers(self, presented: PresentedKey) -> bool:
-        """Whether the key was valid not long ago."""
+        """Return True if the key was valid recently."""
         return self._known.get(presented.hash) is not None
 
     async def find(self, presented: PresentedKey) -> ApiKey | None:
-        """The key, or None when it is unknown or revoked.
+        """Return the key; None if it is unknown or revoked.
 
-        A key is found by the hash of its secret alone: an unknown id and a wrong secret are the same look-up, and the
-        time it takes tells no more than how a hash begins that nobody can choose or undo.
+        The look-up uses the hash of the secret only, so its duration does not reveal whether an id exists.
 
         Raises:
-            StoreUnavailableError: the database is away, and the key is not known from the last minutes.
-            StoreBusyError: too many use it.
+            StoreUnavailableError: the database is away, and the key is not cached.
+            StoreBusyError: all database connections are in use.
         """
         known = self._known.get(presented.hash)
-        if known is not None and self._clock() < known.ask_again_s:
+        if known is not None and self._clock() < known.refresh_s:
             key = known.key
         else:
-            key = await asyncio.get_running_loop().run_in_executor(self._threads, self._ask, presented.hash)
+            key = await asyncio.get_running_loop().run_in_executor(self._threads, self._look_up, presented.hash)
         if key is None or not hmac.compare_digest(key.id, presented.id):
             return None
         return key
@@ -79,24 +80,24 @@ class KeyCache:
         """Finish the look-up in work, drop the others."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    def _ask(self, key_hash: str) -> ApiKey | None:
+    def _look_up(self, key_hash: str) -> ApiKey | None:
         known = self._known.get(key_hash)
-        # Another request may have asked since this one began to wait.
-        if known is not None and self._clock() < known.ask_again_s:
+        # Another request may have looked it up meanwhile.
+        if known is not None and self._clock() < known.refresh_s:
             return known.key
         try:
             key = self._find(key_hash)
         except StoreBusyError:
-            # It is there, and the key may be revoked.
+            # The database is up, so the cached key may be out of date.
             raise
         except StoreUnavailableError:
             now_s = self._clock()
             if known is None or now_s - known.verified_s > _TRUSTED_S:
                 raise
-            self._known.put(key_hash, replace(known, ask_again_s=now_s + self._fresh_s))
+            self._known.put(key_hash, replace(known, refresh_s=now_s + self._fresh_s))
             return known.key
         if key is None:
-            self._known.drop(lambda other, _: other == key_hash)
+            self._known.drop(lambda cached, _: cached == key_hash)
             return None
         now_s = self._clock()
         self._known.put(key_hash, _Known(key, now_s, now_s + self._fresh_s))
@@ -105,7 +106,7 @@ class KeyCache:
         return key
 
     def _find(self, key_hash: str) -> ApiKey | None:
-        # One after the other would wait for a database that does not answer.
+        # Without the breaker every look-up would wait for the silent database.
         if self._breaker.is_open:
             raise StoreUnavailableError()
         try:
@@ -117,6 +118,6 @@ class KeyCache:
             raise
 
     def _touch(self, key_id: str) -> None:
-        # Only told to operators; the next use writes it.
+        # For information only; the next use writes it.
         with suppress(StoreUnavailableError):
             self._keys.touch(key_id)

@@ -1,7 +1,6 @@
-"""API keys as text: `lalaloc_<id>_<secret>`, of which the service keeps the id and a hash of the secret.
+"""API keys as text: `lalaloc_<id>_<secret>`; the service stores the id and a hash of the secret.
 
-The secret is 256 random bits, so a fast hash keeps it as well as a slow one would: slow hashes make up for secrets that
-can be guessed, and nobody guesses one of 2^256. Whoever reads the hashes cannot present any of them.
+The secret is 256 random bits, so a fast hash is sufficient: slow hashes only help against guessable secrets.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ _BEARER = re.compile(r"bearer +(\S+)", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class PresentedKey:
-    """A key that somebody presents; whether it is valid is another matter.
+    """Key in a request, not yet checked.
 
     Attributes:
-        id: names the key, no secret.
+        id: id of the key; not secret.
         hash: SHA-256 of its secret, 64 hexadecimal digits.
     """
 
@@ -31,22 +30,22 @@ class PresentedKey:
 
 
 def new_secret() -> str:
-    """256 random bits as 43 letters, digits, dashes and underscores."""
+    """Return 256 random bits as 43 characters."""
     return secrets.token_urlsafe(_SECRET_BYTES)
 
 
 def hash_of(secret: str) -> str:
-    """What is stored of a secret: its SHA-256 as 64 hexadecimal digits."""
+    """Return the stored hash of a secret: SHA-256, 64 hexadecimal digits."""
     return hashlib.sha256(secret.encode("ascii")).hexdigest()
 
 
 def key_text(key_id: str, secret: str) -> str:
-    """The key as its owner keeps and sends it."""
+    """Return the key as text."""
     return f"lalaloc_{key_id}_{secret}"
 
 
 def parse_authorization(values: Sequence[str]) -> PresentedKey | None:
-    """The key of a request's `Authorization` headers; None when there is not exactly one, with one well-formed key."""
+    """Parse `Authorization` headers; None unless there is exactly one, with a well-formed key."""
     bearer = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
     key = _KEY.fullmatch(bearer[1]) if bearer else None
     return None if key is None else PresentedKey(key[1], hash_of(key[2]))

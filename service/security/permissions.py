@@ -1,4 +1,4 @@
-"""Scopes, the one table that says which route needs which, and on whose behalf a request comes."""
+"""Scopes, the table of scopes per route, and the caller of a request."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from starlette.types import Scope
 from service.storage.records import DEFAULT_TENANT
 
 _SCOPE_KEY = "lalaloc.caller"
-# Who has one IPv6 address commonly has all that begin like it.
+# An IPv6 client usually owns a whole /64.
 _IPV6_NETWORK_BITS = 64
 
 
 class Permission(StrEnum):
-    """What a key is good for; none includes another."""
+    """Scope of a key; no scope includes another."""
 
     READ = "read"
     LOCALISE = "localise"
     WRITE = "write"
 
 
-# Answered to everybody: whoever watches the process need not have a key.
+# Open to everyone, so that monitoring needs no key.
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
-# Answered without a key, from where requests are answered at all: pages, which ask for one themselves. They are the
-# same for everybody.
+# Pages, open without a key; they ask for one themselves.
 PAGES = frozenset({"/", "/docs", "/web/{name}", "/favicon.ico"})
 
-# Every other route. With keys, what does not stand here is not there: a new route is closed until it has a row.
+# Scopes of all other routes. With keys on, a route without a row does not exist.
 NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/openapi.json"): Permission.READ,
     ("GET", "/metrics"): Permission.READ,
@@ -66,13 +65,13 @@ _PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]
 
 @dataclass(frozen=True)
 class Caller:
-    """On whose behalf a request comes.
+    """Caller of a request.
 
     Attributes:
-        tenant: whose plans it may see.
-        key_id: id of its API key, None where there are no keys.
-        permissions: what it may do.
-        client: with whom it shares what the service can do at a time: its tenant, or without keys its client address.
+        tenant: tenant whose plans are visible.
+        key_id: id of the API key; None while keys are off.
+        permissions: scopes of the key.
+        client: unit of fair sharing: the tenant, or without keys the client address.
     """
 
     tenant: str
@@ -82,12 +81,12 @@ class Caller:
 
 
 def anyone(client: str) -> Caller:
-    """Whoever asks while keys are off, from a client address."""
+    """Return the caller of a request while keys are off."""
     return Caller(DEFAULT_TENANT, None, frozenset(Permission), network_of(client))
 
 
 def permissions_needed(path: str) -> dict[str, Permission]:
-    """Which methods a path has and what each needs; empty for a path that is none of a route."""
+    """Return the methods of a path with their scopes; empty for an unknown path."""
     if is_page(path):
         return {"GET": Permission.READ}
     # The framework redirects from a path with a slash at its end.
@@ -97,7 +96,7 @@ def permissions_needed(path: str) -> dict[str, Permission]:
 
 
 def is_page(path: str) -> bool:
-    """Whether a path is that of a page, or of what one is made of."""
+    """Return True for the path of a page or of its files."""
     return any(pattern.match(path) for pattern in _PAGE_PATTERNS)
 
 
@@ -107,16 +106,16 @@ def put_caller(scope: Scope, caller: Caller) -> None:
 
 
 def caller_of(scope: Scope) -> Caller:
-    """The caller of a request that was let in."""
+    """Return the caller of an accepted request."""
     return scope[_SCOPE_KEY]
 
 
 def network_of(client: str) -> str:
-    """The network that a client address stands for: itself, or the /64 of an IPv6 address."""
+    """Return the network that an address counts for: the address itself, or the /64 of an IPv6 address."""
     try:
         address = ipaddress.ip_address(client)
     except ValueError:
-        # A Unix socket has none, and proxies may state anything.
+        # Unix sockets have no address, and proxies can send any text.
         return client
     if address.version == 4:
         return client

@@ -1,4 +1,4 @@
-"""How often: requests per key, and refused keys per client address. Counted in memory, each replica for itself."""
+"""Rate limits: requests per key, and invalid keys per client address; counted in memory per replica."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from service.security.permissions import network_of
 from service.settings import Settings
 from service.storage.records import ApiKey
 
-# Client addresses share this many counters, so that their number does not matter. Only an address with refused keys
-# of its own notices that another one fell on the same counter.
+# Client addresses share a fixed number of counters, which bounds memory. A collision only affects addresses that send
+# invalid keys.
 _ADDRESS_COUNTERS = 1024
 # Invalid API keys per minute of a client address; further ones are rejected without a look-up.
 REFUSED_KEYS_PER_MINUTE = 60
 
 
 class RateLimits:
-    """Counts over a sliding window; for one event loop."""
+    """Rate limits over a sliding window; for one event loop."""
 
     def __init__(self, settings: Settings) -> None:
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
@@ -34,7 +34,7 @@ class RateLimits:
         """Count a request of a key.
 
         Raises:
-            RateLimitedError: it has sent too many.
+            RateLimitedError: the limit is exceeded.
         """
         per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
         if self._burst:
@@ -43,17 +43,19 @@ class RateLimits:
             await self._count(RateLimitItemPerMinute(per_minute, namespace="rate"), key.id, "minute")
 
     async def count_refused(self, client: str) -> None:
-        """Count a refused key of a client address.
+        """Count an invalid key of a client address.
 
         Raises:
-            TooManyRefusedKeysError: it has sent too many.
+            TooManyRefusedKeysError: the limit is exceeded.
         """
         if not await self._limiter.hit(self._refused, _counter_of(client)):
             raise await self._too_many_refused(client)
 
     async def check_refused(self, client: str) -> None:
-        """Raises:
-        TooManyRefusedKeysError: the client address has sent so many refused keys that its next is not looked at.
+        """Refuse a client address that exceeded its limit of invalid keys.
+
+        Raises:
+            TooManyRefusedKeysError: the limit is exceeded.
         """
         if not await self._limiter.test(self._refused, _counter_of(client)):
             raise await self._too_many_refused(client)
@@ -67,11 +69,11 @@ class RateLimits:
         return TooManyRefusedKeysError(self._refused.amount, retry_after_s)
 
     async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
-        """Whole seconds until the count is lower than now."""
+        """Return whole seconds until the count drops."""
         freed_at_s, _ = await self._limiter.get_window_stats(limit, identifier)
         return max(math.ceil(freed_at_s - time.time()), 1)
 
 
 def _counter_of(client: str) -> str:
-    """The counter of a client address. Which others share it differs from process to process, and cannot be told."""
+    """Return the counter of a client address; the hash is salted per process, so collisions cannot be planned."""
     return str(hash(network_of(client)) % _ADDRESS_COUNTERS)

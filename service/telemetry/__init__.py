@@ -1,6 +1,7 @@
-"""What the service tells of itself: metrics, log lines as JSON, and, when asked for, OpenTelemetry spans.
+"""Metrics, logs as JSON, and optional OpenTelemetry spans.
 
-Begin with `metrics.py`. `log_fields.py` is what is told of one request; `service.http.middleware.telemetry` tells it.
+Begin with `metrics.py`. `log_fields.py` holds the fields of a request's log line, written by
+`service.http.middleware.telemetry`.
 """
 
 from service.telemetry.log_fields import RequestLogFields, add_log_fields, request_id_of

@@ -1,4 +1,4 @@
-"""The fields of a request's one log line: what it turned out to be about, added by whoever learns it."""
+"""Fields of a request's log line, filled in while the request is handled."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _SCOPE_KEY = "lalaloc.log_fields"
 
 @dataclass
 class RequestLogFields:
-    """Fields of one request; what was not learnt is None.
+    """Fields of one request; None if unknown.
 
     Attributes:
-        request_id: names the request in answers and log lines.
+        request_id: id in answers and log lines.
         trace: this service's span of the caller's trace.
         plan: id of the floor plan.
         venue: id of the venue.
         revision: id of the revision of the plan, or of the venue where there is no plan.
-        stage: the last stage that produced the position.
-        clock: times of the request's stages, also of those that ran before it failed.
-        rejection: the kind of problem (its slug) that it was refused with.
-        key: id of the API key, never the key itself.
-        tenant: whose key it is.
-        bytes_in: bytes of the body that arrived.
-        gave_up: the client hung up before it had its whole answer.
+        stage: last stage of the query.
+        clock: durations of the stages, also of a request that failed.
+        rejection: slug of the problem that the request was refused with.
+        key: id of the API key; never the key itself.
+        tenant: tenant of the key.
+        bytes_in: received bytes of the body.
+        gave_up: the client disconnected before the end of the answer.
     """
 
     request_id: str
@@ -50,7 +50,7 @@ class RequestLogFields:
     gave_up: bool = False
 
 
-# Of the request that the running code works for; log lines tell its ids.
+# Fields of the current request, for the ids in log lines.
 current_log_fields: ContextVar[RequestLogFields | None] = ContextVar("lalaloc_request", default=None)
 
 
@@ -71,11 +71,11 @@ def add_log_fields(
     key: str | None = None,
     tenant: str | None = None,
 ) -> None:
-    """Add to the fields of a request; what is left out stays as it was. They must never be secrets."""
+    """Set fields of a request; omitted fields keep their value. Never pass secrets."""
     log_fields = _log_fields_of(request.scope)
     if log_fields is None:
         return
-    given = {
+    fields = {
         "plan": plan,
         "venue": venue,
         "revision": revision,
@@ -85,13 +85,13 @@ def add_log_fields(
         "key": key,
         "tenant": tenant,
     }
-    for name, value in given.items():
+    for name, value in fields.items():
         if value is not None:
             setattr(log_fields, name, value)
 
 
 def request_id_of(scope: Mapping[str, Any]) -> str | None:
-    """The id of the request with this scope."""
+    """Return the id of the request with this scope."""
     log_fields = _log_fields_of(scope)
     return None if log_fields is None else log_fields.request_id
 

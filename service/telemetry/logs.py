@@ -1,4 +1,4 @@
-"""Log lines as JSON on standard error, each with the ids of the request that it belongs to."""
+"""Logging as JSON on standard error, with the ids of the request."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from datetime import UTC, datetime
 from service.telemetry.log_fields import current_log_fields
 
 LOGGER_NAME = "lalaloc"
-# The HTTP server's own: its log of accesses holds query strings, and says nothing that ours does not.
+# The HTTP server's access log contains query strings and adds nothing to ours.
 _SERVER, _SERVER_ACCESS = "uvicorn", "uvicorn.access"
-# Warns of what clients send; they are told, and the line of their request says so.
+# Its warnings about client input are in the answers and in the request's line already.
 _FORMS = "python_multipart"
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object per line: time (UTC), level, message, ids, and the fields given as `extra={"fields": ...}`.
+    """Formatter with one JSON object per line: time (UTC), level, message, ids, and fields.
 
-    `request_id` and `trace_id` are null on lines that belong to no request.
+    Fields are given as `extra={"fields": ...}`; `request_id` and `trace_id` are null outside requests.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, plain ASCII."""
+        """Return the line in ASCII."""
         log_fields = current_log_fields.get()
         line: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
@@ -38,7 +38,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure_logging(level: str) -> logging.Logger:
-    """Send the service's log, and those of libraries, to standard error; calling it again only changes the level."""
+    """Log to standard error, libraries included; a second call only changes the level."""
     logger = logging.getLogger(LOGGER_NAME)
     logger.setLevel(level.upper())
     if not any(isinstance(handler.formatter, JsonFormatter) for handler in logger.handlers):
@@ -48,7 +48,7 @@ def configure_logging(level: str) -> logging.Logger:
         logger.propagate = False
         server = logging.getLogger(_SERVER)
         server.handlers, server.propagate = [handler], False
-        # What libraries say, unless whoever runs the app listens already.
+        # Library logs, unless the application has a handler of its own.
         if not logging.getLogger().handlers:
             logging.getLogger().addHandler(handler)
     access = logging.getLogger(_SERVER_ACCESS)

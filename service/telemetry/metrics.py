@@ -1,4 +1,4 @@
-"""Metrics for Prometheus, in a registry of their own."""
+"""Prometheus metrics."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ _GRID_SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1
 
 
 class Telemetry:
-    """The service's Prometheus metrics; one instance, hence one registry, per app.
+    """Prometheus metrics of one app, in a registry of their own.
 
-    Labels come from small sets: route templates, stages, kinds of problems; never from what callers send.
+    Labels come from small sets, such as route templates, stages and problem kinds, and never from client input.
 
     Attributes:
-        tracing: where spans go, None when none are exported.
+        registry: the registry.
+        tracing: exporter of spans; None without an endpoint.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,7 @@ class Telemetry:
         )
         self.rejections = self.counter("lalaloc_rejections", "Requests refused, by the kind of problem.", ["reason"])
         self.disconnects = self.counter(
-            "lalaloc_disconnects", "Requests whose client hung up before the answer was complete.", ["route"]
+            "lalaloc_disconnects", "Requests whose client disconnected before the end of the answer.", ["route"]
         )
         self.stage_seconds = Histogram(
             "lalaloc_stage_seconds", "Time per stage of a query.", ["stage"], buckets=_SECONDS, registry=self.registry
@@ -50,38 +51,36 @@ class Telemetry:
         self.lpo_missed = self.counter(
             "lalaloc_lpo_missed", "LPO jobs without an answer in time, by reason.", ["reason"]
         )
-        self.pool_restarts = self.counter(
-            "lalaloc_pool_restarts", "Worker processes that had to be replaced, by pool.", ["pool"]
-        )
-        # Shown as 0 from the start, so that the first restart is a rise.
+        self.pool_restarts = self.counter("lalaloc_pool_restarts", "Replaced worker processes, by pool.", ["pool"])
+        # Exported as 0 from the start, so that the first restart shows as an increase.
         for pool in ("lpo", "decode", "import"):
             self.pool_restarts.labels(pool)
-        self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Latent grids found in memory.")
-        self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Latent grids not found in memory.")
-        self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Latent grids that made room.")
+        self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Pose grids found in memory.")
+        self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Pose grids not found in memory.")
+        self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Pose grids evicted from memory.")
         self.grid_seconds = Histogram(
-            "lalaloc_grid_seconds", "Time to compute a latent grid.", buckets=_GRID_SECONDS, registry=self.registry
+            "lalaloc_grid_seconds", "Time to compute a pose grid.", buckets=_GRID_SECONDS, registry=self.registry
         )
 
     def counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
-        """Add a counter; an app that is started again goes on with the one of this name."""
+        """Add a counter; a restarted app continues with the existing one."""
         if name not in self._counters:
             self._counters[name] = Counter(name, meaning, labels, registry=self.registry)
         return self._counters[name]
 
     def gauge(self, name: str, meaning: str, read: Callable[[], float]) -> None:
-        """Add a gauge that is read when metrics are asked for; an app that is started again replaces its gauges."""
+        """Add a gauge that is read on each scrape; a restarted app replaces it."""
         self._gauge(name, meaning).set_function(read)
 
     def describe_build(self, version: str, model: str, model_version: str, model_sha256: str) -> None:
-        """Say which software answers with which model: a gauge that is 1, for joining with others."""
+        """Set the info gauge with the versions of software and model."""
         labels = ("version", "model", "model_version", "sha256")
-        gauge = self._gauge("lalaloc_build_info", "Version and model that answer.", labels)
+        gauge = self._gauge("lalaloc_build_info", "Versions of software and model.", labels)
         gauge.clear()
         gauge.labels(version, model, model_version, model_sha256).set(1.0)
 
     def note_restart(self, pool: str) -> None:
-        """Count that a worker process of a pool has to be replaced."""
+        """Count a replaced worker process of a pool."""
         self.pool_restarts.labels(pool).inc()
 
     @contextmanager
@@ -94,7 +93,7 @@ class Telemetry:
             histogram.observe(perf_counter() - begin)
 
     def render(self) -> bytes:
-        """All metrics in Prometheus' text format."""
+        """Return all metrics in Prometheus' text format."""
         return generate_latest(self.registry)
 
     def _gauge(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Gauge:

@@ -1,4 +1,4 @@
-"""W3C Trace Context: the `traceparent` header that ties this service's part of a request to its caller's.
+"""W3C Trace Context: the `traceparent` header, which connects the spans of services.
 
 Source: W3C Recommendation "Trace Context", sections 3.2 (the header) and 4 (processing model).
 """
@@ -17,7 +17,7 @@ _PARENT = re.compile(r"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})
 
 @dataclass(frozen=True)
 class TraceContext:
-    """One span of one trace: lower-case hexadecimal ids, and whether the caller records the trace."""
+    """Span of a trace: lower-case hexadecimal ids, and the flag of the caller's sampling."""
 
     trace_id: str
     span_id: str
@@ -25,14 +25,14 @@ class TraceContext:
 
     @property
     def header(self) -> str:
-        """The value of `traceparent`; what other flags a caller set are not passed on, as the text demands."""
+        """Value of `traceparent`; unknown flags are not passed on, as the recommendation demands."""
         return f"00-{self.trace_id}-{self.span_id}-{_SAMPLED if self.sampled else 0:02x}"
 
 
 def parse_traceparent(values: Sequence[str]) -> TraceContext | None:
-    """The caller's span; None when the header is missing, given twice or invalid: a new trace then begins.
+    """Return the caller's span; None if the header is missing, repeated or invalid.
 
-    Of later versions than 00 the part that this one knows is read, as long as a dash ends it.
+    Of later versions than 00 the known part is read if a dash ends it.
     """
     match = _PARENT.fullmatch(values[0].strip(" \t")) if len(values) == 1 else None
     if match is None:
@@ -40,14 +40,14 @@ def parse_traceparent(values: Sequence[str]) -> TraceContext | None:
     version, trace_id, span_id, flags, more = match.groups()
     if version == _FORBIDDEN_VERSION or (version == "00" and more is not None):
         return None
-    # All zeros is the one value that is no id.
+    # All zeros is invalid.
     if not int(trace_id, 16) or not int(span_id, 16):
         return None
     return TraceContext(trace_id, span_id, bool(int(flags, 16) & _SAMPLED))
 
 
 def child_of(parent: TraceContext | None) -> TraceContext:
-    """A new span in the caller's trace, or in a new one that nobody records."""
+    """Return a new span in the caller's trace, or in a new, unsampled trace."""
     span_id = secrets.token_hex(8)
     if parent is None:
         return TraceContext(secrets.token_hex(16), span_id, sampled=False)

@@ -1,4 +1,8 @@
-"""Spans of requests and their stages for OpenTelemetry: needs the extra `otel`, which is imported only when used."""
+"""OpenTelemetry spans of requests and their stages; the extra `otel` is imported only when used.
+
+An instrumentation library does not replace this: spans of stages are made after the fact from measured times, some of
+them from other processes, and request and trace ids exist without the extra as well.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ _EXPORT_TIMEOUT_S = 5.0
 
 
 def otlp_exporter(endpoint: str) -> SpanExporter:
-    """Sends spans over OTLP/HTTP to the full address of a collector, such as `http://collector:4318/v1/traces`.
+    """Return an OTLP/HTTP exporter to the URL of a collector, such as `http://collector:4318/v1/traces`.
 
     Raises:
         ConfigError: the extra is not installed.
@@ -34,19 +38,19 @@ def otlp_exporter(endpoint: str) -> SpanExporter:
 
 @dataclass(frozen=True)
 class OpenSpan:
-    """A span that goes on, and when it began on the clock that stages are timed by (`perf_counter`, seconds)."""
+    """Open span, with its start on the clock of the stages (`perf_counter`, seconds)."""
 
     span: Span
     began_ns: int
     began_s: float
 
     def at_ns(self, moment_s: float) -> int:
-        """A moment of that clock as nanoseconds of Unix time."""
+        """Convert a time on that clock to nanoseconds of Unix time."""
         return self.began_ns + round((moment_s - self.began_s) * 1e9)
 
 
 class Tracing:
-    """Makes spans and hands them to an exporter from a thread of its own, dropping what it cannot send in time."""
+    """Spans, exported by a background thread that drops what it cannot send in time."""
 
     def __init__(self, exporter: SpanExporter, version: str) -> None:
         from opentelemetry.sdk.resources import Resource
@@ -54,13 +58,13 @@ class Tracing:
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
 
         resource = Resource.create({"service.name": "lalaloc", "service.version": version})
-        # By default whoever began the trace decides whether it is recorded; those that begin here are.
+        # Default sampling: the caller decides for its traces; new traces are recorded.
         self._provider = TracerProvider(resource=resource, shutdown_on_exit=False)
         self._provider.add_span_processor(BatchSpanProcessor(exporter))
         self._tracer = self._provider.get_tracer("lalaloc", version)
 
     def begin(self, parent: TraceContext | None) -> tuple[TraceContext, OpenSpan]:
-        """Open a request's span, in the caller's trace when there is one."""
+        """Open a request's span, in the caller's trace if there is one."""
         from opentelemetry import trace
 
         context = trace.set_span_in_context(trace.INVALID_SPAN)
@@ -79,7 +83,7 @@ class Tracing:
         return ids, OpenSpan(span, began_ns, began_s)
 
     def end(self, opened: OpenSpan, log_fields: RequestLogFields, *, method: str, route: str, status: int) -> None:
-        """Close a request's span, with one below it for every stage that was timed."""
+        """Close a request's span, and add a child span per stage."""
         from opentelemetry import trace
 
         span = opened.span
@@ -106,5 +110,5 @@ class Tracing:
         span.end()
 
     def close(self) -> None:
-        """Send what is left, for a bounded time, and end."""
+        """Send the remaining spans, with a timeout."""
         self._provider.shutdown()

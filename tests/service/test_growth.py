@@ -15,7 +15,7 @@ from service.http.conditional import expected_revision
 from service.http.cursors import parse_cursor
 from service.http.idempotent_request import _key_of
 from service.http.uploads import UploadLimits, read_parts
-from service.security.exposure import may_be_named
+from service.security.exposure import is_allowed_host
 from service.security.keys import parse_authorization
 from service.telemetry.trace_context import parse_traceparent
 from tests.growth import assert_no_worse_than_linear
@@ -60,7 +60,7 @@ _PARSED: dict[str, Callable[[str], object]] = {
     "traceparent": lambda text: parse_traceparent(["01-" + "1" * 32 + "-" + "2" * 16 + "-01" + text]),
     "cursor": parse_cursor,
     "authorization": lambda text: parse_authorization(["Bearer " + text]),
-    "host": may_be_named,
+    "host": is_allowed_host,
     "idempotency key": lambda text: _key_of(_request("idempotency-key", text)),
 }
 

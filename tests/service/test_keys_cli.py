@@ -79,7 +79,7 @@ def test_a_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str
     assert main(["keys", "revoke", key_id]) == 0
     assert main(["keys", "revoke", key_id]) == 1
     assert main(["keys", "revoke", "nobody"]) == 1
-    assert "no key 'nobody' is in use" in capsys.readouterr().err
+    assert "no active key 'nobody'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c co
 from ray import serve  # noqa: E402
 
 from service.on_ray import app  # noqa: E402
-from service.on_ray.outcome import Failure, Success, telling_failures  # noqa: E402
+from service.on_ray.outcome import Failure, Success, returning_failures  # noqa: E402
 from tests.service.ray_cluster import NAME  # noqa: E402
 
 
@@ -160,7 +160,7 @@ def test_a_context_arrives_with_the_time_that_was_spent() -> None:
 
 def test_a_replica_tells_what_it_refuses_and_raises_what_it_should_not() -> None:
     class Replica:
-        @telling_failures
+        @returning_failures
         async def half(self, number: int) -> int:
             if number < 0:
                 raise DeadlineExceededError(10.0)
