@@ -38,7 +38,7 @@ CONFIGURED: dict[str, str] = BY_KIND["ConfigMap"]["data"]
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("name", RESOURCES)
-def test_each_manifest_is_valid(name: str, version: str) -> None:
+def test_manifests_are_valid(name: str, version: str) -> None:
     assert kubernetes_validate.validate(RESOURCES[name], version, strict=True) == version
 
 
@@ -51,7 +51,7 @@ def test_each_manifest_is_valid(name: str, version: str) -> None:
         ("poddisruptionbudget.yaml", ("spec", "maxUnavailible"), 1),
     ],
 )
-def test_a_slip_would_be_noticed(name: str, path: tuple[str | int, ...], value: object) -> None:
+def test_validation_notices_a_mistake(name: str, path: tuple[str | int, ...], value: object) -> None:
     manifest: Any = deepcopy(RESOURCES[name])
     inner = manifest
     for step in path[:-1]:
@@ -68,7 +68,7 @@ def test_every_manifest_is_applied() -> None:
     assert KUSTOMIZATION["images"] == [{"name": name, "newTag": tag}]
 
 
-def test_all_are_about_the_same_pods() -> None:
+def test_manifests_select_the_same_pods() -> None:
     spec = {kind: one.get("spec", {}) for kind, one in BY_KIND.items()}
     assert spec["Deployment"]["selector"]["matchLabels"] == LABELS
     assert spec["Service"]["selector"] == LABELS
@@ -83,7 +83,7 @@ def test_all_are_about_the_same_pods() -> None:
     assert [one["configMapRef"]["name"] for one in CONTAINER["envFrom"]] == [BY_KIND["ConfigMap"]["metadata"]["name"]]
 
 
-def test_settings_are_those_of_the_service() -> None:
+def test_manifest_settings_exist() -> None:
     given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
     values: dict[str, Any] = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
     assert Settings(**values).access.api_keys
@@ -95,14 +95,14 @@ def test_settings_are_those_of_the_service() -> None:
     assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
 
 
-def test_a_pod_has_time_to_stop_and_is_not_asked_meanwhile() -> None:
+def test_pod_has_time_to_stop() -> None:
     notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().requests.stop_deadline_s
     assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
     probe = CONTAINER["readinessProbe"]
     assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]
 
 
-def test_the_pod_may_do_no_more_than_it_needs() -> None:
+def test_pod_has_minimal_rights() -> None:
     security = CONTAINER["securityContext"]
     assert security["readOnlyRootFilesystem"]
     assert security["allowPrivilegeEscalation"] is False
@@ -118,7 +118,7 @@ def test_the_pod_may_do_no_more_than_it_needs() -> None:
     assert all("sizeLimit" in one["emptyDir"] for one in POD["volumes"])
 
 
-def test_ports_and_probes_are_those_of_the_service() -> None:
+def test_ports_and_probes_match_the_service() -> None:
     [port] = CONTAINER["ports"]
     assert f"EXPOSE {port['containerPort']}" in DOCKERFILE
     assert BY_KIND["Service"]["spec"]["ports"][0]["targetPort"] == port["name"]
@@ -131,7 +131,7 @@ def test_ports_and_probes_are_those_of_the_service() -> None:
     assert CONTAINER["readinessProbe"]["httpGet"]["path"] == "/readyz"
 
 
-def test_the_autoscaler_goes_by_a_metric_that_there_is() -> None:
+def test_autoscaler_uses_an_existing_metric() -> None:
     [by_requests] = [one for one in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if one["type"] == "Pods"]
     metric = by_requests["pods"]["metric"]["name"]
     adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
@@ -146,7 +146,7 @@ def test_the_autoscaler_goes_by_a_metric_that_there_is() -> None:
     assert int(by_requests["pods"]["target"]["averageValue"]) < 2 * (shares.workers + shares.compute_threads)
 
 
-def test_a_node_can_be_emptied_without_an_outage() -> None:
+def test_node_can_be_drained_without_an_outage() -> None:
     scaling = BY_KIND["HorizontalPodAutoscaler"]["spec"]
     assert scaling["minReplicas"] > BY_KIND["PodDisruptionBudget"]["spec"]["maxUnavailable"]
     assert BY_KIND["Deployment"]["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 0

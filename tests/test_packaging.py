@@ -35,7 +35,7 @@ def _copied() -> list[str]:
     return [source for copy in copies for source in copy.split()]
 
 
-def test_every_direct_requirement_is_pinned_to_a_version_it_allows() -> None:
+def test_direct_requirements_are_pinned() -> None:
     project = tomllib.loads(PYPROJECT)["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     requirements = [Requirement(text) for group in groups for text in group]
@@ -46,7 +46,7 @@ def test_every_direct_requirement_is_pinned_to_a_version_it_allows() -> None:
         assert name in own or requirement.specifier.contains(pins[name]), requirement
 
 
-def test_torch_is_pinned_in_one_place_only() -> None:
+def test_torch_is_pinned_once() -> None:
     assert "torch" not in _constraints()
     assert re.fullmatch(r"\d+\.\d+\.\d+", install_torch.pinned_version(PYPROJECT))
 
@@ -59,7 +59,7 @@ def test_torch_is_pinned_in_one_place_only() -> None:
         (True, {"2.0.0"}, ["torch==2.0.0"]),
     ],
 )
-def test_without_a_gpu_the_cpu_build_comes_first_and_the_plain_one_second(
+def test_cpu_build_is_tried_first_without_a_gpu(
     monkeypatch: pytest.MonkeyPatch, gpu: bool, found: set[str], asked: list[str]
 ) -> None:
     tried = []
@@ -87,14 +87,14 @@ def test_without_a_gpu_the_cpu_build_comes_first_and_the_plain_one_second(
         ("1.9.0", True, False),
     ],
 )
-def test_an_installed_torch_is_kept_when_it_is_the_right_one(
+def test_right_installed_torch_is_kept(
     monkeypatch: pytest.MonkeyPatch, installed: str, wants_cpu: bool, right: bool
 ) -> None:
     monkeypatch.setattr(install_torch.importlib.metadata, "version", lambda name: installed)
     assert install_torch.is_installed("2.0.0", wants_cpu=wants_cpu) is right
 
 
-def test_the_image_copies_what_exists_and_is_not_ignored() -> None:
+def test_image_copies_existing_files() -> None:
     sources = _copied()
     assert sources
     assert [source for source in sources if not (ROOT / source).exists()] == []
@@ -104,7 +104,7 @@ def test_the_image_copies_what_exists_and_is_not_ignored() -> None:
     assert [source for source in sources if not any(fnmatch(source.rstrip("/"), name) for name in let_through)] == []
 
 
-def test_image_and_compose_name_known_settings_and_one_port() -> None:
+def test_image_and_compose_use_known_settings() -> None:
     named = set(re.findall(r"\bLALALOC_[A-Z_]+", DOCKERFILE)) | set(COMPOSE["environment"])
     assert named <= SETTINGS
     (port,) = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, re.MULTILINE)
@@ -113,19 +113,19 @@ def test_image_and_compose_name_known_settings_and_one_port() -> None:
     assert [published.split(":")[-1] for published in COMPOSE["ports"]] == [port]
 
 
-def test_what_is_published_for_others_without_keys_has_to_be_asked_for() -> None:
+def test_compose_publishes_locally_by_default() -> None:
     environment, (published,) = COMPOSE["environment"], COMPOSE["ports"]
     assert published == f"{environment['LALALOC_PUBLISHED_ON'].removesuffix(':8000}')}:8000}}:8000"
     assert environment["LALALOC_PUBLISHED_ON"].startswith("${LALALOC_PUBLISH:-127.0.0.1:")
     assert environment["LALALOC_ALLOW_ANONYMOUS"] == "${LALALOC_ALLOW_ANONYMOUS:-off}"
 
 
-def test_the_image_can_export_spans() -> None:
+def test_image_can_export_spans() -> None:
     (extras,) = re.findall(r'pip install .* "\.\[(.*)\]"', DOCKERFILE)
     assert {"service", "lpo", "otel"} <= set(extras.split(","))
 
 
-def test_the_proxy_and_the_replicas_find_each_other() -> None:
+def test_proxy_and_replicas_match() -> None:
     replicas = {name: service for name, service in REPLICAS.items() if name.startswith("replica-")}
     proxy = (ROOT / "docker" / "nginx.conf").read_text(encoding="utf-8")
     (port,) = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, re.MULTILINE)
@@ -138,12 +138,12 @@ def test_the_proxy_and_the_replicas_find_each_other() -> None:
         assert service["environment"]["LALALOC_API_KEYS"] == "on"
 
 
-def test_containers_are_given_the_time_that_stopping_takes() -> None:
+def test_containers_have_time_to_stop() -> None:
     for service in (COMPOSE, REPLICAS["replica-1"]):
         assert float(service["stop_grace_period"].rstrip("s")) > Settings().requests.stop_deadline_s
 
 
-def test_the_image_does_not_run_as_root_and_compose_builds_it() -> None:
+def test_image_does_not_run_as_root() -> None:
     final_stage = DOCKERFILE[DOCKERFILE.rindex("\nFROM ") :]
     assert re.search(r"^USER (?!root)\w+$", final_stage, re.MULTILINE)
     build = COMPOSE["build"]

@@ -51,7 +51,7 @@ def _in_flight(client: httpx.Client) -> float:
     return _metric(client, "lalaloc_requests_in_flight")
 
 
-def test_past_the_limit_requests_are_refused_at_once_and_places_come_free_again(small: httpx.Client) -> None:
+def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
     with ExitStack() as uploads:
         for _ in range(PLACES):
             uploads.enter_context(_open_upload(small))
@@ -68,7 +68,7 @@ def test_past_the_limit_requests_are_refused_at_once_and_places_come_free_again(
     upload(small)
 
 
-def test_a_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
+def test_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
     with ExitStack() as uploads:
         for _ in range(PLACES):
             uploads.enter_context(_open_upload(small))
@@ -78,7 +78,7 @@ def test_a_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
     wait_for(lambda: _in_flight(small) == 0)
 
 
-def test_a_query_past_the_limit_is_refused_before_it_is_uploaded(small: httpx.Client, panorama: bytes) -> None:
+def test_excess_query_is_refused_before_its_upload(small: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(small)
     with ThreadPoolExecutor(8) as threads:
         answers = list(threads.map(lambda _: localise(small, plan_id, panorama), range(24)))
@@ -91,9 +91,7 @@ def test_a_query_past_the_limit_is_refused_before_it_is_uploaded(small: httpx.Cl
     assert 'lalaloc_rejections_total{reason="overloaded"}' in small.get("/metrics").text
 
 
-def test_photographs_that_one_client_sends_at_once_wait_and_are_all_answered(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_parallel_queries_of_one_client_are_all_answered(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, max_queries=4) as client, ThreadPoolExecutor(14) as threads:
         plan_id = upload(client)
         answers = list(threads.map(lambda _: localise(client, plan_id, panorama, refine="none"), range(14)))
@@ -101,7 +99,7 @@ def test_photographs_that_one_client_sends_at_once_wait_and_are_all_answered(
         assert _metric(client, "lalaloc_queries_waiting") == _metric(client, "lalaloc_queries_in_work") == 0
 
 
-def test_those_that_wait_for_a_slot_are_few_and_take_turns() -> None:
+def test_slot_queue_is_bounded_and_round_robin() -> None:
     async def scenario() -> None:
         slots, order, goes_on = Slots(2, 4), list[str](), asyncio.Event()
 
@@ -141,7 +139,7 @@ def test_those_that_wait_for_a_slot_are_few_and_take_turns() -> None:
     asyncio.run(scenario())
 
 
-def test_a_slot_that_comes_as_its_query_is_given_up_goes_to_the_next() -> None:
+def test_slot_of_a_cancelled_query_goes_to_the_next() -> None:
     async def scenario() -> None:
         slots = Slots(1, 4)
 
@@ -161,7 +159,7 @@ def test_a_slot_that_comes_as_its_query_is_given_up_goes_to_the_next() -> None:
     asyncio.run(scenario())
 
 
-def test_a_query_that_waits_for_its_grid_holds_up_no_other(small: httpx.Client, panorama: bytes) -> None:
+def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, panorama: bytes) -> None:
     ready, preparing = upload(small), upload(small, HALL, wait=False)
     with ThreadPoolExecutor(1) as threads:
         waiting = threads.submit(localise, small, preparing, panorama)
@@ -173,7 +171,7 @@ def test_a_query_that_waits_for_its_grid_holds_up_no_other(small: httpx.Client, 
         assert waiting.result().status_code in (200, 404, 503)
 
 
-def test_a_client_that_hangs_up_frees_its_place(small: httpx.Client, panorama: bytes) -> None:
+def test_disconnect_frees_the_slot(small: httpx.Client, panorama: bytes) -> None:
     preparing = upload(small, HALL, wait=False)
     body, content_type = _multipart(preparing, panorama)
     with socket.create_connection((small.base_url.host, small.base_url.port or 80), timeout=10.0) as connection:

@@ -11,25 +11,25 @@ from service.cores import CoreShares, _quota_cores, share_cores, usable_cores
 
 
 @pytest.mark.parametrize("cores", range(4, 130))
-def test_left_open_all_cores_are_used_and_none_twice(cores: int) -> None:
+def test_open_shares_use_every_core_once(cores: int) -> None:
     shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
     assert shares.total == cores
     assert min(shares.workers, shares.compute_threads) >= 1
 
 
 @pytest.mark.parametrize("cores", [1, 2, 3])
-def test_a_single_lpo_worker_leaves_all_of_few_cores_to_queries(cores: int) -> None:
+def test_single_lpo_worker_takes_no_core_of_few(cores: int) -> None:
     shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
     assert shares == CoreShares(1, 1, cores, 1)
 
 
-def test_what_is_given_is_kept_and_the_rest_shared_out() -> None:
+def test_given_numbers_are_kept() -> None:
     assert share_cores(8, workers=0, worker_threads=0, compute_threads=0, onnx_threads=2) == CoreShares(0, 1, 4, 2)
     assert share_cores(8, workers=None, worker_threads=2, compute_threads=0, onnx_threads=0) == CoreShares(1, 2, 6, 1)
     assert share_cores(2, workers=3, worker_threads=1, compute_threads=5, onnx_threads=1) == CoreShares(3, 1, 5, 1)
 
 
-def test_cores_are_those_that_the_scheduler_gives() -> None:
+def test_usable_cores_follow_the_affinity() -> None:
     assert 1 <= usable_cores() <= len(os.sched_getaffinity(0))
 
 
@@ -45,7 +45,7 @@ def test_cores_are_those_that_the_scheduler_gives() -> None:
         ({"cpu/cpu.cfs_quota_us": "250000", "cpu/cpu.cfs_period_us": "100000"}, 2.5),
     ],
 )
-def test_the_least_quota_of_the_control_groups_counts(tmp_path: Path, files: dict[str, str], expected: float) -> None:
+def test_smallest_cgroup_quota_counts(tmp_path: Path, files: dict[str, str], expected: float) -> None:
     own = tmp_path / "cgroup"
     own.write_text("0::/a/b\n")
     for name, content in files.items():

@@ -22,7 +22,7 @@ def _own_errors() -> list[type[Exception]]:
 
 
 @pytest.mark.parametrize("error", _own_errors(), ids=lambda error: error.__name__)
-def test_every_error_of_the_project_stands_in_the_table_itself(error: type[Exception]) -> None:
+def test_every_error_has_a_table_entry(error: type[Exception]) -> None:
     assert error in PROBLEMS
 
 
@@ -31,11 +31,11 @@ def test_equal_types_have_equal_titles_and_statuses() -> None:
     assert all(meanings[kind.type] == (kind.title, kind.status) for kind in PROBLEMS.values())
 
 
-def test_only_internal_errors_are_500_and_their_text_stays_inside() -> None:
+def test_only_internal_errors_are_500_and_hidden() -> None:
     assert all(kind.public == (kind.status != 500) for kind in PROBLEMS.values())
 
 
-def test_a_subclass_without_an_entry_means_what_its_base_means() -> None:
+def test_subclass_without_entry_uses_its_base() -> None:
     class Later(ServiceError):
         pass
 

@@ -54,7 +54,7 @@ def _streams(client: httpx.Client) -> float:
     return float(next(line for line in lines if line.startswith("lalaloc_streams ")).split()[1])
 
 
-def test_a_plan_that_is_ready_has_one_event(client: httpx.Client) -> None:
+def test_ready_plan_has_one_event(client: httpx.Client) -> None:
     plan_id = upload(client)
     with client.stream("GET", f"/floorplans/{plan_id}/events", headers={"Last-Event-ID": "7"}) as response:
         assert response.headers["content-type"] == "text/event-stream; charset=utf-8"
@@ -65,7 +65,7 @@ def test_a_plan_that_is_ready_has_one_event(client: httpx.Client) -> None:
     assert events == [("ready", {"status": "ready", "progress": 1.0, "revision": revision})]
 
 
-def test_progress_is_told_until_the_plan_is_ready(start_app: StartApp, tmp_path: Path) -> None:
+def test_progress_is_streamed_until_ready(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, grid_step_m=0.2, max_grid_poses=10**5) as client:
         plan_id = upload(client, HALL, wait=False)
         begin = monotonic()
@@ -81,7 +81,7 @@ def test_progress_is_told_until_the_plan_is_ready(start_app: StartApp, tmp_path:
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
 
 
-def test_a_plan_that_fails_says_why(start_app: StartApp, tmp_path: Path) -> None:
+def test_failed_plan_states_the_reason(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
     with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
@@ -90,7 +90,7 @@ def test_a_plan_that_fails_says_why(start_app: StartApp, tmp_path: Path) -> None
         assert "at most 146" in event["reason"]
 
 
-def test_a_plan_that_is_deleted_ends_its_streams(start_app: StartApp, tmp_path: Path) -> None:
+def test_deleting_a_plan_ends_its_streams(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
         with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
@@ -101,7 +101,7 @@ def test_a_plan_that_is_deleted_ends_its_streams(start_app: StartApp, tmp_path: 
         wait_for(lambda: _streams(client) == 0, 5.0)
 
 
-def test_a_replaced_plan_tells_its_new_revision(start_app: StartApp, tmp_path: Path) -> None:
+def test_replaced_plan_streams_its_new_revision(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
         with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
@@ -113,15 +113,13 @@ def test_a_replaced_plan_tells_its_new_revision(start_app: StartApp, tmp_path: P
             assert before != after
 
 
-def test_there_is_no_stream_about_nothing(client: httpx.Client) -> None:
+def test_unknown_plan_has_no_stream(client: httpx.Client) -> None:
     for plan_id in ("0" * 32, "x"):
         assert_problem(client.get(f"/floorplans/{plan_id}/events"), 404, "unknown-floorplan")
 
 
 @pytest.mark.one_replica
-def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
-    start_app: StartApp, tmp_path: Path
-) -> None:
+def test_streams_are_limited_and_freed_on_disconnect(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_streams=3, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
         url = f"/floorplans/{plan_id}/events"
@@ -138,9 +136,7 @@ def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
             assert next(_events(again))[0] == "progress"
 
 
-def test_a_stream_lasts_no_longer_than_it_may(
-    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stream_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "STREAM_DEADLINE_S", 1.0)
     with start_app(tmp_path, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
@@ -163,7 +159,7 @@ def test_streams_end_when_the_service_stops(tiny_bundle: Path, tmp_path: Path) -
             assert monotonic() - begin < 3.0
 
 
-def test_silence_is_broken_by_comments(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW)
     app = create_app(settings)
     with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
@@ -204,9 +200,7 @@ def test_stream_ends_when_its_key_is_revoked(
         store.close()
 
 
-def test_what_another_replica_computes_is_followed_here(
-    postgres: PostgresServer, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_progress_of_another_replica_is_streamed(postgres: PostgresServer, start_app: StartApp, tmp_path: Path) -> None:
     shared = {"database_url": postgres.new_database(), "sweep_s": 0.2, "grid_lease_s": 0.8, **SLOW}
     with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:
         plan_id = upload(first, HALL, wait=False)

@@ -24,7 +24,7 @@ WORST = "127.0.0.2"
 
 
 @pytest.mark.parametrize(("limit", "alone"), [(1, 1), (2, 1), (3, 2), (4, 3), (6, 4), (32, 24), (64, 48)])
-def test_alone_a_client_gets_three_quarters_and_leaves_some(limit: int, alone: int) -> None:
+def test_single_client_gets_three_quarters(limit: int, alone: int) -> None:
     shares = Shares(limit)
     while shares.may_take("a"):
         shares.take("a")
@@ -33,7 +33,7 @@ def test_alone_a_client_gets_three_quarters_and_leaves_some(limit: int, alone: i
 
 
 @given(st.integers(1, 100))
-def test_with_headroom_a_client_gets_what_it_was_meant_to(count: int) -> None:
+def test_with_headroom_gives_one_client_its_count(count: int) -> None:
     shares = Shares(with_headroom(count))
     while shares.may_take("a"):
         shares.take("a")
@@ -41,9 +41,7 @@ def test_with_headroom_a_client_gets_what_it_was_meant_to(count: int) -> None:
 
 
 @given(st.integers(1, 60), st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=300))
-def test_whoever_holds_nothing_gets_one_while_any_is_left_and_no_more_than_all_are_given(
-    limit: int, steps: list[tuple[str, bool]]
-) -> None:
+def test_idle_tenant_gets_a_slot(limit: int, steps: list[tuple[str, bool]]) -> None:
     shares = Shares(limit)
     for client, takes in steps:
         if takes and shares.may_take(client):
@@ -55,7 +53,7 @@ def test_whoever_holds_nothing_gets_one_while_any_is_left_and_no_more_than_all_a
 
 
 @given(st.integers(8, 200), st.integers(2, 4))
-def test_clients_that_want_all_they_can_get_end_with_about_the_same(limit: int, clients: int) -> None:
+def test_greedy_clients_get_equal_shares(limit: int, clients: int) -> None:
     shares, names = Shares(limit), range(clients)
     while shares.may_take(0):
         shares.take(0)
@@ -71,7 +69,7 @@ def test_clients_that_want_all_they_can_get_end_with_about_the_same(limit: int, 
 
 
 @given(st.lists(st.sampled_from("abc"), max_size=40))
-def test_those_that_wait_are_served_one_of_each_and_oldest_first(clients: list[str]) -> None:
+def test_queue_is_round_robin_and_oldest_first(clients: list[str]) -> None:
     queue: FairQueue[int] = FairQueue()
     for number, client in enumerate(clients):
         queue.append(client, number)
@@ -86,7 +84,7 @@ def test_those_that_wait_are_served_one_of_each_and_oldest_first(clients: list[s
         assert first < len(set(clients))
 
 
-def test_what_nobody_wants_any_more_is_dropped() -> None:
+def test_queue_drops_unwanted_items() -> None:
     queue: FairQueue[int] = FairQueue()
     for number in range(6):
         queue.append("ab"[number % 2], number)
@@ -96,7 +94,7 @@ def test_what_nobody_wants_any_more_is_dropped() -> None:
     assert [queue.take() for _ in range(4)] == [("a", 6), ("a", 2), ("a", 4), None]
 
 
-def test_permits_go_round_and_one_is_left_to_others() -> None:
+def test_permits_are_shared_fairly() -> None:
     async def scenario() -> list[str]:
         semaphore, order = FairSemaphore(2), list[str]()
 
@@ -129,7 +127,7 @@ def test_permits_go_round_and_one_is_left_to_others() -> None:
     assert asyncio.run(scenario()) == ["b", "a", "a", "a"]
 
 
-def test_a_thread_whose_caller_left_is_still_its_client_s() -> None:
+def test_abandoned_thread_still_counts_for_its_client() -> None:
     async def scenario() -> None:
         threads, goes_on = Threads("test", 2), threading.Event()
         try:
@@ -153,7 +151,7 @@ def test_a_thread_whose_caller_left_is_still_its_client_s() -> None:
     ("address", "network"),
     [("10.0.0.1", "10.0.0.1"), ("::ffff:10.0.0.1", "10.0.0.1"), ("2001:db8::1:2", "2001:db8::/64"), ("x", "x")],
 )
-def test_the_addresses_of_a_network_count_as_one(address: str, network: str) -> None:
+def test_addresses_of_a_network_count_as_one(address: str, network: str) -> None:
     assert network_of(address) == network
 
 
@@ -180,7 +178,7 @@ def _gauge(client: httpx.Client, name: str) -> float:
 
 
 @pytest.mark.one_replica
-def test_bodies_that_do_not_come_leave_room_for_others(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     head = "POST /localise HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
     with start_app(tmp_path, max_pending_requests=8) as client, ExitStack() as attack:
         plan_id = upload(client)
@@ -198,7 +196,7 @@ def test_bodies_that_do_not_come_leave_room_for_others(start_app: StartApp, tmp_
 
 
 @pytest.mark.one_replica
-def test_answers_that_are_not_read_leave_room_for_others(start_app: StartApp, tmp_path: Path) -> None:
+def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_reads=8, max_plan_bytes=32 * 2**20) as client, ExitStack() as attack:
         # White space is kept, and no socket holds as much.
         content = httpx.Request("POST", "http://x", json=FLAT).read() + b" " * (30 * 2**20)
@@ -214,7 +212,7 @@ def test_answers_that_are_not_read_leave_room_for_others(start_app: StartApp, tm
 
 
 @pytest.mark.one_replica
-def test_streams_of_one_leave_room_for_others(start_app: StartApp, tmp_path: Path) -> None:
+def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_path: Path) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"grid_step_m": 0.1, "inline_grid_poses": 1, "max_grid_poses": 10**6}
     with start_app(tmp_path, max_streams=4, **settings) as client, ExitStack() as attack:
@@ -229,9 +227,7 @@ def test_streams_of_one_leave_room_for_others(start_app: StartApp, tmp_path: Pat
 
 
 @pytest.mark.one_replica
-def test_a_picture_that_takes_too_long_keeps_no_other_waiting(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     slow = _endless_picture()
     with start_app(tmp_path, decode_workers=2, decode_stall_s=1.5, max_scans=10_000) as client, ExitStack() as attack:
         plan_id = upload(client)

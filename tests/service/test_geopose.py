@@ -53,7 +53,7 @@ def anchored(**anchor: Any) -> FloorPlan:
 
 
 @pytest.mark.parametrize("north_deg", [0.0, 25.0, 200.0])
-def test_places_and_directions_are_those_of_geodesy(north_deg: float) -> None:
+def test_positions_and_headings_match_geodesy(north_deg: float) -> None:
     plan = anchored(**ANCHOR, north_deg=north_deg)
     assert plan.anchor is not None
     geod = pyproj.Geod(ellps="WGS84")
@@ -68,7 +68,7 @@ def test_places_and_directions_are_those_of_geodesy(north_deg: float) -> None:
         assert plan.anchor.to_plan(np.array([[lon, lat]]))[0] == pytest.approx([x, y], abs=1e-6)
 
 
-def test_two_control_points_are_an_anchor() -> None:
+def test_two_control_points_make_an_anchor() -> None:
     known = Anchor(**ANCHOR, north_deg=25.0)
     places = [(1.0, 2.0), (9.0, 5.5)]
     points = [
@@ -103,12 +103,12 @@ def test_two_control_points_are_an_anchor() -> None:
         ([48.0, 11.0], "must be an object"),
     ],
 )
-def test_an_anchor_that_cannot_be_is_refused(client: httpx.Client, anchor: Any, words: str) -> None:
+def test_invalid_anchor_is_refused(client: httpx.Client, anchor: Any, words: str) -> None:
     response = client.post("/floorplans", json=FLAT | {"anchor": anchor})
     assert words in assert_problem(response, 422, "invalid-floorplan")["detail"]
 
 
-def test_a_hint_on_earth_is_the_same_hint_in_the_plan(client: httpx.Client, panorama: bytes) -> None:
+def test_earth_hint_equals_plan_hint(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[2.0, 1.0]]))
     on_earth = json.dumps({"latitude": lat, "longitude": lon})
@@ -129,7 +129,7 @@ def test_a_hint_on_earth_is_the_same_hint_in_the_plan(client: httpx.Client, pano
         ({"latitude": 48.1, "longitude": 11, "x_m": 1}, "invalid-request", "near.x_m: is '1'"),
     ],
 )
-def test_a_hint_on_earth_that_cannot_be_is_told(
+def test_invalid_earth_hint_is_refused(
     client: httpx.Client, panorama: bytes, near: dict[str, float], slug: str, words: str
 ) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
@@ -137,12 +137,12 @@ def test_a_hint_on_earth_that_cannot_be_is_told(
     assert words in problem["detail"]
 
 
-def test_without_an_anchor_a_hint_on_earth_is_refused(client: httpx.Client, panorama: bytes) -> None:
+def test_earth_hint_needs_an_anchor(client: httpx.Client, panorama: bytes) -> None:
     response = localise(client, upload(client), panorama, near='{"latitude": 48, "longitude": 11}', radius_m=5)
     assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
 
 
-def test_a_plan_keeps_its_anchor_and_north_is_said_once(client: httpx.Client) -> None:
+def test_plan_keeps_its_anchor_and_north(client: httpx.Client) -> None:
     twice = client.post("/floorplans", json=FLAT | {"north_deg": 10, "anchor": ANCHOR | {"north_deg": 25}})
     assert "give one of them" in assert_problem(twice, 422, "invalid-floorplan")["detail"]
     plan = client.get(f"/floorplans/{upload(client, FLAT | {'anchor': ANCHOR | {'north_deg': 25}})}").json()["plan"]
@@ -150,7 +150,7 @@ def test_a_plan_keeps_its_anchor_and_north_is_said_once(client: httpx.Client) ->
     assert FloorPlan.from_dict(plan).to_dict() == plan
 
 
-def test_answers_say_where_on_earth(client: httpx.Client, panorama: bytes) -> None:
+def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     answer = localise(client, plan_id, panorama, heading_deg=115, refine="none").json()
     geopose = answer["geopose"]
@@ -172,7 +172,7 @@ def test_answers_say_where_on_earth(client: httpx.Client, panorama: bytes) -> No
     assert feature["properties"]["room"] == answer["room"]
 
 
-def test_every_candidate_is_somewhere_on_earth(client: httpx.Client, panorama: bytes) -> None:
+def test_every_candidate_has_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     answer = localise(client, plan_id, panorama, refine="none", top_k=5).json()
     assert len(answer["candidates"]) > 1
@@ -182,9 +182,7 @@ def test_every_candidate_is_somewhere_on_earth(client: httpx.Client, panorama: b
         assert_at(candidate["geopose"], candidate, Anchor(**ANCHOR, north_deg=25.0))
 
 
-def test_a_plan_of_a_venue_lies_by_its_own_anchor_else_by_that_of_the_venue(
-    client: httpx.Client, panorama: bytes
-) -> None:
+def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes) -> None:
     of_venue = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
     ids = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25}), upload(client)]
     far = FLAT | {"rooms": [{"name": "far", "polygon": [[x + 2e4, y] for x, y in FLAT["rooms"][0]["polygon"]]}]}
@@ -209,7 +207,7 @@ def test_a_plan_of_a_venue_lies_by_its_own_anchor_else_by_that_of_the_venue(
     assert feature["geometry"]["coordinates"] == [place["lon"], place["lat"], place["h"]]
 
 
-def test_a_venue_without_an_anchor_has_no_place_on_earth(client: httpx.Client, panorama: bytes) -> None:
+def test_unanchored_venue_has_no_geopose(client: httpx.Client, panorama: bytes) -> None:
     venue_id = client.post("/venues", json={"plans": [{"floorplan_id": upload(client)}]}).json()["id"]
     headers, fields = {"Accept": "application/geo+json"}, {"venue_id": venue_id, "refine": "none"}
     response = client.post("/localise", data=fields, files={"panorama": panorama}, headers=headers)
@@ -218,7 +216,7 @@ def test_a_venue_without_an_anchor_has_no_place_on_earth(client: httpx.Client, p
     assert "a picture is of one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
 
 
-def test_a_sequence_is_a_collection_of_features(client: httpx.Client, panorama: bytes) -> None:
+def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     fields, files = {"floorplan_id": plan_id, "refine": "none"}, [("panorama", panorama)] * 2
     answer = client.post("/localise/sequence", data=fields, files=files).json()
@@ -241,7 +239,7 @@ def test_a_sequence_is_a_collection_of_features(client: httpx.Client, panorama: 
     assert_problem(keyed, 422, "invalid-request")
 
 
-def test_a_plan_without_an_anchor_has_no_place_on_earth(client: httpx.Client, panorama: bytes) -> None:
+def test_unanchored_plan_has_no_geopose(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client)
     assert localise(client, plan_id, panorama, refine="none").json()["geopose"] is None
     file = {"panorama": ("p.jpg", panorama, "image/jpeg")}
@@ -261,7 +259,7 @@ def test_a_plan_without_an_anchor_has_no_place_on_earth(client: httpx.Client, pa
         ("svg", "image/svg+xml"),
     ],
 )
-def test_what_is_exported_can_be_uploaded_again(client: httpx.Client, format: str, media: str) -> None:
+def test_exported_plan_can_be_uploaded_again(client: httpx.Client, format: str, media: str) -> None:
     plan_id = client.post("/floorplans", json=PLAN).json()["id"]
     response = client.get(f"/floorplans/{plan_id}/export", params={"format": format})
     assert response.status_code == 200, response.text
@@ -273,7 +271,7 @@ def test_what_is_exported_can_be_uploaded_again(client: httpx.Client, format: st
     assert_problem(unknown, 422, "invalid-request")
 
 
-def test_an_anchored_plan_goes_around_by_imdf_with_its_place(client: httpx.Client) -> None:
+def test_imdf_round_trip_keeps_the_anchor(client: httpx.Client) -> None:
     plan_id = client.post("/floorplans", json=PLAN | {"anchor": ANCHOR, "north_deg": 0}).json()["id"]
     archive = client.get(f"/floorplans/{plan_id}/export", params={"format": "imdf"}).content
     again = client.post("/floorplans", files={"file": ("plan", archive)}).json()["plan"]
@@ -284,7 +282,7 @@ def test_an_anchored_plan_goes_around_by_imdf_with_its_place(client: httpx.Clien
     assert lowest[0] == pytest.approx(lowest[1], abs=1e-7)
 
 
-def test_the_client_sends_files_with_options_and_fetches_exports(client: httpx.Client) -> None:
+def test_client_uploads_with_options_and_exports(client: httpx.Client) -> None:
     with Client(str(client.base_url)) as service:
         plan = service.upload_floorplan(PLAN, options={"name": "named"})
         assert plan.name == "named"

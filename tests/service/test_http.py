@@ -24,7 +24,7 @@ from tests.service.postgres import PostgresServer
 ROOT = Path(__file__).parents[2]
 
 
-def test_unknown_routes_and_methods_are_problems_too(client: httpx.Client) -> None:
+def test_unknown_routes_and_methods_are_problems(client: httpx.Client) -> None:
     assert_problem(client.get("/no/such/route"), 404, "not-found")
     response = client.put("/localise")
     assert_problem(response, 405, "method-not-allowed")
@@ -52,7 +52,7 @@ def test_unknown_routes_and_methods_are_problems_too(client: httpx.Client) -> No
         ("GET", "/?plan=1", {"plan": "unknown"}),
     ],
 )
-def test_a_query_parameter_that_would_be_ignored_is_refused(
+def test_unknown_query_parameter_is_refused(
     client: httpx.Client, method: str, path: str, faults: dict[str, str]
 ) -> None:
     url = path.replace("PLAN", upload(client)) if "PLAN" in path else path
@@ -62,7 +62,7 @@ def test_a_query_parameter_that_would_be_ignored_is_refused(
     assert all(faults[name] in told[name] for name in faults)
 
 
-def test_every_get_may_be_a_head(client: httpx.Client) -> None:
+def test_every_get_answers_head(client: httpx.Client) -> None:
     plan_id = upload(client)
     paths = [path for path, operations in client.get("/openapi.json").json()["paths"].items() if "get" in operations]
     assert len(paths) >= 10
@@ -87,7 +87,7 @@ def test_every_get_may_be_a_head(client: httpx.Client) -> None:
     assert client.delete("/floorplans").headers["allow"].split(", ") == ["GET", "POST", "HEAD"]
 
 
-def test_a_head_of_events_holds_no_stream(client: httpx.Client) -> None:
+def test_head_of_events_holds_no_stream(client: httpx.Client) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [60, 0], [60, 60], [0, 60]]}]}
     plan_id = upload(client, hall, wait=False)
     head = client.head(f"/floorplans/{plan_id}/events")
@@ -100,9 +100,7 @@ PAGE = {"Origin": "https://plans.example"}
 PREFLIGHT = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "authorization,idempotency-key"}
 
 
-def test_pages_of_other_sites_are_told_nothing_unless_they_are_named(
-    client: httpx.Client, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_cors_allows_only_configured_origins(client: httpx.Client, start_app: StartApp, tmp_path: Path) -> None:
     assert "access-control-allow-origin" not in client.get("/floorplans", headers=PAGE).headers
     assert client.options("/localise", headers=PAGE | PREFLIGHT).status_code == 405
     with start_app(tmp_path, cors_origins="https://plans.example, http://localhost:3000") as named:
@@ -122,13 +120,13 @@ def test_pages_of_other_sites_are_told_nothing_unless_they_are_named(
 
 
 @pytest.mark.parametrize("origins", ["plans.example", "https://plans.example/", "https://*.example", "null", "* "])
-def test_origins_that_could_never_match_or_let_everybody_change_plans_are_refused(origins: str) -> None:
+def test_useless_or_unsafe_origins_are_refused(origins: str) -> None:
     with pytest.raises(ConfigError, match=r"neither an origin such as|needs LALALOC_API_KEYS=on"):
         Settings(cors_origins=origins)
     Settings(cors_origins="*", api_keys=True)
 
 
-def test_an_unexpected_error_tells_nothing_but_the_request_id() -> None:
+def test_unexpected_error_reveals_only_the_request_id() -> None:
     app = create_app()
 
     def broken() -> Runtime:
@@ -156,13 +154,13 @@ class _no_lifespan:
 
 
 @pytest.mark.parametrize(("given", "kept"), [("abc-123", True), ("a b", False), ("x" * 65, False)])
-def test_a_sane_request_id_is_kept(client: httpx.Client, given: str, kept: bool) -> None:
+def test_valid_request_id_is_kept(client: httpx.Client, given: str, kept: bool) -> None:
     answered = client.get("/healthz", headers={"x-request-id": given}).headers["x-request-id"]
     assert (answered == given) == kept
     assert re.fullmatch(r"[A-Za-z0-9._-]{1,64}", answered)
 
 
-def test_without_workers_the_service_is_ready_when_it_is_up(client: httpx.Client) -> None:
+def test_service_without_workers_is_ready_at_once(client: httpx.Client) -> None:
     assert client.get("/healthz").json() == {"status": "ok"}
     wait_for(lambda: client.get("/readyz").status_code == 200)
     response = client.get("/readyz")
@@ -171,7 +169,7 @@ def test_without_workers_the_service_is_ready_when_it_is_up(client: httpx.Client
     assert response.json()["decode_pool"]["workers"] == 1
 
 
-def test_reads_that_wait_do_not_hold_up_health(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+def test_waiting_reads_do_not_block_health(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     url = postgres.new_database()
     with (
         # More than the framework has threads.
@@ -190,7 +188,7 @@ def test_reads_that_wait_do_not_hold_up_health(start_app: StartApp, postgres: Po
 
 
 @pytest.mark.one_replica
-def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Client, panorama: bytes) -> None:
+def test_metrics_count_requests_and_queries(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client)
     localise(client, plan_id, panorama, refine="vdr")
     client.get("/no/such/route")
@@ -203,21 +201,21 @@ def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Clie
     assert plan_id not in text
 
 
-def test_the_written_api_description_is_up_to_date() -> None:
+def test_openapi_yaml_is_up_to_date() -> None:
     written = (ROOT / "openapi.yaml").read_text(encoding="utf-8")
     assert yaml.safe_load(written) == yaml.safe_load(openapi_text()), (
         "openapi.yaml is stale: run `python -m service.openapi openapi.yaml`"
     )
 
 
-def test_the_api_description_refers_to_nothing_that_is_missing(client: httpx.Client) -> None:
+def test_api_description_has_no_dangling_references(client: httpx.Client) -> None:
     document = client.get("/openapi.json").text
     references = set(re.findall(r'"#/components/schemas/([^"]+)"', document))
     assert {"FloorPlanDocument", "Problem", "LocaliseAnswer"} <= references
     assert references <= set(client.get("/openapi.json").json()["components"]["schemas"])
 
 
-def test_every_operation_but_health_says_that_it_may_be_refused_for_now(client: httpx.Client) -> None:
+def test_operations_describe_temporary_refusals(client: httpx.Client) -> None:
     document = client.get("/openapi.json").json()
     for path, operations in document["paths"].items():
         for operation in operations.values():
@@ -230,7 +228,7 @@ def test_every_operation_but_health_says_that_it_may_be_refused_for_now(client: 
 
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/web/app.js", "/web/docs.js", "/favicon.ico"])
-def test_pages_load_nothing_from_elsewhere(client: httpx.Client, path: str) -> None:
+def test_pages_load_nothing_external(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.status_code == 200
     assert "default-src 'none'" in response.headers["content-security-policy"]
@@ -258,9 +256,7 @@ _EVERYWHERE = {
         ("PUT", "/localise", 405),
     ],
 )
-def test_every_answer_has_security_headers_and_is_not_kept(
-    client: httpx.Client, method: str, path: str, status: int
-) -> None:
+def test_answers_have_security_headers(client: httpx.Client, method: str, path: str, status: int) -> None:
     response = client.request(method, path)
     assert response.status_code == status
     assert response.headers.items() >= _EVERYWHERE.items()
@@ -270,7 +266,7 @@ def test_every_answer_has_security_headers_and_is_not_kept(
 
 
 @pytest.mark.parametrize("path", ["/", "/docs"])
-def test_pages_may_load_what_they_link_to_and_no_one_may_frame_them(client: httpx.Client, path: str) -> None:
+def test_pages_load_own_files_and_cannot_be_framed(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.headers.items() >= _EVERYWHERE.items()
     policy = dict(part.strip().split(" ", 1) for part in response.headers["content-security-policy"].split(";"))
@@ -286,9 +282,7 @@ def test_pages_may_load_what_they_link_to_and_no_one_may_frame_them(client: http
 
 
 @pytest.mark.parametrize("path", ["/floorplans", "/healthz", "/no/such"])
-def test_a_request_whose_length_is_told_twice_is_refused_and_its_connection_closed(
-    client: httpx.Client, path: str
-) -> None:
+def test_request_with_two_lengths_is_refused_and_closed(client: httpx.Client, path: str) -> None:
     assert client.base_url.port is not None
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     smuggled = "GET /limits HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -302,8 +296,6 @@ def test_a_request_whose_length_is_told_twice_is_refused_and_its_connection_clos
 
 
 @pytest.mark.parametrize(("scheme", "told"), [("https", "max-age=31536000"), ("http", None)])
-def test_browsers_are_told_to_stay_with_https_when_they_came_by_it(
-    client: httpx.Client, scheme: str, told: str | None
-) -> None:
+def test_https_answers_have_hsts(client: httpx.Client, scheme: str, told: str | None) -> None:
     response = client.get("/healthz", headers={"x-forwarded-proto": scheme})
     assert response.headers.get("strict-transport-security") == told

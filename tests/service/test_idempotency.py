@@ -76,7 +76,7 @@ def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
         yield started
 
 
-def test_the_same_upload_again_is_the_same_plan(own: httpx.Client) -> None:
+def test_repeated_upload_returns_the_same_plan(own: httpx.Client) -> None:
     first = _post(own, "a")
     assert first.status_code == 201
     assert _same(first, _post(own, "a"))
@@ -87,21 +87,21 @@ def test_the_same_upload_again_is_the_same_plan(own: httpx.Client) -> None:
     assert _count(own) == 4
 
 
-def test_the_answer_is_kept_over_a_restart(start_app: StartApp, tmp_path: Path) -> None:
+def test_answer_survives_a_restart(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         first = _post(client, "a")
     with start_app(tmp_path) as client:
         assert _same(first, _post(client, "a"))
 
 
-def test_the_same_file_in_another_envelope_is_the_same_upload(own: httpx.Client) -> None:
+def test_multipart_boundary_does_not_matter(own: httpx.Client) -> None:
     first = own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
     for name in ("flat.json", "again.json"):
         # Every form has a boundary of its own.
         assert _same(first, own.post("/floorplans", files={"file": (name, CONTENT)}, headers=_keyed("a")))
 
 
-def test_another_body_under_the_same_key_is_refused(own: httpx.Client) -> None:
+def test_key_with_another_body_is_refused(own: httpx.Client) -> None:
     _post(own, "a")
     problem = assert_problem(_post(own, "a", {**FLAT, "name": "other"}), 422, "idempotency-key-reused")
     assert "'a'" in problem["detail"]
@@ -109,12 +109,12 @@ def test_another_body_under_the_same_key_is_refused(own: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("key", ["x" * 255, "!~", '"quoted"'])
-def test_a_key_is_visible_ascii(client: httpx.Client, key: str) -> None:
+def test_visible_ascii_keys_are_accepted(client: httpx.Client, key: str) -> None:
     assert _same(_post(client, key), _post(client, key))
 
 
 @pytest.mark.parametrize("key", ["", "x" * 256, "a b", "a\tb", "é"])
-def test_another_key_is_refused_by_its_name(client: httpx.Client, panorama: bytes, key: str) -> None:
+def test_invalid_key_is_refused(client: httpx.Client, panorama: bytes, key: str) -> None:
     headers = [(b"Idempotency-Key", key.encode("latin-1"))]
     form = {"data": {"floorplan_id": "x"}, "files": {"panorama": ("p.jpg", panorama)}}
     for response in (
@@ -126,12 +126,12 @@ def test_another_key_is_refused_by_its_name(client: httpx.Client, panorama: byte
         assert "1 to 255" in problem["detail"]
 
 
-def test_two_keys_are_none(client: httpx.Client) -> None:
+def test_two_keys_are_refused(client: httpx.Client) -> None:
     headers = [("Idempotency-Key", "a"), ("Idempotency-Key", "b")]
     assert_problem(client.post("/floorplans", json=FLAT, headers=headers), 422, "invalid-request")
 
 
-def test_the_same_query_again_has_the_same_answer(own: httpx.Client, panorama: bytes) -> None:
+def test_repeated_query_returns_the_same_answer(own: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(own)
     first = _query(own, "a", plan_id, panorama)
     assert first.status_code == 200
@@ -143,9 +143,7 @@ def test_the_same_query_again_has_the_same_answer(own: httpx.Client, panorama: b
     assert _post(own, "a").status_code == 201
 
 
-def test_a_refusal_for_good_is_kept_and_one_for_now_is_not(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_permanent_refusal_is_kept_temporary_is_not(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, max_floorplans=1) as client:
         bad = {"rooms": []}
         assert _same(_post(client, "bad", bad), _post(client, "bad", bad))
@@ -159,7 +157,7 @@ def test_a_refusal_for_good_is_kept_and_one_for_now_is_not(
         assert _post(client, "full").status_code == 201
 
 
-def test_of_many_at_once_one_is_carried_out(own: httpx.Client) -> None:
+def test_one_of_many_parallel_requests_is_executed(own: httpx.Client) -> None:
     with ThreadPoolExecutor(8) as threads:
         answers = list(threads.map(lambda _: _post(own, "a"), range(8)))
     done = [answer for answer in answers if answer.status_code == 201]
@@ -172,7 +170,7 @@ def test_of_many_at_once_one_is_carried_out(own: httpx.Client) -> None:
     assert _count(own) == 1
 
 
-def test_what_a_process_that_died_had_stored_is_found_by_the_next(
+def test_plan_of_a_dead_process_is_found_by_the_next(
     start_app: StartApp, tmp_path: Path, database_of: DatabaseOf
 ) -> None:
     with start_app(tmp_path) as client:
@@ -197,7 +195,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
         store.close()
 
 
-def test_an_upload_whose_client_hangs_up_is_carried_out_once(own: httpx.Client) -> None:
+def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
     head = (
         "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nIdempotency-Key: a\r\n"
         f"Content-Length: {len(CONTENT)}\r\n\r\n"
@@ -214,9 +212,7 @@ def test_an_upload_whose_client_hangs_up_is_carried_out_once(own: httpx.Client) 
     assert _count(own) == 1
 
 
-def test_a_query_whose_client_hangs_up_may_be_sent_again_at_once(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
         plan_id = upload(client, hall, wait=False)
@@ -238,9 +234,7 @@ def test_a_query_whose_client_hangs_up_may_be_sent_again_at_once(
         assert_problem(_query(client, "a", plan_id, panorama), 404, "unknown-floorplan")
 
 
-def test_what_is_stored_is_answered_for_whatever_becomes_of_the_database(
-    own: httpx.Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     def away(*_arguments: Any) -> NoReturn:
         raise StoreUnavailableError()
 
@@ -268,7 +262,7 @@ def _idempotent(store: Store) -> IdempotentRequest:
     return IdempotentRequest(store.idempotency_keys, Request(scope), "default", "POST /x")
 
 
-def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_again(store: Store) -> None:
+def test_failed_but_stored_upload_is_found_by_the_retry(store: Store) -> None:
     failures = iter([StoreUnavailableError(), None])
 
     def work(token: str) -> Response:
@@ -300,7 +294,7 @@ def _poisoned() -> Exception:
         (UploadTimeoutError("too slow"), False),
     ],
 )
-def test_only_refusals_that_the_request_is_to_blame_for_are_kept(store: Store, refusal: Exception, kept: bool) -> None:
+def test_only_errors_of_the_request_are_kept(store: Store, refusal: Exception, kept: bool) -> None:
     def refuse(_token: str) -> Response:
         raise refusal
 
@@ -314,7 +308,7 @@ def test_only_refusals_that_the_request_is_to_blame_for_are_kept(store: Store, r
 
 
 @pytest.mark.parametrize("leaves", [True, False], ids=["hangs up", "is told to come again"])
-def test_who_is_gone_before_their_claim_is_made_leaves_none(store: Store, leaves: bool) -> None:
+def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
     async def never() -> Response:
         raise AssertionError("it has not begun")
 
@@ -346,7 +340,7 @@ FILES = st.dictionaries(st.text(max_size=3), st.binary(max_size=3), max_size=3)
 
 
 @given(PARTS, FILES, PARTS, FILES)
-def test_digests_are_equal_for_equal_parts_only(
+def test_digests_differ_for_different_parts(
     fields: dict[str, str], files: dict[str, bytes], other_fields: dict[str, str], other_files: dict[str, bytes]
 ) -> None:
     turned = Parts(dict(reversed(fields.items())), dict(reversed(files.items())))

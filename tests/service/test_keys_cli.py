@@ -28,7 +28,7 @@ def _create(capsys: pytest.CaptureFixture[str], *options: str) -> str:
     return capsys.readouterr().out.removesuffix("\n")
 
 
-def test_a_key_works_at_once_while_the_service_runs_and_no_more_once_it_is_revoked(
+def test_key_works_at_once_until_it_is_revoked(
     data_dir: Path, start_app: StartApp, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with start_app(data_dir, api_keys=True, key_cache_s=0.0) as client:
@@ -40,7 +40,7 @@ def test_a_key_works_at_once_while_the_service_runs_and_no_more_once_it_is_revok
         assert_problem(client.get(f"/floorplans/{plan_id}"), 401, "unauthenticated")
 
 
-def test_the_key_alone_is_printed_and_shown_once(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_the_key_is_printed(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = _create(capsys, "--scope", "localise", "--rate-per-minute", "30")
     assert re.fullmatch(r"lalaloc_[0-9a-f]{32}_[A-Za-z0-9_-]{43}", key)
     _, key_id, secret = key.split("_", 2)
@@ -55,7 +55,7 @@ def test_the_key_alone_is_printed_and_shown_once(data_dir: Path, capsys: pytest.
     assert not any(secret.encode() in path.read_bytes() for path in stored)
 
 
-def test_keys_are_listed_with_all_that_is_known_of_them(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_shows_all_key_fields(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = _create(capsys, "--scope", "write", "--scope", "read").split("_")[1]
     assert main(["keys", "create", "--tenant", "other", "--name", "x", "--scope", "read"]) == 0
     assert main(["keys", "revoke", first]) == 0
@@ -74,7 +74,7 @@ def test_keys_are_listed_with_all_that_is_known_of_them(data_dir: Path, capsys: 
     assert table[1].split()[:5] == [rows[1]["id"], "other", "x", "read", "-"]
 
 
-def test_a_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key_id = _create(capsys, "--scope", "read").split("_")[1]
     assert main(["keys", "revoke", key_id]) == 0
     assert main(["keys", "revoke", key_id]) == 1
@@ -95,7 +95,7 @@ def test_a_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str
         (["--scope", "read", "--rate-per-minute", "1000001"], "0 to 1000000"),
     ],
 )
-def test_what_is_wrong_with_a_key_is_told(
+def test_invalid_key_options_are_refused(
     data_dir: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: str
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -105,7 +105,7 @@ def test_what_is_wrong_with_a_key_is_told(
     assert not data_dir.exists()
 
 
-def test_a_wrong_setting_is_told_without_a_trace(
+def test_invalid_setting_prints_no_trace(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LALALOC_DATABASE_URL", "mysql://somewhere/else")

@@ -56,7 +56,7 @@ def plan_id(on_ray: httpx.Client) -> str:
 
 
 @pytest.mark.slow
-def test_it_answers_as_one_process_does(
+def test_ray_answers_like_one_process(
     on_ray: httpx.Client, plan_id: str, start_app: StartApp, data_dir: Path, panorama: bytes
 ) -> None:
     assert on_ray.get("/readyz").status_code == 200
@@ -71,7 +71,7 @@ def test_it_answers_as_one_process_does(
 
 
 @pytest.mark.slow
-def test_sequences_venues_and_pictures_are_answered(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
     sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id}, files=files)
     assert sequence.status_code == 200, sequence.text
@@ -84,7 +84,7 @@ def test_sequences_venues_and_pictures_are_answered(on_ray: httpx.Client, plan_i
 
 
 @pytest.mark.slow
-def test_what_a_replica_refuses_is_told_as_ever(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_replica_errors_reach_the_client(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
     assert_problem(localise(on_ray, plan_id, b"no picture"), 422, "invalid-panorama")
     assert_problem(localise(on_ray, plan_id, panorama, rooms=json.dumps(["nowhere"])), 422, "invalid-hint")
     assert_problem(localise(on_ray, "0" * 32, panorama), 404, "unknown-floorplan")
@@ -92,7 +92,7 @@ def test_what_a_replica_refuses_is_told_as_ever(on_ray: httpx.Client, plan_id: s
 
 
 @pytest.mark.slow
-def test_each_plan_stays_in_the_memory_of_one_replica(on_ray: httpx.Client, panorama: bytes) -> None:
+def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -> None:
     plans = [upload(on_ray, FLAT | {"name": f"flat {number}"}) for number in range(8)]
     revisions = {localise(on_ray, plan, panorama, refine="none").json()["floorplan_revision"] for plan in plans * 2}
     search = serve.get_deployment_handle("search", NAME)
@@ -105,9 +105,7 @@ def test_each_plan_stays_in_the_memory_of_one_replica(on_ray: httpx.Client, pano
 
 
 @pytest.mark.slow
-def test_an_optimiser_that_dies_is_done_without_and_replaced(
-    on_ray: httpx.Client, plan_id: str, panorama: bytes
-) -> None:
+def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
     named = ray.util.list_named_actors(all_namespaces=True)
     [lpo] = [one for one in named if one["name"].startswith(f"SERVE_REPLICA::{NAME}#lpo#")]
     ray.kill(ray.get_actor(**lpo), no_restart=True)
@@ -123,7 +121,7 @@ def test_an_optimiser_that_dies_is_done_without_and_replaced(
         ({"lpo_min": "3", "lpo_max": "2"}, "lpo_max is 2, less than lpo_min, which is 3"),
     ],
 )
-def test_numbers_of_replicas_that_cannot_be_are_refused_by_name(
+def test_invalid_replica_numbers_are_refused(
     arguments: dict[str, str], told: str, tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LALALOC_BUNDLE", str(tiny_bundle))
@@ -140,7 +138,7 @@ def test_numbers_of_replicas_that_cannot_be_are_refused_by_name(
         InvalidRequestError([("top_k", "is 0, at least 1 is needed")]),
     ],
 )
-def test_errors_arrive_with_all_that_they_say(error: Any) -> None:
+def test_errors_keep_their_attributes(error: Any) -> None:
     arrived = pickle.loads(pickle.dumps(Failure.of(error))).error
     assert type(arrived) is type(error)
     assert str(arrived) == str(error)
@@ -149,7 +147,7 @@ def test_errors_arrive_with_all_that_they_say(error: Any) -> None:
     assert type(error) in PROBLEMS
 
 
-def test_a_context_arrives_with_the_time_that_was_spent() -> None:
+def test_context_keeps_the_spent_time() -> None:
     sent = QueryContext.starting("tenant", 10.0, spent_s=4.0)
     arrived = pickle.loads(pickle.dumps(sent))
     assert arrived.client == "tenant"
@@ -158,7 +156,7 @@ def test_a_context_arrives_with_the_time_that_was_spent() -> None:
     assert arrived.clock is not sent.clock
 
 
-def test_a_replica_tells_what_it_refuses_and_raises_what_it_should_not() -> None:
+def test_replica_returns_errors_and_raises_bugs() -> None:
     class Replica:
         @returning_failures
         async def half(self, number: int) -> int:

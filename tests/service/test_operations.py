@@ -29,9 +29,7 @@ def stored(client: httpx.Client, panorama: bytes) -> tuple[list[dict[str, object
     return plans, answer.json()["position"]
 
 
-def test_a_sqlite_backup_taken_while_the_service_runs_brings_everything_back(
-    start_app: StartApp, panorama: bytes, tmp_path: Path
-) -> None:
+def test_sqlite_backup_restores_everything(start_app: StartApp, panorama: bytes, tmp_path: Path) -> None:
     data, backup = tmp_path / "data", tmp_path / "backup.sqlite3"
     own = {"database_url": f"sqlite:///{data / 'lalaloc.sqlite3'}"}
     data.mkdir()
@@ -53,7 +51,7 @@ def test_a_sqlite_backup_taken_while_the_service_runs_brings_everything_back(
 
 
 @pytest.mark.parametrize("with_grids", [True, False])
-def test_a_postgresql_dump_brings_everything_back(
+def test_postgresql_dump_restores_everything(
     start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path, with_grids: bool
 ) -> None:
     url, dump = own_database(postgres), str(tmp_path / "backup.dump")
@@ -72,7 +70,7 @@ def test_a_postgresql_dump_brings_everything_back(
         assert stored(client, panorama) == before
 
 
-def test_replicas_of_two_models_run_side_by_side(
+def test_replicas_of_two_models_coexist(
     start_app: StartApp, postgres: PostgresServer, tiny_bundle: Path, panorama: bytes, tmp_path: Path
 ) -> None:
     url, bundle = postgres.new_database(), tmp_path / "next"
@@ -91,7 +89,7 @@ def test_replicas_of_two_models_run_side_by_side(
                 assert versions[1] == "next" != versions[0]
 
 
-def test_every_setting_that_the_page_names_exists() -> None:
+def test_documented_settings_exist() -> None:
     named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", PAGE))
     known = {name.upper() for name in SETTING_NAMES}
     # Of the compose files.

@@ -93,7 +93,7 @@ def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
     assert position["h"] == pytest.approx(519.5 + pose.get("camera_height_m", 1.5), abs=0.3)
 
 
-def test_a_plan_by_its_id(shipped: httpx.Client, home: str) -> None:
+def test_query_by_plan_id(shipped: httpx.Client, home: str) -> None:
     asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes())
     response = shipped.post("/geopose", params={"floorplan_id": home}, json=asked)
     assert response.status_code == 200, response.text
@@ -101,7 +101,7 @@ def test_a_plan_by_its_id(shipped: httpx.Client, home: str) -> None:
     assert response.json()["lalaloc"]["warnings"] == []
 
 
-def test_a_plan_by_where_the_device_is_about(shipped: httpx.Client, home: str) -> None:
+def test_query_by_geolocation(shipped: httpx.Client, home: str) -> None:
     # Storeys of one house have one place.
     upper = upload(shipped, FLAT | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
     asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(12.0, 8.0, 30.0))
@@ -115,7 +115,7 @@ def test_a_plan_by_where_the_device_is_about(shipped: httpx.Client, home: str) -
     assert "within 50 m of latitude" in assert_problem(nowhere, 404, "no-floorplan-nearby")["detail"]
 
 
-def test_a_venue_whose_anchor_holds_and_a_reading_that_does_not(shipped: httpx.Client, home: str) -> None:
+def test_query_in_a_venue_ignores_a_wrong_reading(shipped: httpx.Client, home: str) -> None:
     plain = upload(shipped, HOME)
     anchor = ANCHOR | {"north_deg": NORTH_DEG}
     venue = shipped.post("/venues", json={"plans": [{"floorplan_id": plain, "level": 2}], "anchor": anchor}).json()
@@ -160,7 +160,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
 
 
 @pytest.mark.parametrize(("change", "field", "words"), WRONG.values(), ids=WRONG.keys())
-def test_what_is_missing_or_wrong_is_told(
+def test_missing_and_invalid_members_are_refused(
     client: httpx.Client, panorama: bytes, change: Callable[[dict[str, Any]], None], field: str, words: str
 ) -> None:
     asked = oscp_request(panorama)
@@ -170,7 +170,7 @@ def test_what_is_missing_or_wrong_is_told(
     assert words in problem["detail"]
 
 
-def test_what_is_no_panorama_or_too_large_is_told(start_app: StartApp, tmp_path: Path) -> None:
+def test_invalid_and_large_pictures_are_refused(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_panorama_bytes=2000) as client:
         plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 0})
         params = {"floorplan_id": plan_id}

@@ -84,9 +84,7 @@ def _warm(client: httpx.Client) -> bool:
     return client.get("/readyz").json()["lpo_pool"]["ready"] > 0
 
 
-def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
-    tiny_bundle: Path, tmp_path: Path, panorama: bytes
-) -> None:
+def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         early = client.get("/readyz")
@@ -111,7 +109,7 @@ def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
         assert localise(client, plan_id, panorama, refine="none").json()["candidates"] == coarse["candidates"]
 
 
-def test_workers_killed_at_random_cost_no_query_its_answer(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
     rng = random.Random(3)
     environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="2", MAX_QUERIES="8")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
@@ -142,9 +140,7 @@ def test_workers_killed_at_random_cost_no_query_its_answer(tiny_bundle: Path, tm
         assert 'lalaloc_pool_restarts_total{pool="lpo"} 0.0' not in client.get("/metrics").text
 
 
-def test_a_killed_service_leaves_no_workers_and_takes_up_what_it_was_preparing(
-    tiny_bundle: Path, tmp_path: Path
-) -> None:
+def test_killed_service_leaves_no_workers_and_resumes(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         wait_for(lambda: _warm(client), 120.0)
@@ -165,7 +161,7 @@ def test_a_killed_service_leaves_no_workers_and_takes_up_what_it_was_preparing(
     assert (tmp_path / "log").read_text().count("Application shutdown complete") == 1
 
 
-def test_the_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) -> None:
     script = [sys.executable, "-m", "tests.service.torch_free", str(tiny_bundle), str(tmp_path)]
     environment = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
     done = subprocess.run(script, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
@@ -184,7 +180,7 @@ def test_the_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path
         ("LALALOC_DATABASE_URL", "mysql://somewhere/plans", "mysql"),
     ],
 )
-def test_a_wrong_setting_stops_the_start_and_is_named_in_a_line(
+def test_invalid_setting_stops_the_start(
     tiny_bundle: Path, tmp_path: Path, variable: str, value: str, told: str
 ) -> None:
     environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
@@ -196,7 +192,7 @@ def test_a_wrong_setting_stops_the_start_and_is_named_in_a_line(
     assert done.stderr.count("\n") == 1
 
 
-def test_a_model_with_a_flipped_bit_stops_the_start_and_is_named_in_a_line(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_damaged_model_stops_the_start(tiny_bundle: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "model"
     shutil.copytree(tiny_bundle, damaged)
     network = damaged / "image_encoder.onnx"
@@ -210,7 +206,7 @@ def test_a_model_with_a_flipped_bit_stops_the_start_and_is_named_in_a_line(tiny_
     assert "'image_encoder.onnx' has SHA-256" in done.stderr
 
 
-def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
     command = [sys.executable, "-m", "service", "--port", "0"]
     process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
@@ -225,7 +221,7 @@ def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_pa
         process.wait(10.0)
 
 
-def test_every_log_line_from_the_start_on_is_json_and_holds_no_query(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_log_is_json_and_holds_no_query(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="0")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         client.get("/floorplans", params={"name": "very-secret"}, headers={"authorization": "Bearer very-secret"})

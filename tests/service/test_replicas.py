@@ -62,7 +62,7 @@ def _listens(client: httpx.Client, status: int) -> bool:
         return False
 
 
-def test_two_replicas_behind_the_proxy_are_one_service(
+def test_two_replicas_act_as_one_service(
     start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path
 ) -> None:
     url = postgres.new_database()
@@ -88,7 +88,7 @@ def test_two_replicas_behind_the_proxy_are_one_service(
             assert localise(a, plan_id, panorama, heading_deg=0).status_code == 404
 
 
-def test_refusals_take_no_replica_out(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+def test_refusals_do_not_disable_a_replica(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     shared: dict[str, Any] = {"database_url": postgres.new_database(), "max_reads": 1}
     with start_app(tmp_path / "a", **shared) as a, start_app(tmp_path / "b", **shared) as b, ExitStack() as readers:
         waiting = readers.enter_context(ThreadPoolExecutor(2))
@@ -103,9 +103,7 @@ def test_refusals_take_no_replica_out(start_app: StartApp, postgres: PostgresSer
                 assert proxy.get("/healthz").status_code == 200
 
 
-def test_the_proxy_lets_through_what_the_service_takes(
-    start_app: StartApp, postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_proxy_accepts_the_largest_uploads(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     url = postgres.new_database()
     with start_app(tmp_path / "a", database_url=url) as a, nginx(tmp_path, [a, a]) as proxy:
         limit = a.get("/limits").json()["max_panorama_bytes"]
@@ -165,13 +163,11 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
 
 
 @pytest.mark.parametrize(("request_", "status", "slug"), OF_THE_PROXY.values(), ids=OF_THE_PROXY.keys())
-def test_what_the_proxy_refuses_is_a_problem_document_too(
-    alone: httpx.Client, request_: bytes, status: int, slug: str
-) -> None:
+def test_proxy_errors_are_problem_documents(alone: httpx.Client, request_: bytes, status: int, slug: str) -> None:
     _assert_refused(*_answer_to(alone, request_), status, slug)
 
 
-def test_a_replica_that_does_not_answer_is_told_as_a_problem(tmp_path: Path) -> None:
+def test_silent_replica_becomes_a_problem_document(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent, ExitStack() as stack:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         replicas = [stack.enter_context(httpx.Client(base_url=url)) for _ in range(2)]

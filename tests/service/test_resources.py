@@ -63,7 +63,7 @@ def test_pages_have_every_plan_once_newest_first(
     assert [plan_id for page in pages for plan_id in page] == ids[::-1]
 
 
-def test_what_comes_and_goes_meanwhile_moves_no_other_plan(start_app: StartApp, tmp_path: Path) -> None:
+def test_paging_is_stable_under_changes(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         ids = [upload(client, wait=False) for _ in range(4)]
         first = client.get("/floorplans", params={"limit": 2}).json()
@@ -79,7 +79,7 @@ def test_what_comes_and_goes_meanwhile_moves_no_other_plan(start_app: StartApp, 
 @pytest.mark.parametrize(
     ("name", "found"), [("flat", [4, 3, 1, 0]), ("HOUSE", [6, 2]), ("ärg", [5]), ("%", [4]), ("_", [3]), ("none", [])]
 )
-def test_plans_are_found_by_a_part_of_their_name(
+def test_plans_are_found_by_part_of_their_name(
     listed: tuple[httpx.Client, list[str]], name: str, found: list[int]
 ) -> None:
     client, ids = listed
@@ -102,7 +102,7 @@ def test_plans_are_found_by_a_part_of_their_name(
         ({"name": "x" * 201}, "name"),
     ],
 )
-def test_a_listing_that_makes_no_sense_is_refused_by_the_field(
+def test_invalid_list_parameters_are_refused(
     listed: tuple[httpx.Client, list[str]], params: dict[str, Any], field: str
 ) -> None:
     problem = assert_problem(listed[0].get("/floorplans", params=params), 422, "invalid-request")
@@ -113,13 +113,13 @@ def test_a_listing_that_makes_no_sense_is_refused_by_the_field(
     st.datetimes(datetime(1970, 1, 1), datetime(9999, 12, 31), timezones=st.just(UTC)),
     st.binary(min_size=16, max_size=16),
 )
-def test_a_cursor_stands_for_one_place(moment: datetime, plan_id: bytes) -> None:
+def test_cursor_round_trip(moment: datetime, plan_id: bytes) -> None:
     place = Cursor(moment, plan_id.hex())
     assert parse_cursor(cursor_text(place)) == place
 
 
 @given(st.text(alphabet="Aa9_-+/=", min_size=31, max_size=33))
-def test_no_two_texts_are_the_same_cursor(text: str) -> None:
+def test_cursor_texts_are_unique(text: str) -> None:
     with contextlib.suppress(InvalidRequestError):
         assert cursor_text(parse_cursor(text)) == text
 
@@ -131,7 +131,7 @@ REPRESENTATIONS = ["", "/original", "/preview.svg", "/mesh.glb"]
 
 
 @pytest.mark.parametrize("path", REPRESENTATIONS)
-def test_who_has_a_representation_gets_304(client: httpx.Client, path: str) -> None:
+def test_matching_tag_gets_304(client: httpx.Client, path: str) -> None:
     url = f"/floorplans/{upload(client)}{path}"
     first = client.get(url)
     etag = first.headers["etag"]
@@ -152,7 +152,7 @@ def test_who_has_a_representation_gets_304(client: httpx.Client, path: str) -> N
 
 
 @pytest.mark.parametrize("value", ["", "x", '"', '"a" "b"', "*, *", '"a", b', "W/", 'w/"a"'])
-def test_a_header_that_is_no_list_of_tags_is_refused(client: httpx.Client, value: str) -> None:
+def test_invalid_tag_header_is_refused(client: httpx.Client, value: str) -> None:
     url = f"/floorplans/{upload(client)}"
     looked_at = client.get(url, headers={"If-None-Match": value})
     assert assert_problem(looked_at, 422, "invalid-request")["errors"][0]["field"] == "If-None-Match"
@@ -168,7 +168,7 @@ def test_drawings_of_other_poses_have_other_tags(client: httpx.Client) -> None:
     assert len(tags) == 3
 
 
-def test_a_tag_stands_for_the_very_bytes_while_a_plan_is_prepared(start_app: StartApp, tmp_path: Path) -> None:
+def test_tag_identifies_bytes_while_preparing(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **_hall()) as client:
         created = client.post("/floorplans", json=HALL)
         url = created.headers["location"]
@@ -186,7 +186,7 @@ def test_a_tag_stands_for_the_very_bytes_while_a_plan_is_prepared(start_app: Sta
 # Revisions
 
 
-def test_a_replaced_plan_has_another_revision(client: httpx.Client) -> None:
+def test_replaced_plan_has_another_revision(client: httpx.Client) -> None:
     created = client.post("/floorplans", json=FLAT)
     before, url = created.json(), created.headers["location"]
     response = client.put(url, json=_named("Flat 3, rebuilt"))
@@ -204,7 +204,7 @@ def test_a_replaced_plan_has_another_revision(client: httpx.Client) -> None:
     assert [plan["revision"] for plan in listed if plan["id"] == before["id"]] == [after["revision"]]
 
 
-def test_an_older_revision_is_told_while_it_is_kept(start_app: StartApp, tmp_path: Path) -> None:
+def test_kept_revisions_can_be_read(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_revisions=2) as client:
         created = client.post("/floorplans", json=FLAT)
         url, revisions = created.headers["location"], [created.json()["revision"]]
@@ -217,7 +217,7 @@ def test_an_older_revision_is_told_while_it_is_kept(start_app: StartApp, tmp_pat
             assert_problem(client.get(url, params={"revision": unknown}), 404, "unknown-revision")
 
 
-def test_answers_name_the_revision_that_was_searched(client: httpx.Client, panorama: bytes) -> None:
+def test_answers_name_the_searched_revision(client: httpx.Client, panorama: bytes) -> None:
     created = client.post("/floorplans", json=FLAT).json()
     answers = [localise(client, created["id"], panorama, refine="none").json()]
     replaced = client.put(f"/floorplans/{created['id']}", json=_named("other")).json()
@@ -225,7 +225,7 @@ def test_answers_name_the_revision_that_was_searched(client: httpx.Client, panor
     assert [answer["floorplan_revision"] for answer in answers] == [created["revision"], replaced["revision"]]
 
 
-def test_queries_in_work_finish_while_their_plan_is_replaced(client: httpx.Client, panorama: bytes) -> None:
+def test_running_queries_survive_a_replacement(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client)
     url = f"/floorplans/{plan_id}"
     known, stop = {client.get(url).json()["revision"]}, threading.Event()
@@ -245,7 +245,7 @@ def test_queries_in_work_finish_while_their_plan_is_replaced(client: httpx.Clien
     assert len(known) > 2
 
 
-def test_a_plan_that_is_not_there_is_not_made_by_replacing_it(client: httpx.Client) -> None:
+def test_put_does_not_create_plans(client: httpx.Client) -> None:
     for plan_id in (NEVER, "x"):
         assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
     plan_id = upload(client)
@@ -253,7 +253,7 @@ def test_a_plan_that_is_not_there_is_not_made_by_replacing_it(client: httpx.Clie
     assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
 
 
-def test_a_bad_plan_replaces_nothing(client: httpx.Client) -> None:
+def test_invalid_plan_replaces_nothing(client: httpx.Client) -> None:
     url = f"/floorplans/{upload(client)}"
     before = client.get(url).json()
     assert_problem(client.put(url, json={"rooms": []}), 422, "invalid-floorplan")
@@ -262,7 +262,7 @@ def test_a_bad_plan_replaces_nothing(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("method", ["PUT", "DELETE"])
-def test_who_expects_another_revision_is_refused(client: httpx.Client, method: str) -> None:
+def test_unexpected_revision_is_refused(client: httpx.Client, method: str) -> None:
     body: dict[str, Any] = {"json": FLAT} if method == "PUT" else {}
     created = client.post("/floorplans", json=FLAT)
     url, old = created.headers["location"], created.headers["etag"]
@@ -284,9 +284,7 @@ def test_who_expects_another_revision_is_refused(client: httpx.Client, method: s
 
 
 @pytest.mark.parametrize("condition", ["*", "revision"])
-def test_any_revision_and_the_plain_id_of_the_revision_are_conditions_as_well(
-    client: httpx.Client, condition: str
-) -> None:
+def test_star_and_plain_revision_ids_are_conditions(client: httpx.Client, condition: str) -> None:
     created = client.post("/floorplans", json=FLAT)
     value = "*" if condition == "*" else f'"{created.json()["revision"]}"'
     url, headers = created.headers["location"], {"If-Match": value}
@@ -294,7 +292,7 @@ def test_any_revision_and_the_plain_id_of_the_revision_are_conditions_as_well(
     assert client.delete(url, headers=headers).status_code == (204 if condition == "*" else 412)
 
 
-def test_of_many_who_replace_the_same_revision_one_does(client: httpx.Client) -> None:
+def test_one_of_many_replacements_succeeds(client: httpx.Client) -> None:
     created = client.post("/floorplans", json=FLAT)
     url, headers = created.headers["location"], {"If-Match": created.headers["etag"]}
     with ThreadPoolExecutor(6) as threads:
@@ -308,9 +306,7 @@ def test_of_many_who_replace_the_same_revision_one_does(client: httpx.Client) ->
 # Deletion and jobs
 
 
-def test_a_revision_that_is_replaced_while_it_is_prepared_is_not_any_longer(
-    start_app: StartApp, tmp_path: Path
-) -> None:
+def test_replacing_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: Path) -> None:
     large = HALL | {"rooms": [{"name": "hall", "polygon": [[0, 0], [90, 0], [90, 90], [0, 90]]}]}
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6, sweep_s=3600.0) as client:
         plan_id = upload(client, large, wait=False)
@@ -321,9 +317,7 @@ def test_a_revision_that_is_replaced_while_it_is_prepared_is_not_any_longer(
         wait_for(lambda: "lalaloc_grids_pending 0.0" in client.get("/metrics").text, 5.0)
 
 
-def test_a_plan_that_is_deleted_while_it_is_prepared_is_not_any_longer(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_deleting_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
         plan_id = upload(client, HALL, wait=False)
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
@@ -336,7 +330,7 @@ def test_a_plan_that_is_deleted_while_it_is_prepared_is_not_any_longer(
         assert_problem(client.get(f"/floorplans/{plan_id}"), 404, "unknown-floorplan")
 
 
-def test_a_plan_that_was_being_prepared_is_taken_up_after_a_restart(start_app: StartApp, tmp_path: Path) -> None:
+def test_preparation_resumes_after_a_restart(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **_hall(), grid_lease_s=0.5) as client:
         plan_id = upload(client, HALL, wait=False)
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
@@ -345,9 +339,7 @@ def test_a_plan_that_was_being_prepared_is_taken_up_after_a_restart(start_app: S
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
 
 
-def test_queries_are_answered_while_a_large_plan_is_prepared(
-    start_app: StartApp, tmp_path: Path, panorama: bytes
-) -> None:
+def test_queries_run_while_a_large_plan_is_prepared(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
         small = upload(client)
         large = upload(client, HALL, wait=False)
@@ -369,7 +361,7 @@ def _cached_bytes(client: httpx.Client) -> float:
     return float(next(line for line in lines if line.startswith("lalaloc_grid_cache_bytes ")).split()[1])
 
 
-def test_what_one_replica_does_the_other_knows_at_once(replicas: list[httpx.Client], panorama: bytes) -> None:
+def test_replicas_see_changes_at_once(replicas: list[httpx.Client], panorama: bytes) -> None:
     first, second = replicas
     created = first.post("/floorplans", json=FLAT).json()
     url = f"/floorplans/{created['id']}"

@@ -153,7 +153,7 @@ def guarded(
         store.close()
 
 
-def test_every_route_says_which_scope_it_needs() -> None:
+def test_every_route_has_a_scope() -> None:
     served = {operation for operation in _served() if operation[0] != "HEAD"}
     assert served - set(NEEDED) == set(), "these routes are closed to everybody: give them a row in NEEDED"
     assert set(NEEDED) - served == set(), "these routes are gone"
@@ -164,9 +164,7 @@ def test_every_route_says_which_scope_it_needs() -> None:
 
 @pytest.mark.parametrize("scheme", [None, "malformed", "unknown", "revoked"])
 @pytest.mark.parametrize(("method", "path"), sorted(_served() | set(OPERATIONS)))
-def test_nothing_but_health_is_answered_without_a_valid_key(
-    guarded: Guarded, method: str, path: str, scheme: str | None
-) -> None:
+def test_only_health_works_without_a_valid_key(guarded: Guarded, method: str, path: str, scheme: str | None) -> None:
     key = {None: None, "malformed": "lalaloc_x", "unknown": key_text("0" * 32, new_secret())}.get(scheme)
     if scheme == "revoked":
         key = make_key(guarded.store)
@@ -179,7 +177,7 @@ def test_nothing_but_health_is_answered_without_a_valid_key(
 
 
 @pytest.mark.parametrize(("method", "path"), OPERATIONS)
-def test_a_key_without_the_scope_is_refused_and_told_which_it_needs(guarded: Guarded, method: str, path: str) -> None:
+def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: str) -> None:
     needed = NEEDED[method, path]
     others = tuple(permission for permission in EVERYTHING if permission != needed)
     problem = assert_problem(
@@ -189,7 +187,7 @@ def test_a_key_without_the_scope_is_refused_and_told_which_it_needs(guarded: Gua
 
 
 @pytest.mark.parametrize(("method", "path"), OPERATIONS)
-def test_a_key_with_the_scope_alone_is_let_in(guarded: Guarded, method: str, path: str) -> None:
+def test_key_with_only_the_scope_is_accepted(guarded: Guarded, method: str, path: str) -> None:
     plan_id = guarded.send("POST", "/floorplans", guarded.key).json()["id"]
     key = make_key(guarded.store, scopes=(NEEDED[method, path],))
     if path.endswith("/events"):
@@ -200,7 +198,7 @@ def test_a_key_with_the_scope_alone_is_let_in(guarded: Guarded, method: str, pat
 
 
 @pytest.mark.parametrize(("method", "path"), ABOUT_A_PLAN)
-def test_the_plan_of_another_tenant_does_not_exist(guarded: Guarded, method: str, path: str) -> None:
+def test_plan_of_another_tenant_does_not_exist(guarded: Guarded, method: str, path: str) -> None:
     theirs = make_key(guarded.store, tenant="theirs")
     never = "0123456789abcdef" * 2
     mine, unknown = guarded.send(method, path, theirs), guarded.send(method, path, theirs, never)
@@ -211,7 +209,7 @@ def test_the_plan_of_another_tenant_does_not_exist(guarded: Guarded, method: str
     assert guarded.send("GET", f"/floorplans/{{{PLAN}}}", guarded.key).json()["name"] == FLAT["name"]
 
 
-def test_listings_have_the_plans_of_the_tenant_only(guarded: Guarded) -> None:
+def test_lists_have_only_plans_of_the_tenant(guarded: Guarded) -> None:
     theirs = make_key(guarded.store, tenant="others")
     assert guarded.send("GET", "/floorplans", theirs).json()["floorplans"] == []
     own = guarded.send("POST", "/floorplans", theirs).json()["id"]
@@ -223,12 +221,12 @@ def test_listings_have_the_plans_of_the_tenant_only(guarded: Guarded) -> None:
 
 @pytest.mark.parametrize("path", sorted(OPEN_PATHS))
 @pytest.mark.parametrize("key", [None, "nonsense"])
-def test_health_is_told_to_everybody(guarded: Guarded, path: str, key: str | None) -> None:
+def test_health_needs_no_key(guarded: Guarded, path: str, key: str | None) -> None:
     wait_for(lambda: guarded.send("GET", path, key).status_code == 200)
 
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/web/app.js", "/web/style.css", "/favicon.ico"])
-def test_pages_are_shown_without_a_key_and_ask_for_one_themselves(guarded: Guarded, path: str) -> None:
+def test_pages_need_no_key(guarded: Guarded, path: str) -> None:
     assert guarded.send("GET", path, None).status_code == 200
     assert guarded.client.head(path).status_code == 200
     assert guarded.send("GET", path, guarded.key).status_code == 200
@@ -238,11 +236,11 @@ def test_pages_are_shown_without_a_key_and_ask_for_one_themselves(guarded: Guard
 
 
 @pytest.mark.parametrize("path", ["/web/", "/web/../app.py", "/web/%2e%2e/app.py", "/web/none.js", "/web/a/b.js"])
-def test_nothing_but_the_pages_is_shown_without_a_key(guarded: Guarded, path: str) -> None:
+def test_other_files_need_a_key(guarded: Guarded, path: str) -> None:
     assert guarded.send("GET", path, None).status_code in (401, 404)
 
 
-def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: Guarded) -> None:
+def test_unknown_paths_are_revealed_only_with_a_key(guarded: Guarded) -> None:
     assert_problem(guarded.send("GET", "/no/such/route", guarded.key), 404, "not-found")
     refused = guarded.send("PATCH", "/localise", guarded.key)
     assert_problem(refused, 405, "method-not-allowed")
@@ -256,21 +254,19 @@ def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: G
         assert guarded.send(method, path, None).status_code == 401
 
 
-def test_a_path_with_a_slash_at_its_end_needs_what_it_leads_to(guarded: Guarded) -> None:
+def test_path_with_a_trailing_slash_needs_the_same_scope(guarded: Guarded) -> None:
     writer = make_key(guarded.store, scopes=("write",))
     assert guarded.send("GET", "/floorplans/", writer).status_code == 403
     assert guarded.send("GET", "/floorplans/", guarded.key).headers["location"] == "/floorplans"
 
 
-def test_a_redirect_names_no_host(client: httpx.Client) -> None:
+def test_redirect_names_no_host(client: httpx.Client) -> None:
     redirect = client.get("/floorplans/?name=x", headers={"host": "127.0.0.1:99"}, follow_redirects=False)
     assert redirect.status_code == 307
     assert redirect.headers["location"] == "/floorplans?name=x"
 
 
-def test_a_route_that_nobody_gave_a_scope_is_not_there(
-    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path
-) -> None:
+def test_route_without_a_scope_is_closed(tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path) -> None:
     settings = Settings(
         data_dir=tmp_path,
         database_url=database_of(tmp_path),
@@ -287,7 +283,7 @@ def test_a_route_that_nobody_gave_a_scope_is_not_there(
         store.close()
 
 
-def test_unknown_revoked_and_mistaken_keys_are_refused_in_the_same_words(guarded: Guarded) -> None:
+def test_invalid_keys_get_the_same_message(guarded: Guarded) -> None:
     revoked = make_key(guarded.store)
     guarded.store.keys.revoke(id_of(revoked))
     keys = {
@@ -315,20 +311,20 @@ def test_unknown_revoked_and_mistaken_keys_are_refused_in_the_same_words(guarded
         (["Bearer {key}", "Bearer {key}"], False),
     ],
 )
-def test_one_authorization_header_with_one_whole_key_counts(values: list[str], accepted: bool) -> None:
+def test_only_one_whole_authorization_header_counts(values: list[str], accepted: bool) -> None:
     key_id, secret = "0123456789abcdef" * 2, new_secret()
     parsed = parse_authorization([value.format(key=key_text(key_id, secret)) for value in values])
     assert parsed == (PresentedKey(key_id, hash_of(secret)) if accepted else None)
 
 
-def test_secrets_have_256_bits_and_are_never_the_same() -> None:
+def test_secrets_are_random_256_bits() -> None:
     secrets = {new_secret() for _ in range(1000)}
     assert len(secrets) == 1000
     assert {len(secret) for secret in secrets} == {43}
     assert 43 * 6 >= 256
 
 
-def test_a_key_that_is_revoked_in_use_is_refused_soon(guarded: Guarded) -> None:
+def test_revoked_key_is_rejected_soon(guarded: Guarded) -> None:
     key = make_key(guarded.store)
     assert guarded.send("GET", "/limits", key).status_code == 200
     guarded.store.keys.revoke(id_of(key))
@@ -336,7 +332,7 @@ def test_a_key_that_is_revoked_in_use_is_refused_soon(guarded: Guarded) -> None:
     assert_problem(guarded.send("GET", "/limits", key), 401, "unauthenticated")
 
 
-def test_when_a_key_was_used_is_written_once_a_minute(guarded: Guarded) -> None:
+def test_last_use_is_written_once_a_minute(guarded: Guarded) -> None:
     key = make_key(guarded.store)
 
     def last_used() -> object:
@@ -352,7 +348,7 @@ def test_when_a_key_was_used_is_written_once_a_minute(guarded: Guarded) -> None:
     assert last_used() == first
 
 
-def test_a_body_is_not_waited_for_when_its_request_is_refused(guarded: Guarded) -> None:
+def test_refused_request_is_answered_before_its_body(guarded: Guarded) -> None:
     head = "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000000\r\n\r\n"
     with socket.create_connection((guarded.client.base_url.host, guarded.client.base_url.port or 0), 5.0) as raw:
         begin = monotonic()
@@ -361,7 +357,7 @@ def test_a_body_is_not_waited_for_when_its_request_is_refused(guarded: Guarded) 
         assert monotonic() - begin < 2.0
 
 
-def test_the_log_names_key_and_tenant_and_never_the_secret(start_app: StartApp, tmp_path: Path) -> None:
+def test_log_names_key_and_tenant_without_secret(start_app: StartApp, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'own.sqlite3'}"
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
@@ -383,7 +379,7 @@ def test_the_log_names_key_and_tenant_and_never_the_secret(start_app: StartApp, 
     assert key.split("_", 2)[2] not in lines
 
 
-def test_no_stack_trace_leaves_when_the_store_is_broken(start_app: StartApp, tmp_path: Path) -> None:
+def test_broken_store_reveals_no_stack_trace(start_app: StartApp, tmp_path: Path) -> None:
     database = tmp_path / "own.sqlite3"
     with start_app(tmp_path, database_url=f"sqlite:///{database}", log_level="error") as client:
         plan_id = upload(client)
@@ -398,7 +394,7 @@ def test_no_stack_trace_leaves_when_the_store_is_broken(start_app: StartApp, tmp
             assert not re.search(r"secret|sqlalchemy|\.py|line \d", response.text)
 
 
-def test_the_api_description_says_what_each_operation_needs_and_how_it_refuses() -> None:
+def test_api_description_states_scopes_and_refusals() -> None:
     document = create_app().openapi()
     (scheme,) = document["components"]["securitySchemes"]
     assert document["components"]["securitySchemes"][scheme]["scheme"] == "bearer"
@@ -414,9 +410,7 @@ def test_the_api_description_says_what_each_operation_needs_and_how_it_refuses()
 
 
 @pytest.mark.one_replica
-def test_a_key_may_send_so_many_requests_a_minute_and_is_told_when_to_go_on(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
-) -> None:
+def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=5, rate_burst=0) as client:
         store = Store(database_of(tmp_path))
         usual, unlimited = make_key(store), make_key(store, rate_per_minute=0)
@@ -438,7 +432,7 @@ def test_a_key_may_send_so_many_requests_a_minute_and_is_told_when_to_go_on(
         store.close()
 
 
-def test_a_burst_is_cut_short(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_burst_is_limited(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=0, rate_burst=2) as client:
         store = Store(database_of(tmp_path))
         key = make_key(store)
@@ -452,7 +446,7 @@ def test_a_burst_is_cut_short(start_app: StartApp, database_of: DatabaseOf, tmp_
 
 @pytest.mark.one_replica
 @pytest.mark.parametrize("kind", ["unknown", "malformed"])
-def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_are(
+def test_many_invalid_keys_do_not_block_valid_ones(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 5)
@@ -473,7 +467,7 @@ def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_a
         store.close()
 
 
-def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one(
+def test_address_counters_are_bounded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 1)
@@ -498,7 +492,7 @@ def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one(
 
 
 @pytest.mark.one_replica
-def test_known_keys_go_on_working_while_the_database_is_away(
+def test_known_keys_work_without_the_database(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
 ) -> None:
     url = postgres.new_database()
@@ -522,7 +516,7 @@ def test_known_keys_go_on_working_while_the_database_is_away(
         wait_for(lambda: client.get("/limits", headers=bearer(other)).status_code == 200, 10.0)
 
 
-def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tmp_path: Path) -> None:
+def test_key_is_cached_ten_minutes_without_database(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     clock_s = [1000.0]
     ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
@@ -548,7 +542,7 @@ def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tm
         store.close()
 
 
-def test_a_database_that_is_busy_is_no_reason_to_trust_a_key(tmp_path: Path) -> None:
+def test_busy_database_does_not_extend_the_key_cache(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     clock_s = [1000.0]
     ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
@@ -607,7 +601,7 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
         ({"allow_anonymous": True}, 200),
     ],
 )
-def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise(
+def test_remote_requests_without_keys_are_refused(
     tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, told: dict[str, Any], status: int
 ) -> None:
     settings = Settings(
@@ -654,7 +648,7 @@ def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise
         ("POST", {"Host": "evil.example"}, 403),
     ],
 )
-def test_without_keys_pages_from_elsewhere_have_no_say(
+def test_foreign_pages_without_keys_are_refused(
     anonymous: httpx.Client, method: str, headers: dict[str, str], status: int
 ) -> None:
     response = anonymous.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
@@ -673,7 +667,7 @@ def test_without_keys_pages_from_elsewhere_have_no_say(
         ({"allow_anonymous": True}, 403),
     ],
 )
-def test_other_names_and_pages_will_do_when_they_are_allowed(
+def test_allowed_hosts_and_pages_are_accepted(
     start_app: StartApp, tmp_path: Path, settings: dict[str, Any], status: int
 ) -> None:
     with start_app(tmp_path, **settings) as client:
@@ -682,7 +676,7 @@ def test_other_names_and_pages_will_do_when_they_are_allowed(
 
 
 @pytest.mark.parametrize("name", ["plans.example:8443", "https://plans.example", "*.example", "[2001:db8::1]", "a b"])
-def test_an_allowed_name_that_could_never_match_is_refused(name: str) -> None:
+def test_impossible_allowed_host_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="neither a bare name or address nor"):
         Settings(allowed_hosts=f"localhost,{name}")
     Settings(allowed_hosts="plans.example, 192.0.2.7,2001:db8::1,*")
@@ -714,7 +708,7 @@ def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> 
         ("0.0.0.0", {"published_on": "0.0.0.0:8000", "allow_anonymous": True}, False),
     ],
 )
-def test_an_address_for_others_is_refused_without_keys(host: str, settings: dict[str, Any], refused: bool) -> None:
+def test_public_address_without_keys_is_refused(host: str, settings: dict[str, Any], refused: bool) -> None:
     if not refused:
         check_address(host, Settings(**settings))
         return
@@ -723,7 +717,7 @@ def test_an_address_for_others_is_refused_without_keys(host: str, settings: dict
 
 
 @pytest.mark.parametrize("command", [["service"], ["service.cli", "serve"]], ids=" ".join)
-def test_the_service_does_not_start_on_a_public_address_without_keys(command: list[str], tmp_path: Path) -> None:
+def test_service_does_not_start_publicly_without_keys(command: list[str], tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", *command, "--host", "0.0.0.0", "--port", "0"],
         env={"LALALOC_DATA_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)},

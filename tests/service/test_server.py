@@ -21,7 +21,7 @@ from service.settings import Settings
 from tests.service.conftest import wait_for
 
 
-def test_the_body_of_an_answer_does_not_wait_for_its_head_to_be_acknowledged() -> None:
+def test_answer_body_is_not_delayed() -> None:
     no_delay: list[int] = []
 
     class Watched(bounded_protocol(5.0, 100)):
@@ -72,7 +72,7 @@ def _app() -> FastAPI:
     return app
 
 
-def test_idle_connections_make_room_for_new_ones() -> None:
+def test_idle_connections_make_room() -> None:
     settings = Settings(max_connections=1, max_reads=4, max_streams=4, max_pending_requests=11)
     # What may be in work at once, and one more.
     most = 4 + 4 + 11 + 1
@@ -90,7 +90,7 @@ def test_idle_connections_make_room_for_new_ones() -> None:
             idle[-1].recv(1)
 
 
-def test_a_connection_with_a_request_in_work_makes_no_room() -> None:
+def test_busy_connection_is_not_closed() -> None:
     app, go_on = _app(), threading.Event()
 
     @app.get("/slow")
@@ -110,9 +110,7 @@ def test_a_connection_with_a_request_in_work_makes_no_room() -> None:
 
 
 @pytest.mark.parametrize(("proxies", "told"), [(None, "127.0.0.1"), ("127.0.0.1", "203.0.113.7")])
-def test_an_address_is_believed_of_proxies_that_were_named_and_of_nobody_else(
-    monkeypatch: pytest.MonkeyPatch, proxies: str | None, told: str
-) -> None:
+def test_only_named_proxies_are_trusted(monkeypatch: pytest.MonkeyPatch, proxies: str | None, told: str) -> None:
     monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
     if proxies is not None:
         monkeypatch.setenv("FORWARDED_ALLOW_IPS", proxies)
@@ -121,7 +119,7 @@ def test_an_address_is_believed_of_proxies_that_were_named_and_of_nobody_else(
     assert answer.json() == told
 
 
-def test_the_limit_of_descriptors_is_raised_and_connections_stay_below_it() -> None:
+def test_descriptor_limit_bounds_connections() -> None:
     code = (
         "import resource, sys\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[2])))\n"

@@ -12,7 +12,7 @@ from lalaloc_core.errors import ConfigError
 from service.settings import PREFIX, SETTING_NAMES, Settings, settings_table
 
 
-def test_an_unknown_name_is_an_error_that_names_it_and_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_setting_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LALALOC_DATADIR", "/tmp/x")
     with pytest.raises(ConfigError, match="LALALOC_DATADIR") as raised:
         Settings.load()
@@ -23,9 +23,7 @@ def test_an_unknown_name_is_an_error_that_names_it_and_the_known_ones(monkeypatc
     ("name", "value"),
     [("WORKERS", "-1"), ("WORKERS", "two"), ("REQUEST_DEADLINE_S", "nan"), ("GRID_STEP_M", "0"), ("LOG_LEVEL", "loud")],
 )
-def test_a_bad_value_is_an_error_that_names_variable_and_value(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: str
-) -> None:
+def test_invalid_value_names_variable_and_value(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
     monkeypatch.setenv(PREFIX + name, value)
     with pytest.raises(ConfigError, match=PREFIX + name) as raised:
         Settings.load()
@@ -59,14 +57,12 @@ def test_settings_cannot_change_once_read() -> None:
         settings.compute.workers = 5  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_the_default_bundle_does_not_depend_on_the_working_directory(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_default_bundle_is_independent_of_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert Settings.load().bundle == Path(__file__).parents[2] / "models" / "default"
 
 
-def test_the_table_of_settings_has_every_one_with_its_meaning() -> None:
+def test_settings_table_is_complete() -> None:
     rows = [line for line in settings_table().splitlines() if line.startswith("| `")]
     assert len(rows) == len(SETTING_NAMES)
     assert all(len(row.split("|")[3].strip()) > 10 for row in rows)

@@ -63,7 +63,7 @@ def _in_flight(client: httpx.Client) -> bool:
     return "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text
 
 
-def test_told_to_stop_it_finishes_what_is_in_work_and_refuses_the_rest(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> None:
     body = json.dumps(FLAT).encode()
     with _service(tiny_bundle, tmp_path / "data") as service:
         workers = children(service.process.pid)
@@ -83,7 +83,7 @@ def test_told_to_stop_it_finishes_what_is_in_work_and_refuses_the_rest(tiny_bund
         assert not any(alive(worker) for worker in workers)
 
 
-def test_a_load_balancer_is_told_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
     with _service(tiny_bundle, tmp_path / "data", STOP_NOTICE_S="3") as service:
         begin = monotonic()
         service.process.send_signal(signal.SIGTERM)
@@ -94,7 +94,7 @@ def test_a_load_balancer_is_told_before_the_service_stops(tiny_bundle: Path, tmp
         assert monotonic() - begin > 3.0
 
 
-def test_stopping_takes_no_longer_than_it_may(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
     with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         workers = children(service.process.pid)
         with service.connect(_upload_head(b"x" * 100)) as upload:
@@ -109,7 +109,7 @@ def test_stopping_takes_no_longer_than_it_may(tiny_bundle: Path, tmp_path: Path)
         wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
 
 
-def test_clients_that_follow_events_do_not_hold_it_up(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"GRID_STEP_M": "0.1", "MAX_GRID_POSES": "1000000"}
     with _service(tiny_bundle, tmp_path / "data", **settings) as service:
@@ -123,7 +123,7 @@ def test_clients_that_follow_events_do_not_hold_it_up(tiny_bundle: Path, tmp_pat
         assert service.process.wait(10.0) == 0
 
 
-def test_a_second_signal_ends_it_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_second_signal_ends_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
     with _service(tiny_bundle, tmp_path / "data") as service:
         workers = children(service.process.pid)
         with service.connect(_upload_head(b"x" * 100)):
@@ -137,7 +137,7 @@ def test_a_second_signal_ends_it_at_once(tiny_bundle: Path, tmp_path: Path) -> N
         wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
 
 
-def test_clients_that_dribble_are_cut_off(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_slow_clients_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     limits = {"KEEP_ALIVE_S": "1", "HEAD_DEADLINE_S": "1", "MAX_PENDING_REQUESTS": "1"}
     with _service(tiny_bundle, tmp_path / "data", **limits) as service:
         with service.connect(b"GET /healthz HTTP/1.1\r\nX-Slow: ") as slow_head:

@@ -92,7 +92,7 @@ def _metric(client: httpx.Client, sample: str) -> float:
     return float(match[1]) if match else 0.0
 
 
-def test_a_query_has_one_line_with_plan_stage_and_times(client: httpx.Client, log: Log, panorama: bytes) -> None:
+def test_query_has_one_log_line(client: httpx.Client, log: Log, panorama: bytes) -> None:
     plan_id = upload(client)
     response = localise(client, plan_id, panorama, refine="vdr")
     (line,) = log.of_request(response.headers["x-request-id"])
@@ -106,7 +106,7 @@ def test_a_query_has_one_line_with_plan_stage_and_times(client: httpx.Client, lo
     assert line["stages_ms"]["encode"] == pytest.approx(response.json()["timings_ms"]["encode"], abs=0.1)
 
 
-def test_the_path_of_a_plan_is_its_route_and_its_id_a_field(client: httpx.Client, log: Log) -> None:
+def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
     found = client.get(f"/floorplans/{plan_id}")
     (line,) = log.of_request(found.headers["x-request-id"])
@@ -117,7 +117,7 @@ def test_the_path_of_a_plan_is_its_route_and_its_id_a_field(client: httpx.Client
 
 
 @pytest.mark.one_replica
-def test_what_was_refused_tells_why_and_how_far_it_came(client: httpx.Client, log: Log) -> None:
+def test_refused_request_logs_its_reason(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
     refusals = 'lalaloc_rejections_total{reason="invalid-panorama"}'
     before = _metric(client, refusals)
@@ -129,9 +129,7 @@ def test_what_was_refused_tells_why_and_how_far_it_came(client: httpx.Client, lo
     assert _metric(client, refusals) == before + 1.0
 
 
-def test_what_is_refused_before_it_is_routed_has_its_route_all_the_same(
-    start_app: StartApp, tmp_path: Path, log: Log
-) -> None:
+def test_early_refusal_logs_its_route(start_app: StartApp, tmp_path: Path, log: Log) -> None:
     with start_app(tmp_path, api_keys=True, log_level="info") as client:
         response = client.get(f"/floorplans/{'0' * 32}", headers={"authorization": "Bearer very-secret"})
         (line,) = log.of_request(response.headers["x-request-id"])
@@ -141,7 +139,7 @@ def test_what_is_refused_before_it_is_routed_has_its_route_all_the_same(
 
 
 @pytest.mark.one_replica
-def test_a_client_that_hangs_up_is_counted_and_told(client: httpx.Client, log: Log) -> None:
+def test_disconnect_is_counted_and_logged(client: httpx.Client, log: Log) -> None:
     gone = 'lalaloc_disconnects_total{route="/floorplans"}'
     before = _metric(client, gone)
     with socket.create_connection((client.base_url.host, client.base_url.port or 80)) as connection:
@@ -157,7 +155,7 @@ def test_a_client_that_hangs_up_is_counted_and_told(client: httpx.Client, log: L
     assert _metric(client, gone) == before + 1.0
 
 
-def test_no_line_tells_a_key_or_a_query(client: httpx.Client, log: Log, panorama: bytes) -> None:
+def test_log_has_no_keys_or_queries(client: httpx.Client, log: Log, panorama: bytes) -> None:
     plan_id = upload(client)
     headers = {"Authorization": "Bearer very-secret", "Cookie": "very-secret"}
     for method, path in [
@@ -174,14 +172,14 @@ def test_no_line_tells_a_key_or_a_query(client: httpx.Client, log: Log, panorama
 
 
 @pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics"])
-def test_probes_are_told_to_whoever_debugs_alone(client: httpx.Client, log: Log, path: str) -> None:
+def test_probes_are_logged_at_debug_level(client: httpx.Client, log: Log, path: str) -> None:
     client.get(path, headers={"x-request-id": "probe"})
     client.get("/limits", headers={"x-request-id": "other"})
     assert {line["level"] for line in log.of_request("probe")} == {"debug"}
     assert {line["level"] for line in log.of_request("other")} == {"info"}
 
 
-def test_a_valid_trace_goes_on_in_the_answer_and_the_log(client: httpx.Client, log: Log) -> None:
+def test_valid_trace_is_continued(client: httpx.Client, log: Log) -> None:
     response = client.get("/limits", headers={"traceparent": f"00-{TRACE}-{SPAN}-01"})
     version, trace_id, span_id, flags = response.headers["traceparent"].split("-")
     assert (version, trace_id, flags) == ("00", TRACE, "01")
@@ -205,7 +203,7 @@ def test_a_valid_trace_goes_on_in_the_answer_and_the_log(client: httpx.Client, l
         f"00-{TRACE[1:]}-{SPAN}-01",
     ],
 )
-def test_an_invalid_trace_is_replaced(client: httpx.Client, header: str) -> None:
+def test_invalid_trace_is_replaced(client: httpx.Client, header: str) -> None:
     answered = client.get("/healthz", headers={"traceparent": header}).headers["traceparent"]
     fresh = parse_traceparent([answered])
     assert fresh is not None
@@ -213,7 +211,7 @@ def test_an_invalid_trace_is_replaced(client: httpx.Client, header: str) -> None
     assert fresh.sampled is False
 
 
-def test_two_traces_are_none_and_later_versions_are_read_as_far_as_known() -> None:
+def test_repeated_and_later_traceparent_headers() -> None:
     header = f"00-{TRACE}-{SPAN}-01"
     assert parse_traceparent([header, header]) is None
     assert parse_traceparent([f"cc-{TRACE}-{SPAN}-ff-what-comes"]) == TraceContext(TRACE, SPAN, sampled=True)
@@ -221,7 +219,7 @@ def test_two_traces_are_none_and_later_versions_are_read_as_far_as_known() -> No
 
 
 @given(_HEX_16, _HEX_16, _HEX_16, st.booleans())
-def test_a_header_reads_as_the_span_that_wrote_it(high: str, low: str, span: str, sampled: bool) -> None:
+def test_traceparent_round_trip(high: str, low: str, span: str, sampled: bool) -> None:
     written = TraceContext(high + low, span, sampled)
     zero = not int(high + low, 16) or not int(span, 16)
     assert parse_traceparent([written.header]) == (None if zero else written)
@@ -230,12 +228,12 @@ def test_a_header_reads_as_the_span_that_wrote_it(high: str, low: str, span: str
 
 
 @given(st.text(max_size=80))
-def test_no_header_is_too_odd_to_be_refused(header: str) -> None:
+def test_any_traceparent_text_is_parsed_safely(header: str) -> None:
     found = parse_traceparent([header])
     assert found is None or found.trace_id in header
 
 
-def test_the_build_is_told_and_metrics_of_rooms_are_made_once(client: httpx.Client) -> None:
+def test_build_info_and_drawing_metrics(client: httpx.Client) -> None:
     model = client.get("/readyz").json()["model"]
     labels = f'model="{model["name"]}",model_version="{model["version"]}",sha256="{model["sha256"]}",version='
     text = client.get("/metrics").text
@@ -246,7 +244,7 @@ def test_the_build_is_told_and_metrics_of_rooms_are_made_once(client: httpx.Clie
     assert 'lalaloc_lpo_missed_total{reason="died"} 0.0' in text
 
 
-def test_labels_stay_bounded_whatever_is_asked_for(client: httpx.Client) -> None:
+def test_metric_labels_are_bounded(client: httpx.Client) -> None:
     for attempt in range(5):
         client.get(f"/odd/{attempt}")
         client.request(f"ODD{attempt}", "/healthz")
@@ -256,7 +254,7 @@ def test_labels_stay_bounded_whatever_is_asked_for(client: httpx.Client) -> None
     assert not re.search(r"odd/|ODD\d|0{31}", text)
 
 
-def test_the_dashboard_asks_only_for_metrics_that_are_there(client: httpx.Client) -> None:
+def test_dashboard_uses_existing_metrics(client: httpx.Client) -> None:
     dashboard = json.loads((ROOT / "docker" / "grafana" / "lalaloc.json").read_text(encoding="utf-8"))
     expressions = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
     asked = {name for text in expressions for name in re.findall(r"\b(?:lalaloc|process)_\w+", text)}
@@ -267,7 +265,7 @@ def test_the_dashboard_asks_only_for_metrics_that_are_there(client: httpx.Client
     assert all(expression.count("{") == expression.count("}") for expression in expressions)
 
 
-def test_spans_of_stages_lie_inside_that_of_the_request() -> None:
+def test_stage_spans_lie_inside_the_request_span() -> None:
     exporter = InMemorySpanExporter()
     tracing = Tracing(exporter, "0")
     parent = TraceContext(TRACE, SPAN, sampled=True)
@@ -299,7 +297,7 @@ def _id_of(context: SpanContext | None) -> str | None:
     return None if context is None else f"{context.span_id:016x}"
 
 
-def test_a_trace_that_its_caller_does_not_record_is_not_exported() -> None:
+def test_unsampled_trace_is_not_exported() -> None:
     exporter = InMemorySpanExporter()
     tracing = Tracing(exporter, "0")
     ids, opened = tracing.begin(TraceContext(TRACE, SPAN, sampled=False))
@@ -309,7 +307,7 @@ def test_a_trace_that_its_caller_does_not_record_is_not_exported() -> None:
     assert exporter.get_finished_spans() == ()
 
 
-def test_a_collector_gets_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with (
         _collector() as (endpoint, received),
         start_app(tmp_path, otlp_endpoint=endpoint) as client,
@@ -351,12 +349,12 @@ def _collector() -> Iterator[tuple[str, list[Any]]]:
             thread.join(10.0)
 
 
-def test_without_the_extra_an_endpoint_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endpoint_without_the_extra_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry.exporter.otlp.proto.http.trace_exporter", None)
     with pytest.raises(ConfigError, match=r"LALALOC_OTLP_ENDPOINT is 'http://c/v1/traces'.*extra 'otel'"):
         otlp_exporter("http://c/v1/traces")
 
 
-def test_without_an_endpoint_the_sdk_is_not_loaded() -> None:
+def test_sdk_is_not_loaded_without_an_endpoint() -> None:
     program = "import sys, service.app; sys.exit(any(n.startswith('opentelemetry.sdk') for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0

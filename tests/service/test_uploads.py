@@ -45,7 +45,7 @@ def answer_to(connection: socket.socket, send: Callable[[socket.socket], None]) 
     return received.decode("utf-8")
 
 
-def test_a_body_that_stops_is_given_up_long_before_the_deadline(start_app: StartApp, tmp_path: Path) -> None:
+def test_stalled_body_times_out(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, upload_idle_s=0.5, upload_deadline_s=60.0) as client, open_body(client) as connection:
         begin = time.monotonic()
         answer = answer_to(connection, lambda _connection: None)
@@ -54,7 +54,7 @@ def test_a_body_that_stops_is_given_up_long_before_the_deadline(start_app: Start
     assert "stopped for 0.5 s (upload_idle_s)" in answer
 
 
-def test_a_body_that_trickles_is_given_up_as_well(start_app: StartApp, tmp_path: Path) -> None:
+def test_trickling_body_times_out(start_app: StartApp, tmp_path: Path) -> None:
     limits = {"upload_idle_s": 0.5, "upload_bytes_per_s": 1000.0, "upload_deadline_s": 60.0}
     with start_app(tmp_path, **limits) as client, open_body(client) as connection:
         begin = time.monotonic()
@@ -64,7 +64,7 @@ def test_a_body_that_trickles_is_given_up_as_well(start_app: StartApp, tmp_path:
     assert "behind 1000 bytes/s (upload_bytes_per_s)" in answer
 
 
-def test_a_slow_body_that_is_fast_enough_arrives(start_app: StartApp, tmp_path: Path) -> None:
+def test_slow_body_above_the_minimum_rate_arrives(start_app: StartApp, tmp_path: Path) -> None:
     def trickle() -> Iterator[bytes]:
         for _ in range(10):
             time.sleep(0.1)
@@ -79,20 +79,20 @@ _FORM = b'--BB\r\nContent-Disposition: form-data; name="file"; filename="p"\r\n\
 
 
 @pytest.mark.parametrize("charset", ["punycode", "undefined", "utf-16", "no-such", ""])
-def test_a_form_in_another_charset_than_utf_8_is_refused(client: httpx.Client, charset: str) -> None:
+def test_form_in_another_charset_is_refused(client: httpx.Client, charset: str) -> None:
     media = f"multipart/form-data; boundary=BB; charset={charset}"
     response = client.post("/floorplans", content=_FORM % b"{}", headers={"content-type": media})
     problem = assert_problem(response, 415, "unsupported-media")
     assert "send multipart/form-data; charset=utf-8" in problem["detail"]
 
 
-def test_a_form_may_say_that_it_is_utf_8(client: httpx.Client) -> None:
+def test_form_can_state_utf_8(client: httpx.Client) -> None:
     content = _FORM % json.dumps(FLAT).encode()
     headers = {"content-type": 'multipart/form-data; boundary=BB; charset="UTF-8"'}
     assert client.post("/floorplans", content=content, headers=headers).status_code == 201
 
 
-def test_a_large_form_needs_no_room_on_a_disk(
+def test_large_form_is_not_written_to_disk(
     client: httpx.Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As full as a disk can be.
@@ -110,7 +110,7 @@ def test_a_large_form_needs_no_room_on_a_disk(
         ("/localise", "multipart/form-data; boundary=x", "max_panorama_bytes"),
     ],
 )
-def test_a_body_without_a_stated_size_is_cut_off_at_the_limit(
+def test_body_without_a_length_stops_at_the_limit(
     start_app: StartApp, tmp_path: Path, path: str, media: str, name: str
 ) -> None:
     def endless() -> Iterator[bytes]:
