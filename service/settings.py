@@ -193,7 +193,10 @@ class AccessSettings(_Group):
         "0: no limit.",
     )
     rate_burst: int = Field(
-        default=60, ge=0, le=10**6, description="Of these, requests within one second. 0: no limit."
+        default=60,
+        ge=0,
+        le=10**6,
+        description="Rate limit per API key and replica, in requests per second. 0: no limit.",
     )
 
     @model_validator(mode="after")

@@ -90,7 +90,7 @@ def test_manifest_settings_exist() -> None:
     named = {one["name"] for one in CONTAINER["env"]}
     assert {name.removeprefix(PREFIX).lower() for name in named} <= SETTING_NAMES
     assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}
-    # What is secret comes from a secret.
+    # Secret values come from a secret.
     assert all("value" not in one and "secretKeyRef" in one["valueFrom"] for one in CONTAINER["env"])
     assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
 
@@ -111,7 +111,7 @@ def test_pod_has_minimal_rights() -> None:
     assert POD["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
     assert POD["automountServiceAccountToken"] is False
     assert f"--uid {POD['securityContext']['runAsUser']} " in DOCKERFILE
-    # Where it may write: what the image has for its data, and temporary files.
+    # Writable: the data folder of the image, and temporary files.
     written = {one["mountPath"] for one in CONTAINER["volumeMounts"]}
     assert written == {"/tmp", *re.findall(r"LALALOC_DATA_DIR=(\S+)", DOCKERFILE)}
     assert {one["name"] for one in CONTAINER["volumeMounts"]} == {one["name"] for one in POD["volumes"]}

@@ -45,21 +45,21 @@ StartApp = Callable[..., AbstractContextManager[httpx.Client]]
 
 
 @pytest.fixture(autouse=True)
-def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+def _clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in os.environ:
         if name.upper().startswith("LALALOC_"):
             monkeypatch.delenv(name)
 
 
 @pytest.fixture(autouse=True)
-def _only_what_replicas_share(request: pytest.FixtureRequest) -> None:
+def _skip_per_replica_tests(request: pytest.FixtureRequest) -> None:
     if (_REPLICAS > 1 or _DATABASE == "ray") and request.node.get_closest_marker("one_replica") is not None:
-        pytest.skip("about what each replica has for itself")
+        pytest.skip("tests state of a single replica")
 
 
 @pytest.fixture(scope="session")
 def panorama() -> bytes:
-    """A picture that is a valid panorama, if of nothing: smooth colours, 512 x 256."""
+    """A valid panorama without content: smooth colours, 512 x 256."""
     return encode_picture(512, 256, "JPEG")
 
 
@@ -75,7 +75,7 @@ def postgres() -> Iterator[PostgresServer]:
 
 @pytest.fixture(scope="session")
 def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
-    """The database that an app started on a data folder uses: SQLite, or PostgreSQL with TEST_DATABASE=postgresql.
+    """Database of an app by its data folder: SQLite, or PostgreSQL with TEST_DATABASE=postgresql.
 
     With TEST_DATABASE=replicas, two apps use the same PostgreSQL database, and take turns in answering. With
     TEST_DATABASE=ray, the app runs on Ray, on PostgreSQL as well.
@@ -88,14 +88,14 @@ def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
 
 @pytest.fixture(scope="session")
 def ray_address() -> Iterator[str]:
-    """Where the app answers that runs on Ray, see `serving`."""
+    """Address of the app on Ray, see `serving`."""
     with ray_cluster() as address:
         yield address
 
 
 @pytest.fixture(scope="session")
 def start_app(request: pytest.FixtureRequest, tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
-    """Starts the production app in this process; without LPO workers unless asked for."""
+    """Start the production app in this process, by default without LPO workers."""
 
     @contextmanager
     def start(data_dir: Path, **overrides: Any) -> Iterator[httpx.Client]:
@@ -137,7 +137,7 @@ class InTurn(httpx.BaseTransport):
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """One app for the tests of a module that leave nothing behind which others could trip over."""
+    """One app for the tests of a module that do not disturb each other."""
     with start_app(tmp_path_factory.mktemp("data")) as started:
         yield started
 

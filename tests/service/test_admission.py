@@ -1,4 +1,4 @@
-"""Admission: a place, a short wait or a refusal at once, and nobody working for a client that left."""
+"""Admission: a slot, a short wait or a refusal, and no work for disconnected clients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.service.test_localise import HALL
 
 pytestmark = pytest.mark.one_replica
 
-# Of one client address, which leaves one to others.
+# Slots of one client address; one more is left for others.
 PLACES = 3
 
 
@@ -61,7 +61,7 @@ def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
         assert monotonic() - begin < 0.5
         assert f"{PLACES} of your requests are in work" in assert_problem(response, 503, "overloaded")["detail"]
         assert 1 <= int(response.headers["retry-after"]) <= 30
-        # What changes nothing has places of its own, health and metrics need none.
+        # Reads have slots of their own; health and metrics need none.
         assert small.get("/floorplans").status_code == 200
         assert small.get("/healthz").status_code == 200
     wait_for(lambda: _in_flight(small) == 0)
@@ -131,7 +131,7 @@ def test_slot_queue_is_bounded_and_round_robin() -> None:
         goes_on.set()
         outcomes = await asyncio.gather(*own, late, others[0], return_exceptions=True)
         assert [type(outcome) for outcome in outcomes].count(ShareExceededError) == 2
-        # Whoever came last waits for one of the other client, not for all.
+        # The last client waits for one query of the other client, not for all.
         assert sorted(order) == ["a", "a", "a", "a", "b", "c"]
         assert order.index("c") <= 3
         assert slots.in_use == slots.waiting == 0

@@ -1,4 +1,4 @@
-"""Cores are shared out, and hardly more threads compute than there are cores."""
+"""Division of the cores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every error has one meaning over HTTP, and the table of meanings is complete."""
+"""Table of errors and problems: complete and consistent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Server-sent events about plans: progress from whichever replica, one end, bounded in number and time."""
+"""Server-sent events about plans: progress of any replica, one final event, limits."""
 
 from __future__ import annotations
 

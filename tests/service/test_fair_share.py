@@ -1,4 +1,4 @@
-"""What is scarce is shared: no client gets all of it, and those that wait are served in turn."""
+"""Fair sharing between clients."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_queue_is_round_robin_and_oldest_first(clients: list[str]) -> None:
     for client in "abc":
         own = [found[1] for found in served if found is not None and found[0] == client]
         assert own == [number for number, other in enumerate(clients) if other == client]
-    # Whoever has one waits for no more than one of every other.
+    # A client with one item waits for at most one of every other client.
     for client in set(clients):
         first = next(place for place, found in enumerate(served) if found is not None and found[0] == client)
         assert first < len(set(clients))

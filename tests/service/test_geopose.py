@@ -1,4 +1,4 @@
-"""Answers on Earth, as OGC GeoPose and GeoJSON have them; and plans written for other tools."""
+"""Answers on Earth as OGC GeoPose and GeoJSON, and exports of plans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.importers.conftest import assert_same_plan
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
-# What GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11) asks for.
+# Required by GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11).
 YPR = {
     "position": ("lat", "lon", "h"),
     "angles": ("yaw", "pitch", "roll"),

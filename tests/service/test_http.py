@@ -1,4 +1,4 @@
-"""What holds for every answer: problem documents, request ids, metrics, documentation, pages."""
+"""Common properties of answers: problem documents, request ids, metrics, documentation, pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests with an `Idempotency-Key`: carried out once, answered alike, whatever is lost on the way."""
+"""Requests with an `Idempotency-Key`: executed once, answered alike, also after failures."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypa
     def away(*_arguments: Any) -> NoReturn:
         raise StoreUnavailableError()
 
-    # What follows the commit: how far the grid is.
+    # The step after the commit: reading the state of the grid.
     monkeypatch.setattr(StoredGrids, "poses", away)
     created = _post(own, "a")
     assert (created.status_code, created.json()["status"]) == (201, "ready")
@@ -314,7 +314,7 @@ def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
 
     async def ask() -> None:
         reads = BoundedReads(threads=1, max_pending=4, wait_s=30.0 if leaves else 0.2)
-        # Whoever writes waits meanwhile.
+        # Writers wait meanwhile.
         with store._database.writing():
             asking = asyncio.create_task(_idempotent(store).run_async(NOTHING, never, reads))
             await asyncio.sleep(0.3)

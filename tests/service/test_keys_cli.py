@@ -1,4 +1,4 @@
-"""Keys are made, listed and revoked on the command line, in the database of the service, also while it runs."""
+"""Creating, listing and revoking keys on the command line, also while the service runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What requests may be is told, set, and named in the refusal."""
+"""Limits of requests: reported, configurable, and named in errors."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, pano
     many_scans = encode_picture(256, 128, "JPEG", progressive=True)
     with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_panorama_bytes=100_000) as client:
         plan_id = upload(client)
-        # Who asks for no number gets no more than are allowed.
+        # A request without top_k gets no more candidates than allowed.
         allowed = localise(client, plan_id, encode_picture(256, 128, "JPEG"))
         assert allowed.status_code == 200
         assert len(allowed.json()["candidates"]) <= 3

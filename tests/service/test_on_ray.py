@@ -1,4 +1,4 @@
-"""The service on Ray: one application answers as one process does, and keeps each plan with one of its replicas.
+"""The service on Ray: same answers as one process, and each plan in the memory of one replica.
 
 `.venv/bin/pytest -m slow tests/service/test_on_ray.py` starts a cluster of its own, and `TEST_DATABASE=ray
 .venv/bin/pytest tests/service` runs the other tests on one as well.
@@ -34,7 +34,7 @@ from tests.service.ray_cluster import NAME  # noqa: E402
 
 @pytest.fixture(scope="module")
 def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where plans are kept."""
+    """Data folder of the plans."""
     return tmp_path_factory.mktemp("data")
 
 

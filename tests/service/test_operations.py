@@ -1,4 +1,4 @@
-"""What docs/how-to/operate.md tells operators to do, done: backup and restore, and the upgrade of the model."""
+"""Procedures of docs/how-to/operate.md: backup, restore, model upgrade."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_sqlite_backup_restores_everything(start_app: StartApp, panorama: bytes,
     with start_app(data, **own) as client:
         upload(client)
         before = stored(client, panorama)
-        # What `sqlite3 FILE ".backup COPY"` does.
+        # Same as `sqlite3 FILE ".backup COPY"`.
         with (
             closing(sqlite3.connect(data / "lalaloc.sqlite3")) as database,
             closing(sqlite3.connect(backup)) as copy,
@@ -92,7 +92,7 @@ def test_replicas_of_two_models_coexist(
 def test_documented_settings_exist() -> None:
     named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", PAGE))
     known = {name.upper() for name in SETTING_NAMES}
-    # Of the compose files.
+    # Variables of the compose files.
     assert named - known == {"DATABASE_PASSWORD", "PUBLISH"}
 
 

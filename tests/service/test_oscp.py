@@ -85,7 +85,7 @@ def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
     quaternion = answer["geopose"]["quaternion"]
     assert (quaternion["x"], quaternion["y"]) == (0.0, 0.0)
     assert math.hypot(quaternion["z"], quaternion["w"]) == pytest.approx(1.0)
-    # Where the camera's y axis points: the image of (0, 1, 0), east and north.
+    # Direction of the camera's y axis: the image of (0, 1, 0), east and north.
     z, w = quaternion["z"], quaternion["w"]
     true_deg = math.degrees(math.atan2(-2.0 * z * w, w * w - z * z))
     assert (true_deg - (pose["heading_deg"] - NORTH_DEG) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=5.0)

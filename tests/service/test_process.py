@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def environment_of(bundle: Path, data_dir: Path, **settings: str) -> dict[str, str]:
-    """Of a service with these settings, and none that happen to be set here."""
+    """Return the environment of a service with these settings only."""
     given = {"BUNDLE": str(bundle), "DATA_DIR": str(data_dir), "ONNX_THREADS": "1"} | settings
     clean = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
     return clean | {PREFIX + name: value for name, value in given.items()} | {"PYTHONPATH": str(ROOT)}
@@ -75,7 +75,7 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; one that only waits to be buried does not."""
+    """Return True if a process runs; zombies do not."""
     listing = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
     return bool(listing.strip()) and not listing.strip().startswith("Z")
 

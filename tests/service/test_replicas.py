@@ -1,4 +1,4 @@
-"""Two replicas on one PostgreSQL behind the nginx that docker/ configures: one service to whoever uses it."""
+"""Two replicas on one PostgreSQL behind the nginx of docker/."""
 
 from __future__ import annotations
 

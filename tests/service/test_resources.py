@@ -1,4 +1,4 @@
-"""Plans as resources: pages and names, entity tags and what depends on them, revisions, deletion for good."""
+"""Plans as resources: paging, names, entity tags, revisions, deletion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that were measured or computed are told with the digits that mean something."""
+"""Rounding of measured and computed numbers in answers."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def test_answers_are_rounded(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, {"ceiling_height_m": 2.5, "rooms": [{"name": "x", "polygon": third}]})
     answers = [localise(client, plan_id, panorama), client.get(f"/floorplans/{plan_id}"), client.get("/floorplans")]
     told = [json.loads(answer.text) for answer in answers]
-    # The plan itself is told as it was sent.
+    # The plan itself is unchanged.
     assert told[1].pop("plan")["rooms"][0]["polygon"] == third
     numbers = _numbers(told)
     assert len(numbers) > 20
     assert [number for number in numbers if number != round(number, 6)] == []
-    # What was uploaded is told as it was.
+    # Uploaded numbers are unchanged.
     assert client.get(f"/floorplans/{plan_id}/original").json()["rooms"][0]["polygon"] == third
 
 

@@ -1,4 +1,4 @@
-"""Who gets in: with keys every route is closed but to the right one, without keys only this machine is answered."""
+"""Access: scopes of every route with keys, local requests only without keys."""
 
 from __future__ import annotations
 
@@ -484,7 +484,7 @@ def test_address_counters_are_bounded(
                 continue
         return len(rates._limiter.storage.storage)  # pyright: ignore[reportAttributeAccessIssue]
 
-    # Of each counter the minute that is, and the one before it.
+    # Two windows per counter: the current minute and the one before.
     assert asyncio.run(count()) <= 2 * 1024
 
 
@@ -663,7 +663,7 @@ def test_foreign_pages_without_keys_are_refused(
         ({"allowed_hosts": "other.example, Plans.Example"}, 201),
         ({"allowed_hosts": "*"}, 201),
         ({"allowed_hosts": "other.example"}, 403),
-        # Who may connect is another question than what they may be made to send.
+        # Addresses and host names are separate checks.
         ({"allow_anonymous": True}, 403),
     ],
 )
@@ -698,7 +698,7 @@ def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> 
         ("10.1.2.3", {}, True),
         ("0.0.0.0", {"api_keys": True}, False),
         ("0.0.0.0", {"allow_anonymous": True}, False),
-        # What a container listens on is all of its own addresses; what counts is where they are to be had.
+        # A container listens on all of its addresses; the published address counts.
         ("0.0.0.0", {"published_on": "127.0.0.1:8000"}, False),
         ("0.0.0.0", {"published_on": "[::1]:8000"}, False),
         ("0.0.0.0", {"published_on": "0.0.0.0:8000"}, True),

@@ -1,4 +1,4 @@
-"""The HTTP server around the app."""
+"""HTTP server of the app."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _app() -> FastAPI:
 
 def test_idle_connections_make_room() -> None:
     settings = Settings(max_connections=1, max_reads=4, max_streams=4, max_pending_requests=11)
-    # What may be in work at once, and one more.
+    # One more than all slots.
     most = 4 + 4 + 11 + 1
     with _served(_app(), settings) as port, ExitStack() as stack:
         address = ("127.0.0.1", port)
@@ -83,7 +83,7 @@ def test_idle_connections_make_room() -> None:
         for _ in range(3):
             assert httpx.get(f"http://127.0.0.1:{port}/who", timeout=10.0).status_code == 200
         assert time.monotonic() - begin < 5.0
-        # Those that were idle for longest are gone, the latest are not.
+        # The connections that were idle the longest are closed.
         assert idle[0].recv(1) == b""
         idle[-1].setblocking(False)
         with pytest.raises(BlockingIOError):

@@ -1,4 +1,4 @@
-"""`python -m service` told to stop, and clients that take their time: real processes, real signals, raw sockets."""
+"""Stopping `python -m service`, also with slow clients: real processes, signals and sockets."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Pa
         begin = monotonic()
         service.process.send_signal(signal.SIGTERM)
         wait_for(lambda: service.client.get("/readyz").status_code == 503, 0.9)
-        # Whoever has not noticed yet is answered.
+        # Requests are still answered during the notice.
         assert service.client.post("/floorplans", json=FLAT).status_code == 201
         assert service.process.wait(10.0) == 0
         assert monotonic() - begin > 3.0

@@ -1,4 +1,4 @@
-"""What the service tells of itself: one log line per request, trace context, metrics, spans, the dashboard."""
+"""Log lines, trace context, metrics, spans, dashboard."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture
 def log() -> Iterator[Log]:
-    """What is logged from here on."""
+    """Log lines of the test."""
     attached = Log()
     logger = logging.getLogger(LOGGER_NAME)
     # An app that another test started may have set another level for all of this process.
@@ -239,7 +239,7 @@ def test_build_info_and_drawing_metrics(client: httpx.Client) -> None:
     text = client.get("/metrics").text
     assert re.search(rf"^lalaloc_build_info{{{labels}\"[^\"]+\"}} 1\.0$", text, re.MULTILINE)
     assert re.search(r"^process_resident_memory_bytes \d", text, re.MULTILINE)
-    # What has not happened yet is there as well, so that the first time is a rise.
+    # Counters start at 0, so that the first event shows as an increase.
     assert 'lalaloc_rejections_total{reason="overloaded"} 0.0' in text
     assert 'lalaloc_lpo_missed_total{reason="died"} 0.0' in text
 
@@ -282,14 +282,14 @@ def test_stage_spans_lie_inside_the_request_span() -> None:
     spans = {span.name: span for span in exporter.get_finished_spans()}
     assert set(spans) == {"POST /localise", "decode", "encode"}
     request = spans["POST /localise"]
-    # What is handed to an exporter is complete; types that allow None stand for spans that go on.
+    # Exported spans are complete; the types allow None for open spans.
     attributes: Any = request.attributes
     assert attributes["lalaloc.rejection"] == "overloaded"
     assert (_id_of(request.context), _id_of(request.parent)) == (ids.span_id, SPAN)
     for name in ("decode", "encode"):
         assert _id_of(spans[name].parent) == ids.span_id
         times: Any = [request.start_time, spans[name].start_time, spans[name].end_time, request.end_time]
-        # Of two clocks, which may differ by a little.
+        # Two clocks, which can differ slightly.
         assert all(later - earlier >= -1_000_000 for earlier, later in pairwise(times))
 
 

@@ -1,4 +1,4 @@
-"""Bodies that come too slowly, or never end."""
+"""Slow and endless request bodies."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def open_body(client: httpx.Client) -> Iterator[socket.socket]:
 
 
 def answer_to(connection: socket.socket, send: Callable[[socket.socket], None]) -> str:
-    """What comes back while something is being sent."""
+    """Return the answer that arrives while `send` is sending."""
     connection.setblocking(False)
     received, begin = b"", time.monotonic()
     while b"}" not in received:

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, e
 
 from tests.service.conftest import (
     StartApp,
-    _no_settings_from_outside,  # noqa: F401
+    _clean_environment,  # noqa: F401
     database_of,  # noqa: F401
     start_app,  # noqa: F401
 )
