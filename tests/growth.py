@@ -1,4 +1,4 @@
-"""How the time for some work grows with its input."""
+"""Assertion that the time of a computation is linear in its input."""
 
 from __future__ import annotations
 
@@ -6,34 +6,34 @@ import math
 import time
 from collections.abc import Callable
 
-# Twice the input may take so many times as long: linear growth, and what a busy machine adds to it.
+# Largest ratio of times for twice the input: linear growth, plus the noise of a busy machine.
 _MAX_RATIO = 2.5
-# Work that is over sooner is repeated: clocks are not that fine.
+# Shorter work is repeated, since clocks are coarse.
 _MIN_S = 0.02
 _TRIES = 12
 
 
-def assert_no_worse_than_linear(work_of: Callable[[int], Callable[[], object]], size: int) -> None:
-    """Check that twice the input takes at most two and a half times as long, in time of this thread's processor.
+def assert_no_worse_than_linear(prepare: Callable[[int], Callable[[], object]], size: int) -> None:
+    """Check that twice the input takes at most 2.5 times as long, in CPU time of this thread.
 
     Args:
-        work_of: makes the work for a size of input; the time for that does not count.
-        size: of the smaller input.
+        prepare: returns the work for an input size; its own time does not count.
+        size: size of the smaller input.
     """
-    small, large = work_of(size), work_of(2 * size)
+    small, large = prepare(size), prepare(2 * size)
     repeats = 1
-    while _time_of(small, repeats) < _MIN_S:
+    while _seconds(small, repeats) < _MIN_S:
         repeats *= 2
     small_s = large_s = math.inf
     for _ in range(_TRIES):
-        # Others on the machine only ever make it slower: the fastest of some tries counts.
-        small_s, large_s = min(small_s, _time_of(small, repeats)), min(large_s, _time_of(large, repeats))
+        # Other processes can only slow the work down, so the fastest try counts.
+        small_s, large_s = min(small_s, _seconds(small, repeats)), min(large_s, _seconds(large, repeats))
         if large_s <= _MAX_RATIO * small_s:
             return
     raise AssertionError(f"twice the input takes {large_s / small_s:.1f} times as long")
 
 
-def _time_of(work: Callable[[], object], repeats: int) -> float:
+def _seconds(work: Callable[[], object], repeats: int) -> float:
     begin = time.thread_time()
     for _ in range(repeats):
         work()

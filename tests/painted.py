@@ -1,4 +1,4 @@
-"""Panoramas of plain rectangular rooms, painted from the formula: every pixel is floor, wall or ceiling."""
+"""Synthetic panoramas of empty rectangular rooms: every pixel is floor, wall or ceiling."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FLOOR, WALL, CEILING = range(3)
 
 
 def wall_distance_m(azimuth: np.ndarray, size_m: tuple[float, float], at_m: tuple[float, float]) -> np.ndarray:
-    """Distance to the walls of a room from (0, 0) to `size_m`, clockwise from +y."""
+    """Return the distance to the walls of a room from (0, 0) to `size_m`; azimuths are clockwise from +y."""
     with np.errstate(divide="ignore"):
         across, along = 1.0 / np.sin(azimuth), 1.0 / np.cos(azimuth)
     east_west = np.where(across > 0.0, size_m[0] - at_m[0], -at_m[0]) * across
@@ -27,16 +27,16 @@ def painted_surfaces(
     ceiling_m: float = 2.5,
     rows: int = 256,
 ) -> np.ndarray:
-    """(rows, 2 rows) of what is seen, with +y in the middle."""
+    """Return the surface of each pixel, (rows, 2 rows), with +y in the centre."""
     azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
     up = np.tan((0.5 - (np.arange(rows) + 0.5) / rows) * np.pi)[:, None]
     distance_m = wall_distance_m(azimuth, size_m, at_m)
-    seen = np.where(up < -camera_m / distance_m, FLOOR, WALL)
-    return np.where(up > (ceiling_m - camera_m) / distance_m, CEILING, seen)
+    below_ceiling = np.where(up < -camera_m / distance_m, FLOOR, WALL)
+    return np.where(up > (ceiling_m - camera_m) / distance_m, CEILING, below_ceiling)
 
 
 def painted_room(size_m: tuple[float, float], at_m: tuple[float, float]) -> bytes:
-    """A JPEG file of a room with a brown floor, pale walls and a white ceiling, with a little grain."""
+    """Return a JPEG of a room with a brown floor, pale walls and a white ceiling, with a little noise."""
     colours = np.array([[140.0, 105.0, 75.0], [195.0, 190.0, 182.0], [235.0, 235.0, 230.0]])
     grain = np.random.default_rng(0).normal(0.0, 3.0, (256, 512, 3))
     picture = np.clip(colours[painted_surfaces(size_m, at_m)] + grain, 0.0, 255.0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Random rooms, plans and poses for property tests, and the builders that tests of every layer share."""
+"""Random rooms, plans and poses for property tests, and builders shared by all tests."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from lalaloc_core.render.sampling import PoseSet, random_poses
 
 Polygon = list[list[float]]
 
-# Rooms of the strategies are wider than this almost everywhere, so that a pose with the margin below always exists.
+# Random rooms are wider than this almost everywhere, so that a pose with the margin below exists.
 POSE_MARGIN_M = 0.15
 
 
 def rectangle(width_m: float, depth_m: float, at: tuple[float, float] = (0.0, 0.0)) -> Polygon:
-    """A rectangle with its lower left corner at `at`."""
+    """Return a rectangle with its lower left corner at `at`."""
     x, y = at
     return [[x, y], [x + width_m, y], [x + width_m, y + depth_m], [x, y + depth_m]]
 
 
 def l_shape(width_m: float, depth_m: float, cut_width_m: float, cut_depth_m: float) -> Polygon:
-    """A rectangle at the origin whose upper right corner is cut out."""
+    """Return a rectangle at the origin without its upper right corner."""
     x, y = width_m - cut_width_m, depth_m - cut_depth_m
     return [[0.0, 0.0], [width_m, 0.0], [width_m, y], [x, y], [x, depth_m], [0.0, depth_m]]
 
 
 def spiral(corners: int) -> Polygon:
-    """A room that is wound up: the centre of its largest circle is looked for nearly everywhere."""
+    """Return a spiral room, in which the largest inscribed circle is hard to find."""
     turns, half = corners // 40, corners // 2
 
     def arm(offset_m: float) -> list[list[float]]:
@@ -43,18 +43,18 @@ def spiral(corners: int) -> Polygon:
 
 
 def plan_document(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> dict[str, Any]:
-    """A plan in the native format with rooms "room 1", "room 2" and so on; `extra` replaces or adds keys."""
+    """Return a plan in the native format with rooms "room 1", "room 2" and so on; `extra` replaces or adds keys."""
     rooms = [{"name": f"room {index + 1}", "polygon": polygon} for index, polygon in enumerate(polygons)]
     return {"name": "test plan", "ceiling_height_m": ceiling_m, "rooms": rooms, **extra}
 
 
 def plan_of(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> FloorPlan:
-    """A validated plan of these polygons."""
+    """Return a validated plan of these polygons."""
     return FloorPlan.from_dict(plan_document(*polygons, ceiling_m=ceiling_m, **extra))
 
 
 def crooked_flat() -> FloorPlan:
-    """Three rooms without any symmetry, so that every pose and heading looks different."""
+    """Return three rooms without symmetry, so that every pose and heading looks different."""
     return plan_of(
         [[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [2.6, 2.2], [2.6, 3.4], [0.0, 3.0]],
         [[4.2, 0.0], [6.3, 0.0], [6.0, 3.1], [4.2, 2.5]],
@@ -82,7 +82,7 @@ class Scene:
 
 
 def scene_of(plan: FloorPlan, count: int, seed: int, margin_m: float = POSE_MARGIN_M) -> Scene:
-    """`count` random poses of a plan with random headings."""
+    """Return `count` random poses of a plan with random headings."""
     rng = np.random.default_rng(seed)
     return Scene(plan, random_poses(plan, count, rng, margin_m), rng.uniform(-math.pi, math.pi, count))
 
@@ -94,20 +94,20 @@ _seeds = st.integers(0, 2**32 - 1)
 
 @st.composite
 def rectangles(draw: st.DrawFn) -> Polygon:
-    """Rectangular rooms at the origin."""
+    """Draw rectangular rooms at the origin."""
     return rectangle(draw(_lengths), draw(_lengths))
 
 
 @st.composite
 def l_shapes(draw: st.DrawFn) -> Polygon:
-    """L-shaped rooms at the origin."""
+    """Draw L-shaped rooms at the origin."""
     width, depth = draw(_lengths), draw(_lengths)
     return l_shape(width, depth, draw(_shares) * width, draw(_shares) * depth)
 
 
 @st.composite
 def notched(draw: st.DrawFn) -> Polygon:
-    """Rectangles with a pillar into the room, or a recess out of it, in the upper wall."""
+    """Draw rectangles with a pillar or a recess in the upper wall."""
     width, depth = draw(_lengths), draw(_lengths)
     start = draw(st.floats(0.1, 0.4)) * width
     end = start + draw(st.floats(0.15, 0.4)) * width
@@ -126,7 +126,7 @@ def notched(draw: st.DrawFn) -> Polygon:
 
 @st.composite
 def slanted(draw: st.DrawFn) -> Polygon:
-    """Rectangles with one corner cut off at an angle."""
+    """Draw rectangles with one corner cut off at an angle."""
     width, depth = draw(_lengths), draw(_lengths)
     return [
         [0.0, 0.0],
@@ -139,7 +139,7 @@ def slanted(draw: st.DrawFn) -> Polygon:
 
 @st.composite
 def star_shapes(draw: st.DrawFn) -> Polygon:
-    """Simple polygons with corners at rising angles around the origin and any distance: no right angles at all."""
+    """Draw star-shaped polygons around the origin, without right angles."""
     count = draw(st.integers(4, 9))
     radii = draw(st.lists(st.floats(1.2, 5.0), min_size=count, max_size=count))
     jitter = draw(st.lists(st.floats(-0.3, 0.3), min_size=count, max_size=count))
@@ -149,13 +149,13 @@ def star_shapes(draw: st.DrawFn) -> Polygon:
 
 @st.composite
 def convex_polygons(draw: st.DrawFn) -> Polygon:
-    """Convex rooms: nothing hides anything, so the wall profile is continuous in the pose."""
+    """Draw convex rooms: without occlusion the wall profile is continuous in the pose."""
     return _moved(draw(st.one_of(rectangles(), slanted())), draw(st.floats(0.0, 2.0 * math.pi)), (0.0, 0.0))
 
 
 @st.composite
 def room_polygons(draw: st.DrawFn, offset_m: float = 20.0) -> Polygon:
-    """Simple polygons of every family, turned by any angle and moved by up to `offset_m`."""
+    """Draw simple polygons of every family, rotated by any angle and moved by up to `offset_m`."""
     polygon = draw(st.one_of(rectangles(), l_shapes(), notched(), slanted(), star_shapes()))
     angle = draw(st.one_of(st.just(0.0), st.floats(0.0, 2.0 * math.pi)))
     shift = (draw(st.floats(-offset_m, offset_m)), draw(st.floats(-offset_m, offset_m)))
@@ -164,7 +164,7 @@ def room_polygons(draw: st.DrawFn, offset_m: float = 20.0) -> Polygon:
 
 @st.composite
 def plans(draw: st.DrawFn, max_rooms: int = 3) -> FloorPlan:
-    """Plans of one to `max_rooms` rooms side by side, some with their own ceiling."""
+    """Draw plans of one to `max_rooms` rooms side by side, some with their own ceiling."""
     polygons = draw(st.lists(room_polygons(offset_m=0.0), min_size=1, max_size=max_rooms))
     placed = [_moved(polygon, 0.0, (30.0 * index, 0.0)) for index, polygon in enumerate(polygons)]
     document = plan_document(*placed, ceiling_m=draw(st.floats(2.1, 4.0)))
@@ -176,13 +176,13 @@ def plans(draw: st.DrawFn, max_rooms: int = 3) -> FloorPlan:
 
 @st.composite
 def scenes(draw: st.DrawFn, count: int = 3) -> Scene:
-    """Random poses with random headings in one random room far from the origin or near it."""
+    """Draw random poses with random headings in one random room, near the origin or far from it."""
     return scene_of(plan_of(draw(room_polygons()), ceiling_m=draw(st.floats(2.1, 4.0))), count, draw(_seeds))
 
 
 @st.composite
 def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
-    """Rooms in a row, turned by any angle, with openings between them and outwards, columns and stubs of wall."""
+    """Draw rooms in a row, rotated by any angle, with openings, columns and free-standing walls."""
     thickness = draw(st.floats(0.0, 0.3))
     rooms, openings, x, previous = [], [], 0.0, None
     for index in range(draw(st.integers(1, 3))):
@@ -200,8 +200,9 @@ def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
             low, high = max(base, previous[0]), min(base + depth, previous[1])
             begin = low + draw(st.floats(0.05, 0.5)) * (high - low)
             end = begin + draw(st.floats(0.2, 0.5)) * (high - low)
-            at = x - draw(st.floats(0.0, 1.0)) * thickness
-            openings.append({"kind": draw(st.sampled_from(["door", "passage"])), "line": [[at, begin], [at, end]]})
+            line_x = x - draw(st.floats(0.0, 1.0)) * thickness
+            line = [[line_x, begin], [line_x, end]]
+            openings.append({"kind": draw(st.sampled_from(["door", "passage"])), "line": line})
         if draw(st.booleans()):
             heights = {"sill_m": draw(st.sampled_from([0.9, 1.6])), "head_m": 2.1}
             line = [[x + 0.2 * width, base], [x + 0.5 * width, base]]
@@ -215,7 +216,7 @@ def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
 
 
 def _turned(value: Any, angle: float) -> Any:
-    """Every point of a document turned about the origin."""
+    """Rotate every point of a document about the origin."""
     if isinstance(value, dict):
         return {key: _turned(item, angle) for key, item in value.items()}
     if isinstance(value, list) and len(value) == 2 and all(isinstance(item, float) for item in value):
@@ -225,7 +226,7 @@ def _turned(value: Any, angle: float) -> Any:
 
 
 def seeds() -> st.SearchStrategy[int]:
-    """Seeds of numpy generators."""
+    """Draw seeds of numpy generators."""
     return _seeds
 
 

@@ -1,4 +1,4 @@
-"""The command line answers without a service, from any folder, in tables or in JSON, and fails in one line."""
+"""The command line: localisation, drawing, errors and packaging."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PLAN, KITCHEN, BEDROOM = (str(EXAMPLES / name) for name in ("flat.json", "kitche
 LALALOC = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())"]
 
 
-def elsewhere(folder: Path, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
+def run_in(folder: Path, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
     """Run the command line in another folder."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)} | changes
     return subprocess.run(
@@ -32,11 +32,11 @@ def elsewhere(folder: Path, *arguments: str, **changes: str) -> subprocess.Compl
     )
 
 
-def test_photographs_are_found_from_any_folder_and_drawn(tmp_path: Path) -> None:
-    done = elsewhere(tmp_path, "localise", PLAN, KITCHEN, "--heading", "250", "--out", "answer.png", "--json")
+def test_localise_works_from_any_folder(tmp_path: Path) -> None:
+    done = run_in(tmp_path, "localise", PLAN, KITCHEN, "--heading", "250", "--out", "answer.png", "--json")
     assert done.returncode == 0, done.stderr
     (answer,) = json.loads(done.stdout)
-    (truth,) = [one for one in json.loads((EXAMPLES / "poses.json").read_text()) if one["file"] == "kitchen.jpg"]
+    (truth,) = [pose for pose in json.loads((EXAMPLES / "poses.json").read_text()) if pose["file"] == "kitchen.jpg"]
     assert answer["room"] == "kitchen"
     assert answer["position"]["x_m"] == pytest.approx(truth["x_m"], abs=0.2)
     assert answer["position"]["y_m"] == pytest.approx(truth["y_m"], abs=0.2)
@@ -47,12 +47,12 @@ def test_photographs_are_found_from_any_folder_and_drawn(tmp_path: Path) -> None
         assert (picture.format, picture.width) == ("PNG", 1600)
 
 
-def test_several_photographs_are_rows_of_a_table_and_pictures_with_numbers(
+def test_several_photographs_give_rows_and_pictures(
     tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "answer.svg"
-    asked = ["localise", PLAN, KITCHEN, BEDROOM, "--bundle", str(tiny_bundle), "--out", str(out), "--picture", "plan"]
-    assert main(asked) == 0
+    command = ["localise", PLAN, KITCHEN, BEDROOM, "--bundle", str(tiny_bundle), "--out", str(out), "--picture", "plan"]
+    assert main(command) == 0
     head, rule, *rows = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["photograph", "room"]
     assert set(rule) == {"-", " "}
@@ -75,7 +75,7 @@ def test_several_photographs_are_rows_of_a_table_and_pictures_with_numbers(
         ([PLAN, KITCHEN, "--heading-tolerance", "3"], "--heading, which is missing"),
     ],
 )
-def test_mistakes_are_told_in_one_line(
+def test_errors_are_one_line(
     tiny_bundle: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
 ) -> None:
     assert main(["localise", *arguments, "--bundle", str(tiny_bundle)]) == 2
@@ -85,7 +85,7 @@ def test_mistakes_are_told_in_one_line(
 
 
 @pytest.mark.parametrize("option", [["--heading", "400"], ["--camera-height", "-1"], ["--heading-tolerance", "50"]])
-def test_numbers_out_of_range_are_refused_by_the_parser(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_out_of_range_are_refused(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["localise", PLAN, KITCHEN, *option])
     assert ended.value.code == 2
@@ -93,7 +93,7 @@ def test_numbers_out_of_range_are_refused_by_the_parser(option: list[str], capsy
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_a_plan_is_drawn(suffix: str, tmp_path: Path) -> None:
+def test_plan_draw_writes_a_picture(suffix: str, tmp_path: Path) -> None:
     out = tmp_path / f"plan{suffix}"
     assert main(["plan", "draw", PLAN, "--out", str(out)]) == 0
     if suffix == ".svg":
@@ -103,13 +103,13 @@ def test_a_plan_is_drawn(suffix: str, tmp_path: Path) -> None:
             assert max(picture.size) == 1000
 
 
-def test_what_is_likely_wrong_with_a_plan_can_be_had_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_check_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "check", PLAN, "--json"]) == 0
     (plan,) = json.loads(capsys.readouterr().out)
     assert (plan["rooms"], plan["warnings"]) == (7, [])
 
 
-def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
@@ -117,7 +117,7 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_shells_are_told_how_to_complete(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_completion_script_is_valid(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     assert "--camera-height" in script
@@ -126,7 +126,7 @@ def test_shells_are_told_how_to_complete(shell: str, tmp_path: Path, capsys: pyt
         subprocess.run([program, "-n", str(tmp_path / "script")], check=True)
 
 
-def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
+def test_closed_pipe_is_not_an_error(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [*LALALOC, "completion", "bash"]
     with subprocess.Popen(
@@ -134,15 +134,13 @@ def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        # Before a line has come.
+        # Before the first line.
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait(60.0) == 0
 
 
-def test_the_shipped_model_is_relative_in_its_checkout_and_absolute_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_default_bundle_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     assert default_bundle() == Path("models/default")
     monkeypatch.chdir(tmp_path)
@@ -150,7 +148,7 @@ def test_the_shipped_model_is_relative_in_its_checkout_and_absolute_elsewhere(
     assert Bundle.open(default_bundle()).manifest.name == "default"
 
 
-def test_a_wheel_brings_the_model_and_answers_in_an_empty_folder(tmp_path: Path) -> None:
+def test_wheel_contains_the_model(tmp_path: Path) -> None:
     source, wheels, installed, empty = (tmp_path / name for name in ("source", "wheels", "installed", "empty"))
     for folder in ("lalaloc_core", "service", "lalaloc_client", "models"):
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
@@ -158,19 +156,19 @@ def test_a_wheel_brings_the_model_and_answers_in_an_empty_folder(tmp_path: Path)
         shutil.copy(ROOT / file, source)
     empty.mkdir()
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
-    # As the present environment has it, so that nothing is downloaded.
+    # Without build isolation nothing is downloaded.
     subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", wheels, source], check=True)
     (wheel,) = wheels.glob("*.whl")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", installed], check=True)
     python = installed / "bin" / "python"
     subprocess.run([*pip, "--python", python, "install", "--no-deps", "--no-index", wheel], check=True)
     (site,) = installed.glob("lib/python*/site-packages")
-    # The packages that it needs are those of the environment that the tests run in; its own checkout is not.
+    # Dependencies come from the environment of the tests; this checkout is not importable.
     packages = Path(pytest.__file__).parents[1]
     (site / "needed.pth").write_text(f"{packages}\n")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    asked = [installed / "bin" / "lalaloc", "localise", PLAN, KITCHEN, "--heading", "250", "--json"]
-    done = subprocess.run(asked, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    command = [installed / "bin" / "lalaloc", "localise", PLAN, KITCHEN, "--heading", "250", "--json"]
+    done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["room"] == "kitchen"
     where = [python, "-c", "from lalaloc_core.localise.bundle import default_bundle; print(default_bundle())"]

@@ -1,4 +1,4 @@
-"""Pictures show what was found where it is: lines in the photograph, colours and marks on the plan."""
+"""Pictures of answers: lines in the photograph, colours and marks on the plan."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def answer(**changes: Any) -> DrawnAnswer:
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, 4.0])
 @pytest.mark.parametrize("room", [0, 1])
-def test_walls_are_drawn_where_the_renderer_has_them(room: int, heading: float) -> None:
+def test_wall_lines_match_the_renderer(room: int, heading: float) -> None:
     position_m = np.array([MIDDLE, [5.0, 1.0]][room])
     outline = layout_outline(PLAN, position_m, room, heading, EYE_M)
     columns = 512
@@ -69,13 +69,13 @@ def test_walls_are_drawn_where_the_renderer_has_them(room: int, heading: float) 
     for line, rise_m in ((outline.floor, -EYE_M), (outline.ceiling, 1.0)):
         expected = wall_line(profile_m, rise_m, 256) / [columns, 256]
         drawn = np.interp(expected[:, 0], line[:, 0], line[:, 1])
-        # Beside corners one is as good as the other.
+        # Next to corners either wall is correct.
         assert np.quantile(np.abs(drawn - expected[:, 1]), 0.98) < 1e-4
         assert line[0, 0] == pytest.approx(0.0)
         assert line[-1, 0] == pytest.approx(1.0)
 
 
-def test_corners_stand_where_the_plan_has_them_and_nowhere_else() -> None:
+def test_corners_match_the_plan() -> None:
     heading = 0.7
     outline = layout_outline(PLAN, MIDDLE, 0, heading, EYE_M)
     offset = PLAN.rooms[0].polygon_m - MIDDLE
@@ -86,32 +86,32 @@ def test_corners_stand_where_the_plan_has_them_and_nowhere_else() -> None:
     np.testing.assert_allclose(outline.corners[:, 1, 1], 0.5 - math.atan(1.0 / distance_m) / math.pi, atol=1e-4)
 
 
-def test_openings_are_drawn_at_their_heights_and_those_at_the_pictures_edge_twice() -> None:
+def test_openings_are_drawn_and_split_at_the_edge() -> None:
     outline = layout_outline(PLAN, MIDDLE, 0, 0.0, EYE_M)
     kinds = [opening.kind for opening in outline.openings]
-    # The passage lies behind: half of it at either edge.
+    # The passage is behind the camera: half of it at each edge.
     assert sorted(kinds) == ["door", "passage", "passage", "window"]
-    window = next(one.line for one in outline.openings if one.kind == "window")
+    window = next(opening.line for opening in outline.openings if opening.kind == "window")
     assert window[:, 0].min() == pytest.approx(0.5 - math.atan(1 / 3) / TWO_PI)
     assert window[:, 0].max() == pytest.approx(0.5 + math.atan(1 / 3) / TWO_PI)
-    # In its middle it is three metres away, half a metre below the eye and as much above it.
+    # Its centre is 3 m away; its edges are 0.5 m below and above the eye.
     assert window[:, 1].max() == pytest.approx(0.5 + math.atan(0.5 / 3) / math.pi, abs=1e-4)
     assert window[:, 1].min() == pytest.approx(0.5 - math.atan(0.5 / 3) / math.pi, abs=1e-4)
-    for one in outline.openings:
-        assert np.abs(np.diff(one.line[:, 0])).max() < 0.1, "no line runs across the whole picture"
-        np.testing.assert_array_equal(one.line[0], one.line[-1])
+    for opening in outline.openings:
+        assert np.abs(np.diff(opening.line[:, 0])).max() < 0.1, "no line runs across the whole picture"
+        np.testing.assert_array_equal(opening.line[0], opening.line[-1])
 
 
-def test_what_another_wall_hides_is_not_drawn() -> None:
+def test_hidden_openings_are_not_drawn() -> None:
     document = PLAN.to_dict()
     document["rooms"][1]["walls"] = [[[4.8, 3.6], [4.8, 5.6]]]
     hidden = FloorPlan.from_dict(document)
     position_m = np.array([5.6, 4.6])
-    assert [one.kind for one in layout_outline(PLAN, position_m, 1, 0.0, EYE_M).openings] == ["door"]
+    assert [opening.kind for opening in layout_outline(PLAN, position_m, 1, 0.0, EYE_M).openings] == ["door"]
     assert layout_outline(hidden, position_m, 1, 0.0, EYE_M).openings == ()
 
 
-def test_a_round_room_has_no_corners() -> None:
+def test_round_room_has_no_corners() -> None:
     azimuth = column_azimuths(480)
     ring = np.stack([3.0 * np.sin(azimuth), 3.0 * np.cos(azimuth)], axis=1)[::-1]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"name": "round", "polygon": ring.tolist()}]})
@@ -124,8 +124,8 @@ def all_places(probability: np.ndarray, poses: PoseSet) -> ProbabilityMap:
     return ProbabilityMap(poses.position_m, poses.room_index, probability / probability.sum())
 
 
-def test_the_most_probable_place_is_the_darkest_and_what_is_hopeless_is_the_lightest() -> None:
-    # Between grid poses, as an answer is.
+def test_most_probable_cell_is_darkest() -> None:
+    # Between grid poses, like most answers.
     place_m = np.array([1.18, 4.07])
     heat = posterior_map(PLAN, ProbabilityMap(place_m[None], np.zeros(1, int), np.ones(1)), 0.5)
     distance_m = np.linalg.norm(heat.cells.poses.position_m - place_m, axis=1)
@@ -136,9 +136,9 @@ def test_the_most_probable_place_is_the_darkest_and_what_is_hopeless_is_the_ligh
     assert heat.shade[heat.cells.poses.room_index == 1].max() == 0.0, "walls part the colours of rooms"
 
 
-def test_a_map_s_shades_follow_the_logarithm_of_the_probability() -> None:
+def test_shade_is_logarithmic_in_probability() -> None:
     poses = pose_grid(PLAN, 0.5)
-    # A tenth for every metre to the right.
+    # A factor of 0.1 per metre to the right.
     probability = np.where(poses.room_index == 0, 10.0 ** poses.position_m[:, 0], 0.0)
     heat = posterior_map(PLAN, all_places(probability, poses), 0.5)
     inside = heat.cells.poses.room_index == 0
@@ -149,7 +149,7 @@ def test_a_map_s_shades_follow_the_logarithm_of_the_probability() -> None:
     np.testing.assert_allclose(shade[between], start + slope * x_m[between], atol=0.02)
 
 
-def test_places_that_are_as_probable_are_as_dark() -> None:
+def test_equal_probabilities_have_equal_shades() -> None:
     poses = pose_grid(PLAN, 0.5)
     heat = posterior_map(PLAN, all_places(np.ones(len(poses)), poses), 0.5)
     off_m = np.abs(heat.cells.poses.position_m[:, None] - poses.position_m).max(axis=2).min(axis=1)
@@ -157,7 +157,7 @@ def test_places_that_are_as_probable_are_as_dark() -> None:
     assert np.median(heat.shade) > 0.9
 
 
-def test_a_map_of_distances_is_darkest_where_they_are_least() -> None:
+def test_smallest_distance_is_darkest() -> None:
     cells = Cells.cover(PLAN, 0.2)
     distance_m = 0.1 + np.linalg.norm(cells.poses.position_m - MIDDLE, axis=1)
     heat = distance_map(cells, distance_m, "distance (m)")
@@ -175,7 +175,7 @@ def colours(heat: HeatMap) -> np.ndarray:
         return np.asarray(picture.convert("RGBA"))
 
 
-def test_colours_lie_on_the_floors_alone() -> None:
+def test_heat_map_colours_floors_only() -> None:
     cells = Cells.cover(PLAN, 0.1)
     shown = colours(HeatMap(cells, np.ones(len(cells.poses)), "", ()))
     height, width = shown.shape[:2]
@@ -186,7 +186,7 @@ def test_colours_lie_on_the_floors_alone() -> None:
     assert (opaque == inside).mean() > 0.98
 
 
-def test_strokes_lie_over_the_picture_and_leave_the_rest_of_it() -> None:
+def test_strokes_change_only_their_pixels() -> None:
     photograph = np.full((64, 128, 3), 200, np.uint8)
     line = np.array([[10.0, 32.0], [118.0, 32.0]])
     drawn = np.asarray(draw_strokes(photograph, [Stroke([line], "#ff0000", 2.0, 4.0)]))
@@ -196,7 +196,7 @@ def test_strokes_lie_over_the_picture_and_leave_the_rest_of_it() -> None:
 
 
 @pytest.mark.parametrize("picture", ["both", "plan", "photograph"])
-def test_an_answer_is_drawn_with_all_that_belongs_to_it(picture: Picture) -> None:
+def test_answer_picture_has_all_parts(picture: Picture) -> None:
     heat = posterior_map(PLAN, all_places(np.ones(len(poses := pose_grid(PLAN, 0.5))), poses), 0.5)
     photograph = np.full((128, 256, 3), 90, np.uint8)
     drawn = draw_answer(answer(heat=heat, truth=Marker(x_m=2.2, y_m=3.0)), photograph, picture)
@@ -218,25 +218,25 @@ def test_an_answer_is_drawn_with_all_that_belongs_to_it(picture: Picture) -> Non
         assert image.height == int(root.attrib["height"])
 
 
-def test_a_picture_of_the_photograph_needs_one() -> None:
+def test_photograph_picture_needs_a_photograph() -> None:
     with pytest.raises(ValueError, match="'both' needs the argument photograph"):
         draw_answer(answer())
     assert "<image" not in draw_answer(answer(), picture="plan")
 
 
-def test_a_model_without_confidence_leaves_it_out() -> None:
+def test_picture_without_confidence() -> None:
     bare = answer(confidence=None, rivals=(DrawnCandidate(5.0, 4.0, 210.0, "kitchen", None),))
     words = " ".join(ElementTree.fromstring(draw_answer(bare, picture="plan")).itertext())
     assert "within 1 m" not in words
     assert "kitchen" in words
 
 
-def test_an_ellipse_has_the_axes_of_its_covariance() -> None:
+def test_ellipse_axes_match_the_covariance() -> None:
     assert ellipse_m((0.01, 0.0, 0.04)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
     turned = ellipse_m((0.025, 0.015, 0.025))
     assert turned == pytest.approx((0.4895, 0.2448), abs=1e-3)
 
 
-def test_confidence_has_words() -> None:
-    said = [confidence_words(value) for value in (1.0, 0.9, 0.6, 0.3, 0.0)]
-    assert len(set(said)) == 5
+def test_confidence_words_are_distinct() -> None:
+    descriptions = [confidence_words(value) for value in (1.0, 0.9, 0.6, 0.3, 0.0)]
+    assert len(set(descriptions)) == 5

@@ -1,4 +1,4 @@
-"""Floor plans: what is accepted, what is refused and how the refusal reads."""
+"""Validation of floor plans and its error messages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def with_polygon(polygon: Any) -> dict[str, Any]:
     return plan_document(rectangle(2.0, 2.0, at=(50.0, 0.0)), polygon)
 
 
-def test_the_native_format_is_read_as_documented() -> None:
+def test_native_format_is_read() -> None:
     plan = FloorPlan.from_json(json.dumps(EXAMPLE))
     assert (plan.name, plan.camera_height_m, plan.warnings) == ("Flat 3", 1.5, ())
     assert plan.rooms[0].name == "kitchen"
@@ -45,7 +45,7 @@ def test_the_native_format_is_read_as_documented() -> None:
 
 
 @given(plans())
-def test_writing_a_plan_and_reading_it_again_changes_nothing(plan: FloorPlan) -> None:
+def test_plan_round_trips_through_json(plan: FloorPlan) -> None:
     again = FloorPlan.from_json(json.dumps(plan.to_dict()))
     assert again.to_dict() == plan.to_dict()
     assert again.warnings == plan.warnings
@@ -53,7 +53,7 @@ def test_writing_a_plan_and_reading_it_again_changes_nothing(plan: FloorPlan) ->
 
 
 @given(room_polygons(), st.integers(0, 20), st.booleans())
-def test_any_vertex_order_is_the_same_room(polygon: list[list[float]], start: int, clockwise: bool) -> None:
+def test_vertex_order_does_not_change_the_room(polygon: list[list[float]], start: int, clockwise: bool) -> None:
     start %= len(polygon)
     turned = polygon[start:] + polygon[:start]
     room = plan_of(turned[::-1] if clockwise else turned).rooms[0]
@@ -67,7 +67,7 @@ def test_closing_and_repeated_vertices_are_dropped() -> None:
     assert plan_of(repeated).rooms[0].polygon_m.tolist() == plan_of(clean).rooms[0].polygon_m.tolist()
 
 
-def test_a_room_without_a_name_is_called_by_its_number() -> None:
+def test_unnamed_room_gets_a_number() -> None:
     document = plan_document(rectangle(2.0, 2.0))
     del document["rooms"][0]["name"]
     assert FloorPlan.from_dict(document).rooms[0].name == "room 1"
@@ -95,7 +95,7 @@ def test_a_room_without_a_name_is_called_by_its_number() -> None:
         ({"x": 1}, "list"),
     ],
 )
-def test_a_bad_polygon_is_refused_by_the_name_of_its_room(polygon: Any, reason: str) -> None:
+def test_bad_polygon_error_names_the_room(polygon: Any, reason: str) -> None:
     error = refused(with_polygon(polygon))
     assert error.room == "room 2"
     assert reason in error.reason
@@ -128,7 +128,7 @@ def test_a_bad_polygon_is_refused_by_the_name_of_its_room(polygon: Any, reason: 
         ({"camera_height_m": 2.5}, "below the lowest ceiling"),
     ],
 )
-def test_a_bad_plan_is_refused_with_the_reason(change: dict[str, Any], reason: str) -> None:
+def test_bad_plan_error_names_the_reason(change: dict[str, Any], reason: str) -> None:
     document = plan_document(rectangle(3.0, 3.0))
     document["rooms"][0]["ceiling_height_m"] = 2.5
     error = refused({**document, **change})
@@ -146,7 +146,7 @@ def test_a_bad_plan_is_refused_with_the_reason(change: dict[str, Any], reason: s
         ({"floor": "parquet"}, "unknown key 'floor'"),
     ],
 )
-def test_a_bad_room_is_refused_by_its_name(change: dict[str, Any], reason: str) -> None:
+def test_bad_room_error_names_the_room(change: dict[str, Any], reason: str) -> None:
     document = plan_document(rectangle(3.0, 3.0))
     document["rooms"][0].update(change)
     error = refused(document)
@@ -155,26 +155,26 @@ def test_a_bad_room_is_refused_by_its_name(change: dict[str, Any], reason: str) 
 
 
 @pytest.mark.parametrize("room", [None, 3, "kitchen", [[0, 0], [1, 0], [1, 1]]])
-def test_a_room_that_is_no_object_is_refused_by_its_number(room: Any) -> None:
+def test_non_object_room_error_names_its_number(room: Any) -> None:
     document = plan_document(rectangle(3.0, 3.0))
     document["rooms"].append(room)
     assert refused(document).room == "room 2"
 
 
-def test_a_room_needs_a_ceiling_from_somewhere() -> None:
+def test_missing_ceiling_height_is_refused() -> None:
     document = plan_document(rectangle(3.0, 3.0))
     del document["ceiling_height_m"]
     assert refused(document).room == "room 1"
 
 
-def test_the_camera_must_lie_below_the_lowest_ceiling_not_the_first() -> None:
+def test_camera_must_be_below_the_lowest_ceiling() -> None:
     document = plan_document(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(4.0, 0.0)), camera_height_m=2.2)
     FloorPlan.from_dict(document)
     document["rooms"][1]["ceiling_height_m"] = 2.1
     assert "2.1 m" in str(refused(document))
 
 
-def test_limits_hold_at_the_limit_and_not_beyond() -> None:
+def test_limits_are_inclusive() -> None:
     limits = PlanLimits(max_rooms=2, max_vertices_per_room=5)
     square = rectangle(1.0, 1.0)
     apart = [rectangle(1.0, 1.0, at=(2.0 * index, 0.0)) for index in range(3)]
@@ -185,15 +185,15 @@ def test_limits_hold_at_the_limit_and_not_beyond() -> None:
     assert (error.room, "6 vertices; the limit is 5" in error.reason) == ("room 1", True)
 
 
-def test_millimetres_given_as_metres_are_noticed() -> None:
+def test_millimetre_coordinates_are_refused() -> None:
     assert "metres" in str(refused(plan_document(rectangle(4200.0, 3100.0))))
 
 
-def test_a_plan_far_from_the_origin_is_fine() -> None:
+def test_surveyed_coordinates_are_accepted() -> None:
     assert plan_of(rectangle(4.0, 3.0, at=(4.5e5, 5.4e6))).area_m2 == pytest.approx(12.0)
 
 
-def test_overlapping_rooms_are_a_warning_and_touching_ones_are_not() -> None:
+def test_overlapping_rooms_give_a_warning() -> None:
     touching = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(2.0, 0.0)))
     overlapping = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(1.5, 0.0)))
     assert touching.warnings == ()
@@ -201,13 +201,13 @@ def test_overlapping_rooms_are_a_warning_and_touching_ones_are_not() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2", b"\xff\xfe\x00", "nothing"])
-def test_text_that_is_not_json_is_refused(text: str | bytes) -> None:
+def test_invalid_json_is_refused(text: str | bytes) -> None:
     with pytest.raises(InvalidFloorPlanError, match="not valid JSON"):
         FloorPlan.from_json(text)
 
 
 @pytest.mark.parametrize("text", ["3", "null", "[]", '"plan"'])
-def test_json_that_is_no_object_is_refused(text: str) -> None:
+def test_json_that_is_not_an_object_is_refused(text: str) -> None:
     with pytest.raises(InvalidFloorPlanError, match="must be an object"):
         FloorPlan.from_json(text)
 
@@ -220,7 +220,7 @@ _json = st.recursive(
 
 
 @given(st.sampled_from(["name", "rooms", "ceiling_height_m", "camera_height_m", "polygon", "vertex"]), _json)
-def test_whatever_stands_in_the_document_the_only_error_is_the_named_one(key: str, value: Any) -> None:
+def test_arbitrary_values_raise_only_plan_errors(key: str, value: Any) -> None:
     document = plan_document(rectangle(3.0, 3.0))
     if key == "polygon":
         document["rooms"][0]["polygon"] = value
@@ -232,7 +232,7 @@ def test_whatever_stands_in_the_document_the_only_error_is_the_named_one(key: st
         assert FloorPlan.from_dict(document).area_m2 > 0.0
 
 
-def test_a_plan_cannot_be_changed_after_it_was_validated() -> None:
+def test_plan_is_immutable() -> None:
     plan = plan_of(rectangle(3.0, 2.0), [[4, 0], [6, 0], [5, 2]])
     for array in (plan.rooms[0].polygon_m, plan.rooms[0].walls_m, plan.walls_m, plan.ceiling_heights_m):
         with pytest.raises(ValueError, match="read-only"):
@@ -257,13 +257,13 @@ def test_padding_repeats_the_first_wall() -> None:
     np.testing.assert_array_equal(padded[4:], walls[[0, 0]])
 
 
-def test_positions_are_given_to_the_first_room_that_holds_them() -> None:
+def test_positions_belong_to_the_first_room() -> None:
     plan = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(1.0, 0.0)), rectangle(2.0, 2.0, at=(5.0, 0.0)))
     positions = np.array([[0.5, 1.0], [1.5, 1.0], [2.5, 1.0], [4.0, 1.0], [6.0, 1.0], [np.nan, 0.0]])
     assert plan.room_index_at(positions).tolist() == [0, 0, 1, -1, 2, -1]
 
 
-def test_rooms_compare_by_identity_because_arrays_do_not_compare() -> None:
+def test_rooms_compare_by_identity() -> None:
     first, second = (Room("a", np.zeros((3, 2)), 2.5) for _ in range(2))
     assert first == first
     assert first != second
@@ -279,14 +279,14 @@ def test_north_is_an_azimuth_of_the_plan(degrees: float, azimuth: float) -> None
 
 
 @given(degrees=st.floats(-360, 360))
-def test_north_survives_being_written_and_read(degrees: float) -> None:
+def test_north_round_trips(degrees: float) -> None:
     once = FloorPlan.from_dict(EXAMPLE | {"north_deg": degrees}).to_dict()
     assert math.cos(math.radians(once["north_deg"] - degrees)) == pytest.approx(1.0, abs=1e-12)
     assert FloorPlan.from_dict(once).to_dict() == once
 
 
 @pytest.mark.parametrize("degrees", [361, -360.5, math.nan, math.inf, "north", True, [0]])
-def test_a_north_that_is_no_direction_is_refused(degrees: Any) -> None:
+def test_invalid_north_is_refused(degrees: Any) -> None:
     assert "north_deg" in str(refused(EXAMPLE | {"north_deg": degrees}))
 
 
@@ -299,13 +299,13 @@ def test_deep_nesting_is_refused_before_it_is_parsed(text: str) -> None:
             FloorPlan.from_json(form)
 
 
-def test_brackets_in_names_are_no_nesting() -> None:
+def test_brackets_in_strings_are_not_nesting() -> None:
     name = '[[[[[[[[[[ {{{{{{{{{{ \\" \\\\'
     plan = FloorPlan.from_json(json.dumps(EXAMPLE | {"name": name}))
     assert plan.name == name
 
 
-def test_a_million_vertices_are_refused_without_looking_at_them() -> None:
+def test_million_vertices_are_refused_early() -> None:
     one_room = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 10**6) + "]}]}"
     begin = time.perf_counter()
     with pytest.raises(
@@ -321,14 +321,14 @@ def test_vertices_are_counted_over_all_rooms() -> None:
     FloorPlan.from_dict(document, PlanLimits(max_plan_vertices=12))
 
 
-def test_too_large_a_floor_is_refused() -> None:
+def test_floor_area_limit() -> None:
     document = plan_document(rectangle(10.0, 10.0), rectangle(10.0, 10.0, at=(20.0, 0.0)))
     assert "200 m²; the limit is 199 m² (LALALOC_MAX_AREA_M2)" in str(refused(document, PlanLimits(max_area_m2=199.0)))
     FloorPlan.from_dict(document, PlanLimits(max_area_m2=200.0))
 
 
-def test_looking_for_overlaps_ends_early() -> None:
-    """250 times the same jagged room: all pairs would take minutes."""
+def test_overlap_search_ends_early() -> None:
+    """250 copies of a jagged room: checking all pairs would take minutes."""
     angles = 2.0 * math.pi * np.arange(200) / 200.0
     radii = 2.0 + np.arange(200) % 2
     star = np.round(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1), 3).tolist()

@@ -1,5 +1,4 @@
-"""The closed-form derivatives of log wall profiles: against automatic differentiation, against differences, on arrays
-of both kinds, and of what is seen through openings."""
+"""Closed-form derivatives of log wall profiles against autograd and differences, for numpy and torch."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ COLUMNS = 64
 class TestProfiles:
     @given(rows_of_rooms(), seeds())
     @settings(max_examples=40)
-    def test_they_are_what_automatic_differentiation_gives(self, plan: FloorPlan, seed: int) -> None:
-        # Rooms with columns and free-standing walls, turned by any angle.
+    def test_gradients_match_autograd(self, plan: FloorPlan, seed: int) -> None:
+        # Rooms with columns and free-standing walls, rotated by any angle.
         scene = scene_of(plan, 4, seed)
         walls = torch.tensor(scene.walls_m)
         pose = torch.tensor(np.column_stack([scene.poses.position_m, scene.heading]))
@@ -39,7 +38,7 @@ class TestProfiles:
 
     @given(rows_of_rooms(), seeds())
     @settings(max_examples=20)
-    def test_they_are_the_differences_where_the_same_wall_is_met(self, plan: FloorPlan, seed: int) -> None:
+    def test_gradients_match_differences(self, plan: FloorPlan, seed: int) -> None:
         scene, step = scene_of(plan, 2, seed), 1e-6
         pose = np.column_stack([scene.poses.position_m, scene.heading])
         here = log_profile_gradient(pose[:, :2], pose[:, 2], scene.walls_m, COLUMNS)
@@ -55,14 +54,14 @@ class TestProfiles:
 
     @given(rows_of_rooms(), seeds())
     @settings(max_examples=20)
-    def test_single_precision_and_torch_give_the_same_numbers(self, plan: FloorPlan, seed: int) -> None:
+    def test_single_precision_and_torch_agree(self, plan: FloorPlan, seed: int) -> None:
         scene = scene_of(plan, 3, seed)
         exact = log_profile_gradient(scene.poses.position_m, scene.heading, scene.walls_m, COLUMNS)
         arrays = (scene.poses.position_m, scene.heading, scene.walls_m)
-        position, heading, walls = (torch.tensor(one, dtype=torch.float32) for one in arrays)
+        position, heading, walls = (torch.tensor(array, dtype=torch.float32) for array in arrays)
         single = log_profile_gradient(position, heading, walls, COLUMNS)
         assert single.by_pose.dtype == torch.float32
-        # Beside an edge that hides something the last bit decides which wall is met.
+        # Next to an occluding edge rounding decides which wall is met.
         same = single.wall.numpy() == exact.wall
         assert same.mean() > 0.95
         np.testing.assert_allclose(single.log_m.numpy()[same], exact.log_m[same], atol=1e-4)
@@ -71,13 +70,13 @@ class TestProfiles:
                 single.by_pose[:, unknown].numpy()[same], exact.by_pose[:, unknown][same], rtol=1e-2, atol=1e-3
             )
 
-    def test_outside_of_every_room_nothing_is_infinite(self) -> None:
+    def test_gradients_outside_rooms_are_finite(self) -> None:
         walls = plan_of(rectangle(4.0, 3.0)).walls_m[:1]
         found = log_profile_gradient(np.array([[90.0, 1.5]]), np.zeros(1), walls, COLUMNS)
         assert np.isfinite(found.log_m).all()
         assert np.isfinite(found.by_pose).all()
 
-    def test_a_wall_that_is_seen_edge_on_is_not_seen(self) -> None:
+    def test_edge_on_wall_is_invisible(self) -> None:
         plan = plan_of(rectangle(4.0, 3.0))
         stub = np.array([[[2.0, 1.0, 2.0, 2.0]]])
         walls = np.concatenate([plan.walls_m[:1], stub], axis=1)
@@ -88,7 +87,7 @@ class TestProfiles:
 
 @given(rows_of_rooms(), seeds())
 @settings(max_examples=20)
-def test_what_is_seen_through_an_opening_changes_as_the_wall_behind_does(plan: FloorPlan, seed: int) -> None:
+def test_gradient_through_an_opening(plan: FloorPlan, seed: int) -> None:
     scene = scene_of(plan, 4, seed)
     position, heading = torch.tensor(scene.poses.position_m), torch.tensor(scene.heading)
     room = torch.tensor(scene.poses.room_index)
@@ -110,7 +109,7 @@ def test_what_is_seen_through_an_opening_changes_as_the_wall_behind_does(plan: F
         slope = torch.func.jvp(log_behind, (pose,), (tangent,))[1][row, column]
         end = position[row] + behind_m[:, None] * direction
         walls = torch.tensor(plan.walls_m).flatten(0, 1)
-        # The wall that the ray ends on, alone.
+        # Only the wall that the ray ends on.
         met = _wall_at(end, walls)
         found = log_distance_gradient(position[row], azimuth[:, None], met[:, None])
         torch.testing.assert_close(found.log_m[:, 0], behind_m.log(), rtol=1e-6, atol=1e-6)
@@ -118,7 +117,7 @@ def test_what_is_seen_through_an_opening_changes_as_the_wall_behind_does(plan: F
 
 
 def _wall_at(point_m: torch.Tensor, walls_m: torch.Tensor) -> torch.Tensor:
-    """The wall segment that each point lies on."""
+    """Return the wall segment that each point lies on."""
     start, edge = walls_m[:, :2], walls_m[:, 2:] - walls_m[:, :2]
     offset = point_m[:, None] - start[None]
     share = ((offset * edge).sum(dim=2) / edge.square().sum(dim=1)).clamp(0.0, 1.0)

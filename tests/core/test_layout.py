@@ -1,4 +1,4 @@
-"""What a camera sees along the horizon: against a slow oracle, on homes whose answer is known, and its gradients."""
+"""Layout views against the reference ray tracer and known plans, and their gradients."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, s
 
 COLUMNS = 48
 EYE_M = 1.5
-# Two rooms of 4 x 3 m with a wall of 20 cm, and a door in the middle of it, drawn on its axis.
+# Two rooms of 4 x 3 m, separated by a wall of 20 cm, with a door drawn on the wall's axis.
 TWO_ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, at=(4.2, 0.0)))
 DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
 
 
-def seen(plan: FloorPlan, at: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M) -> LayoutView:
-    """One ray for each azimuth."""
+def view_along(plan: FloorPlan, at: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M) -> LayoutView:
+    """Render one ray for each azimuth."""
     count = len(azimuths_deg)
     position = np.tile(at, (count, 1)).astype(float)
     room = plan.room_index_at(position)
-    # With a single column the ray of a pose is the one along its heading.
+    # With a single column a pose's ray is along its heading.
     return layout_view(position, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
 
 
-def view_of(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:
+def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:
     return layout_view(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
 
 
 @settings(max_examples=25, deadline=None)
 @given(rows_of_rooms(), seeds())
-def test_the_view_is_what_asking_shapely_ray_by_ray_gives(plan: FloorPlan, seed: int) -> None:
+def test_view_matches_shapely_ray_by_ray(plan: FloorPlan, seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = random_poses(plan, 2, rng, 0.1)
     heading = rng.uniform(-math.pi, math.pi, 2)
-    view = view_of(plan, poses, heading)
-    # Beside a corner or the end of an opening the last bit decides; such rays prove nothing.
-    around = [view_of(plan, poses, heading + shift) for shift in (-1e-5, 1e-5)]
+    view = render(plan, poses, heading)
+    # Next to a corner or the end of an opening rounding decides; such rays are skipped.
+    around = [render(plan, poses, heading + shift) for shift in (-1e-5, 1e-5)]
     steady = np.ones(view.kind.shape, bool)
     for other in around:
         steady &= other.kind == view.kind
@@ -62,11 +62,11 @@ def test_the_view_is_what_asking_shapely_ray_by_ray_gives(plan: FloorPlan, seed:
 
 @given(seeds())
 @settings(max_examples=10, deadline=None)
-def test_distances_are_those_of_the_wall_profile_and_nothing_is_seen_before_its_wall(seed: int) -> None:
+def test_distances_equal_the_wall_profile(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plan = generate_home(rng).plan
     poses, heading = random_poses(plan, 4, rng), rng.uniform(-math.pi, math.pi, 4)
-    view = view_of(plan, poses, heading)
+    view = render(plan, poses, heading)
     profile = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
     np.testing.assert_array_equal(view.distance_m, profile)
     assert (view.behind_m >= view.distance_m).all()
@@ -76,11 +76,11 @@ def test_distances_are_those_of_the_wall_profile_and_nothing_is_seen_before_its_
 
 @given(seeds())
 @settings(max_examples=10, deadline=None)
-def test_torch_gives_what_numpy_gives(seed: int) -> None:
+def test_torch_matches_numpy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plan = generate_home(rng).plan
     poses, heading = random_poses(plan, 4, rng), rng.uniform(-math.pi, math.pi, 4)
-    view = view_of(plan, poses, heading)
+    view = render(plan, poses, heading)
     other = layout_view(
         torch.tensor(poses.position_m),
         torch.tensor(heading),
@@ -94,7 +94,7 @@ def test_torch_gives_what_numpy_gives(seed: int) -> None:
     np.testing.assert_allclose(other.behind_m.numpy(), view.behind_m, rtol=1e-9)
 
 
-def test_gradients_of_all_distances_are_right() -> None:
+def test_gradients_match_differences() -> None:
     plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
     position = torch.tensor([[1.1, 1.3], [6.3, 1.6]], dtype=torch.float64, requires_grad=True)
     heading = torch.tensor([0.3, 2.0], dtype=torch.float64, requires_grad=True)
@@ -107,55 +107,55 @@ def test_gradients_of_all_distances_are_right() -> None:
     assert torch.autograd.gradcheck(distances, (position, heading))
 
 
-def test_through_a_door_one_sees_the_far_wall_of_the_next_room() -> None:
+def test_door_shows_the_far_wall_of_the_next_room() -> None:
     plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
-    view = seen(plan, (1.0, 1.5), [90.0, 0.0])
+    view = view_along(plan, (1.0, 1.5), [90.0, 0.0])
     assert view.kind[:, 0].tolist() == [DOOR_CODE, WALL_CODE]
     np.testing.assert_allclose(view.distance_m[:, 0], [3.0, 1.5])
     np.testing.assert_allclose(view.behind_m[:, 0], [7.2, 1.5])
-    back = seen(plan, (5.2, 1.5), [-90.0])
+    back = view_along(plan, (5.2, 1.5), [-90.0])
     np.testing.assert_allclose([back.distance_m[0, 0], back.behind_m[0, 0]], [1.0, 5.2])
 
 
-def test_a_slanting_ray_ends_in_the_thickness_of_the_wall() -> None:
+def test_slanting_ray_ends_in_the_reveal() -> None:
     plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
-    # It enters 5 cm before the end of the door and would leave 15 cm beyond it.
-    view = seen(plan, (3.0, 0.95), [45.0])
+    # The ray enters 5 cm before the end of the door and would leave 15 cm beyond it.
+    view = view_along(plan, (3.0, 0.95), [45.0])
     assert view.kind[0, 0] == DOOR_CODE
     assert view.behind_m[0, 0] == view.distance_m[0, 0]
 
 
 @pytest.mark.parametrize("kind", OPENING_CLASSES[1:])
-def test_windows_and_doors_to_the_outdoors_show_nothing_behind(kind: str) -> None:
+def test_outdoor_openings_show_nothing_behind(kind: str) -> None:
     opening = {"kind": kind, "line": [[0.0, 1.0], [0.0, 2.0]]}
-    view = seen(FloorPlan.from_dict(TWO_ROOMS | {"openings": [opening]}), (1.0, 1.5), [-90.0])
+    view = view_along(FloorPlan.from_dict(TWO_ROOMS | {"openings": [opening]}), (1.0, 1.5), [-90.0])
     assert view.kind[0, 0] == OPENING_CLASSES.index(kind)
     assert view.behind_m[0, 0] == view.distance_m[0, 0] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("eye_m", "code"), [(0.8, WALL_CODE), (1.0, WINDOW_CODE), (2.1, WALL_CODE)])
-def test_an_opening_counts_at_eye_height_only(eye_m: float, code: int) -> None:
+def test_opening_is_visible_at_eye_height_only(eye_m: float, code: int) -> None:
     window = {"kind": "window", "line": [[0.0, 1.0], [0.0, 2.0]], "sill_m": 0.9, "head_m": 2.0}
     plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [window]})
-    assert seen(plan, (1.0, 1.5), [-90.0], eye_m).kind[0, 0] == code
+    assert view_along(plan, (1.0, 1.5), [-90.0], eye_m).kind[0, 0] == code
 
 
-def test_of_openings_above_each_other_the_one_at_eye_height_is_met() -> None:
+def test_stacked_openings_are_chosen_by_eye_height() -> None:
     door = DOOR | {"head_m": 2.0}
     light = {"kind": "window", "line": DOOR["line"], "sill_m": 2.0, "head_m": 2.4}
     plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [light, door]})
-    assert [int(seen(plan, (1.0, 1.5), [90.0], eye).kind[0, 0]) for eye in (1.5, 2.2)] == [DOOR_CODE, WINDOW_CODE]
+    assert [int(view_along(plan, (1.0, 1.5), [90.0], eye).kind[0, 0]) for eye in (1.5, 2.2)] == [DOOR_CODE, WINDOW_CODE]
 
 
-def test_a_room_without_any_opening_has_walls_only() -> None:
+def test_room_without_openings_has_walls_only() -> None:
     plan = plan_of(rectangle(4.0, 3.0))
-    view = view_of(plan, random_poses(plan, 3, np.random.default_rng(0)), np.zeros(3))
+    view = render(plan, random_poses(plan, 3, np.random.default_rng(0)), np.zeros(3))
     assert (view.kind == WALL_CODE).all()
     assert (view.behind_m == view.distance_m).all()
 
 
 def test_padding_changes_nothing() -> None:
-    """The first wall is repeated to pad; its door is met all the same, whichever copy a ray is said to meet."""
+    """Padding repeats the first wall; its door is met on every copy."""
     many = [[0.1 * k, 3.0 + 0.01 * (k % 2)] for k in range(40, -1, -1)]
     document = plan_document(rectangle(4.0, 3.0, at=(0.0, -4.0)), [[0.0, 0.0], [4.0, 0.0], *many])
     document["openings"] = [{"kind": "door", "line": [[1.0, -4.0], [3.0, -4.0]]}]

@@ -1,4 +1,4 @@
-"""Networks of both architectures: shapes, names, and what must hold of them before any training."""
+"""Networks of the architectures `ring` and `paper`: shapes, parameter names and invariants without training."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def layouts(count: int, columns: int) -> tuple[torch.Tensor, torch.Tensor, torch
 
 class TestResNet:
     @pytest.mark.parametrize(("depth", "parameters", "channels"), [(18, 11_176_512, 512), (50, 23_508_032, 2048)])
-    def test_the_backbones_are_torchvision_s_without_fc(self, depth: int, parameters: int, channels: int) -> None:
+    def test_backbones_match_torchvision(self, depth: int, parameters: int, channels: int) -> None:
         backbone = ResNet(depth)
         assert sum(p.numel() for p in backbone.parameters()) == parameters
         assert backbone.channels == channels
 
-    def test_parameters_have_torchvision_s_names_and_shapes(self) -> None:
+    def test_parameters_match_torchvision(self) -> None:
         state = {name: tuple(value.shape) for name, value in ResNet(18).state_dict().items()}
         expected = {
             "conv1.weight": (64, 3, 7, 7),
@@ -53,13 +53,13 @@ class TestResNet:
             "layer1.0.downsample.0.weight": (256, 64, 1, 1),
             "layer1.0.conv3.weight": (256, 64, 1, 1),
             "layer3.5.bn3.weight": (1024,),
-            # The stride is in the 3x3 convolution, as in torchvision.
+            # As in torchvision, the 3x3 convolution has the stride.
             "layer4.2.conv2.weight": (512, 512, 3, 3),
         }
         assert {name: deep.get(name) for name in expected} == expected
         assert len(deep) == 318
 
-    def test_the_bottleneck_strides_in_its_middle_convolution(self) -> None:
+    def test_bottleneck_strides_in_its_middle_convolution(self) -> None:
         block = ResNet(50).get_submodule("layer2.0")
         strides = [block.get_submodule(name).stride for name in ("conv1", "conv2", "conv3")]
         assert strides == [(1, 1), (2, 2), (1, 1)]
@@ -75,7 +75,7 @@ class TestPaper:
         assert latent.shape == (2, 128)
         torch.testing.assert_close(latent.norm(dim=1), torch.ones(2))
 
-    def test_the_layout_encoder_sees_the_heights(self) -> None:
+    def test_layout_encoder_uses_the_heights(self) -> None:
         torch.manual_seed(0)
         encoder = PaperLayoutEncoder(SMALL_PAPER).eval()
         profile, camera, ceiling = layouts(2, 64)
@@ -83,7 +83,7 @@ class TestPaper:
 
     @pytest.mark.parametrize("depth", [18, 50])
     @pytest.mark.parametrize("predictor", ["fc", "mlp"])
-    def test_every_architecture_of_the_comparison_comes_back_from_a_manifest(self, depth: Any, predictor: Any) -> None:
+    def test_paper_variants_load_from_a_manifest(self, depth: Any, predictor: Any) -> None:
         torch.manual_seed(0)
         config = dataclasses.replace(SMALL_PAPER, layout_depth=depth, layout_predictor=predictor, width=8)
         encoder = PaperLayoutEncoder(config).eval()
@@ -92,12 +92,12 @@ class TestPaper:
         inputs = layouts(3, 64)
         torch.testing.assert_close(loaded(*inputs), encoder(*inputs))
 
-    def test_the_two_layer_predictor_has_one_hidden_layer_as_wide_as_the_features(self) -> None:
+    def test_mlp_predictor_has_one_hidden_layer(self) -> None:
         encoder = PaperLayoutEncoder(dataclasses.replace(SMALL_PAPER, layout_predictor="mlp"))
         shapes = {name: tuple(p.shape) for name, p in encoder.fc.named_parameters() if p.ndim == 2}
         assert list(shapes.values()) == [(512, 512), (128, 512)]
 
-    def test_manifests_from_before_the_options_still_load(self) -> None:
+    def test_old_manifests_load(self) -> None:
         old = dataclasses.asdict(SMALL_PAPER)
         del old["layout_predictor"], old["width"]
         state = PaperLayoutEncoder(SMALL_PAPER).state_dict()
@@ -105,7 +105,7 @@ class TestPaper:
         load_layout_encoder("paper", old, safetensors.torch.save(state))
 
     @pytest.mark.parametrize("depth", [18, 50])
-    def test_a_narrow_backbone_has_the_same_layers(self, depth: int) -> None:
+    def test_narrow_backbone_has_the_same_layers(self, depth: int) -> None:
         narrow, usual = ResNet(depth, width=16), ResNet(depth)
         assert narrow.state_dict().keys() == usual.state_dict().keys()
         assert 4 * narrow.channels == usual.channels
@@ -120,7 +120,7 @@ class TestRing:
         assert encoder.ring(*layouts(5, TINY.profile_columns)).shape == (5, TINY.channels, TINY.sectors)
 
     @pytest.mark.parametrize("config", [TINY, RingConfig()], ids=["tiny", "default"])
-    def test_the_image_encoder_speaks_of_the_same_ring_and_profile(self, config: RingConfig) -> None:
+    def test_image_encoder_output_shapes(self, config: RingConfig) -> None:
         encoder = RingImageEncoder(config).eval()
         image = torch.randint(0, 256, (2, config.image_height, config.image_width, 3), dtype=torch.uint8)
         with torch.no_grad():
@@ -128,7 +128,7 @@ class TestRing:
         assert features.ring.shape == (2, config.channels, config.sectors)
         assert features.log_profile.shape == features.log_scale.shape == (2, config.profile_columns)
 
-    def test_fusing_the_normalisation_changes_nothing_but_speed(self) -> None:
+    def test_fused_encoder_gives_the_same_output(self) -> None:
         torch.manual_seed(0)
         encoder = RingLayoutEncoder(TINY).train()
         for _ in range(3):
@@ -141,14 +141,14 @@ class TestRing:
         assert all(torch.equal(before[name], value) for name, value in encoder.state_dict().items())
         assert not any(isinstance(module, torch.nn.BatchNorm1d) for module in fused.modules())
 
-    def test_distances_beyond_all_reason_do_not_become_nan(self) -> None:
+    def test_extreme_distances_do_not_give_nan(self) -> None:
         encoder = RingLayoutEncoder(TINY).eval()
         profile, camera, ceiling = layouts(2, TINY.profile_columns)
         profile[0, 3], profile[1, 5] = float("inf"), 0.0
         assert bool(torch.isfinite(encoder(profile, camera, ceiling)).all())
 
-    def test_the_predicted_profile_scales_with_the_camera_height(self) -> None:
-        # At initialisation the height enters the features too; with that input cut, only the units remain.
+    def test_predicted_profile_scales_with_camera_height(self) -> None:
+        # The untrained features depend on the height too; without that input only the units remain.
         encoder = RingImageEncoder(TINY).eval()
         with torch.no_grad():
             encoder.squeeze.weight[:, -1] = 0.0
@@ -157,11 +157,11 @@ class TestRing:
         torch.testing.assert_close(high - low, torch.full_like(low, 0.6931472))
 
     @pytest.mark.parametrize("padding", [0, 1, 3])
-    def test_the_horizon_has_no_border(self, padding: int) -> None:
+    def test_encoder_is_equivariant_to_rolling(self, padding: int) -> None:
         padded = pad_around(torch.arange(6.0)[None, None], padding)[0, 0]
         assert padded.tolist() == [float(i % 6) for i in range(-padding, 6 + padding)]
 
-    def test_sizes_that_do_not_meet_are_refused(self) -> None:
+    def test_incompatible_sizes_are_refused(self) -> None:
         with pytest.raises(ValueError, match="profile_columns is 33"):
             RingLayoutEncoder(dataclasses.replace(TINY, profile_columns=33))
         with pytest.raises(ValueError, match="sectors"):
@@ -170,14 +170,14 @@ class TestRing:
 
 class TestDecoder:
     @pytest.mark.parametrize("batch", [1, 3])
-    def test_a_latent_becomes_a_depth_image(self, batch: int) -> None:
+    def test_decoder_output_shape(self, batch: int) -> None:
         decoded = LayoutDecoder(16).eval()(torch.randn(batch, 16))
         assert decoded.shape == (batch, 32, 64)
 
 
 class TestLoading:
     @pytest.mark.parametrize("half", [False, True])
-    def test_a_layout_encoder_comes_back_from_its_weights(self, half: bool) -> None:
+    def test_layout_encoder_loads_from_its_weights(self, half: bool) -> None:
         torch.manual_seed(0)
         encoder = RingLayoutEncoder(TINY).eval()
         state = {k: v.half() if half and v.is_floating_point() else v for k, v in encoder.state_dict().items()}
@@ -188,12 +188,12 @@ class TestLoading:
         torch.testing.assert_close(loaded(*inputs), encoder(*inputs), atol=5e-3 if half else 1e-6, rtol=0.0)
         assert all(p.dtype == torch.float32 for p in loaded.parameters())
 
-    def test_missing_and_superfluous_weights_are_refused(self) -> None:
+    def test_missing_and_extra_weights_are_refused(self) -> None:
         state = RingLayoutEncoder(TINY).state_dict()
         for wrong in ({**state, "extra": torch.zeros(1)}, {k: v for k, v in state.items() if k != "head.fc.bias"}):
             with pytest.raises(RuntimeError, match="state_dict"):
                 load_layout_encoder("ring", dataclasses.asdict(TINY), safetensors.torch.save(wrong))
 
-    def test_an_unknown_architecture_is_refused_by_name(self) -> None:
+    def test_unknown_architecture_is_refused(self) -> None:
         with pytest.raises(ValueError, match="'transformer'"):
             load_layout_encoder("transformer", {}, b"")

@@ -1,4 +1,4 @@
-"""Photo spheres: parts put in place, tilted cameras levelled, and metadata that is never trusted."""
+"""Photo Sphere metadata: placement of parts, levelling, and robustness against bad metadata."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 
 
 def xmp(**properties: object) -> bytes:
-    """A packet with GPano properties as attributes."""
+    """Return a packet with GPano properties as attributes."""
     return packet_of(" " + " ".join(f'GPano:{name}="{value}"' for name, value in properties.items()) + ">")
 
 
 def xmp_of_elements(**properties: object) -> bytes:
-    """A packet with GPano properties as elements."""
+    """Return a packet with GPano properties as elements."""
     return packet_of(">" + "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in properties.items()))
 
 
@@ -57,7 +57,7 @@ def crop(left: int, top: int, width: int, height: int, **others: object) -> dict
 
 
 def directions(height: int, width: int) -> np.ndarray:
-    """(h, w, 3): right, forward and up of a level camera that each pixel looks along."""
+    """Return each pixel's direction (h, w, 3): right, forward and up of a level camera."""
     azimuth, elevation = np.meshgrid(column_azimuths(width), row_elevations(height))
     return np.stack(
         [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
@@ -65,14 +65,14 @@ def directions(height: int, width: int) -> np.ndarray:
 
 
 def world(rays: np.ndarray) -> np.ndarray:
-    """Smooth colours all over the sphere, different in every direction."""
+    """Return smooth colours, different in every direction."""
     x, y, z = np.moveaxis(rays, -1, 0)
     channels = [x + 0.4 * y * z, y - 0.4 * x * z, z + 0.3 * np.sin(3.0 * x)]
     return np.round(127.5 + 85.0 * np.stack(channels, axis=-1)).astype(np.uint8)
 
 
 def turn(axis: int, angle: float) -> np.ndarray:
-    """Rotation about right (0), forward (1) or up (2), right-handed."""
+    """Return the right-handed rotation about right (0), forward (1) or up (2)."""
     first, second = [i for i in range(3) if i != axis]
     sign = -1.0 if axis == 1 else 1.0
     matrix = np.eye(3)
@@ -82,7 +82,7 @@ def turn(axis: int, angle: float) -> np.ndarray:
 
 
 def tilted(height: int, width: int, pitch_deg: float, roll_deg: float) -> np.ndarray:
-    """The world as a camera sees it that was pitched up, then rolled clockwise about its viewing direction.
+    """Return the picture of a camera that was pitched up, then rolled clockwise about its viewing direction.
 
     Independent of the code under test: the camera is turned by rotation matrices. Right-handed about `right` lifts the
     viewing direction; right-handed about `forward`, which points away from the photographer, is clockwise to them.
@@ -92,7 +92,7 @@ def tilted(height: int, width: int, pitch_deg: float, roll_deg: float) -> np.nda
 
 
 def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) -> bytes:
-    """A picture of a kind with an XMP packet in it."""
+    """Encode a picture with an XMP packet."""
     buffer = io.BytesIO()
     options: dict[str, object] = {"quality": 98, "subsampling": 0} if kind == "JPEG" else {}
     options |= {"lossless": True} if kind == "WEBP" else {}
@@ -121,7 +121,7 @@ class TestParts:
         ("left", "top", "width", "height"),
         [(0, 128, 1024, 256), (256, 0, 512, 512), (128, 64, 640, 320), (131, 67, 637, 315)],
     )
-    def test_a_part_is_put_in_its_place_and_the_rest_is_neutral(
+    def test_part_is_placed_on_a_neutral_sphere(
         self, kind: str, write: Callable[..., bytes], left: int, top: int, width: int, height: int
     ) -> None:
         packet = write(**crop(left, top, width, height))
@@ -137,15 +137,15 @@ class TestParts:
         assert (pixels[outside] == NEUTRAL).all()
         assert outside.any()
 
-    def test_a_part_that_was_scaled_afterwards_keeps_its_place(self) -> None:
+    def test_scaled_part_keeps_its_place(self) -> None:
         packet = xmp(**crop(128, 64, 640, 320))
         small = np.asarray(Image.fromarray(FULL[64:384, 128:768]).resize((320, 160), Image.Resampling.BOX))
         pixels = opened(encoded(small, "PNG", packet)).pixels.astype(int)
         np.testing.assert_allclose(pixels[10:46, 18:94], LEVEL[10:46, 18:94], atol=5)
 
-    def test_a_full_sphere_that_says_so_is_read_like_one_that_does_not(self) -> None:
-        said = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512)))).pixels
-        np.testing.assert_array_equal(said, opened(encoded(FULL)).pixels)
+    def test_explicit_full_sphere_changes_nothing(self) -> None:
+        explicit = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512)))).pixels
+        np.testing.assert_array_equal(explicit, opened(encoded(FULL)).pixels)
 
     @pytest.mark.parametrize(
         ("changes", "reason"),
@@ -160,9 +160,7 @@ class TestParts:
             ({"CroppedAreaImageWidthPixels": 0}, "a width or height is 0"),
         ],
     )
-    def test_numbers_that_contradict_are_refused_but_for_a_picture_that_is_full_anyway(
-        self, changes: dict[str, object], reason: str
-    ) -> None:
+    def test_contradictory_part_is_refused(self, changes: dict[str, object], reason: str) -> None:
         packet = xmp(**(crop(128, 64, 640, 320) | changes))
         np.testing.assert_array_equal(
             opened(encoded(FULL[:320, :640], "PNG", packet)).pixels, opened(encoded(FULL[:320, :640])).pixels
@@ -181,7 +179,7 @@ class TestParts:
             ({"ProjectionType": "cylindrical"}, "'cylindrical'; only 'equirectangular'"),
         ],
     )
-    def test_what_is_no_use_by_its_own_account_is_refused(self, changes: dict[str, object], reason: str) -> None:
+    def test_unusable_projection_or_part_is_refused(self, changes: dict[str, object], reason: str) -> None:
         packet = xmp(**(crop(128, 64, 640, 320) | changes))
         with pytest.raises(InvalidPanoramaError, match=reason):
             opened(encoded(FULL[:320, :640], "PNG", packet))
@@ -192,26 +190,28 @@ class TestLevelling:
         ("pitch_deg", "roll_deg"),
         [(0, 10), (0, -10), (15, 0), (-15, 0), (20, 30), (-40, 115), (0, 180), (90, 0), (-90, 45), (0.5, -0.5)],
     )
-    def test_a_tilted_camera_gives_the_picture_of_a_level_one(self, pitch_deg: float, roll_deg: float) -> None:
+    def test_tilted_camera_is_levelled(self, pitch_deg: float, roll_deg: float) -> None:
         packet = xmp(PosePitchDegrees=pitch_deg, PoseRollDegrees=roll_deg)
         content = encoded(tilted(FULL_HEIGHT, FULL_WIDTH, pitch_deg, roll_deg), "PNG", packet)
         np.testing.assert_allclose(opened(content).pixels.astype(int), LEVEL, atol=5)
 
     @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(30, 0), (0, 20)])
-    def test_the_signs_are_those_of_the_specification(self, pitch_deg: float, roll_deg: float) -> None:
-        """White sky, black ground; that the pictures are turned as the specification says is looked up in them."""
+    def test_pitch_and_roll_signs_follow_the_specification(self, pitch_deg: float, roll_deg: float) -> None:
+        """White sky and black ground show the direction of the rotation."""
         pose = turn(0, math.radians(pitch_deg)) @ turn(1, math.radians(roll_deg))
         rays = directions(FULL_HEIGHT, FULL_WIDTH) @ pose.T
-        seen = np.where(rays[..., 2:] < 0.0, 0, 255).astype(np.uint8).repeat(3, -1)
+        tilted = np.where(rays[..., 2:] < 0.0, 0, 255).astype(np.uint8).repeat(3, -1)
         row, column = FULL_HEIGHT // 2, FULL_WIDTH // 2
         if pitch_deg > 0.0:
             below = row + round(pitch_deg / 180.0 * FULL_HEIGHT)
-            assert seen[below - 3, column, 0] == 255, "pitch is degrees above the horizon for the centre"
-            assert seen[below + 3, column, 0] == 0
+            assert tilted[below - 3, column, 0] == 255, "pitch is degrees above the horizon for the centre"
+            assert tilted[below + 3, column, 0] == 0
         else:
-            assert seen[row - 20, column + FULL_WIDTH // 8, 0] == 0, "as roll grows, the horizon turns counterclockwise"
-            assert seen[row - 20, column - FULL_WIDTH // 8, 0] == 255
-        levelled = level(seen, pitch=math.radians(pitch_deg), roll=math.radians(roll_deg))
+            assert tilted[row - 20, column + FULL_WIDTH // 8, 0] == 0, (
+                "positive roll turns the horizon counterclockwise"
+            )
+            assert tilted[row - 20, column - FULL_WIDTH // 8, 0] == 255
+        levelled = level(tilted, pitch=math.radians(pitch_deg), roll=math.radians(roll_deg))
         assert (levelled[: row - 4] == 255).all()
         assert (levelled[row + 4 :] == 0).all()
 
@@ -220,15 +220,15 @@ class TestLevelling:
         roll=st.floats(-math.pi, math.pi),
     )
     @settings(max_examples=25)
-    def test_every_pose_is_undone_also_at_seam_and_poles(self, pitch: float, roll: float) -> None:
+    def test_levelling_works_at_seam_and_poles(self, pitch: float, roll: float) -> None:
         picture = tilted(256, 512, math.degrees(pitch), math.degrees(roll))
         expected = world(directions(256, 512)).astype(int)
         np.testing.assert_allclose(level(picture, pitch=pitch, roll=roll).astype(int), expected, atol=4)
 
-    def test_a_level_pose_changes_nothing(self) -> None:
+    def test_level_pose_changes_nothing(self) -> None:
         np.testing.assert_array_equal(level(FULL, pitch=0.0, roll=0.0), FULL)
 
-    def test_a_tilted_part_is_put_in_place_first(self) -> None:
+    def test_tilted_part_is_placed_first(self) -> None:
         whole = tilted(FULL_HEIGHT, FULL_WIDTH, 10, 5)
         packet = xmp(**crop(0, 64, 1024, 384, PosePitchDegrees=10, PoseRollDegrees=5))
         pixels = opened(encoded(whole[64:448], "PNG", packet)).pixels.astype(int)
@@ -236,12 +236,12 @@ class TestLevelling:
 
 
 class TestMetadata:
-    def test_the_compass_heading_is_told(self) -> None:
+    def test_compass_heading_is_returned(self) -> None:
         heading = opened(encoded(FULL, "JPEG", xmp(PoseHeadingDegrees=123.5))).compass_heading
         assert heading == pytest.approx(math.radians(123.5))
         assert opened(encoded(FULL)).compass_heading is None
 
-    def test_where_a_viewer_begins_is_ignored(self) -> None:
+    def test_initial_view_is_ignored(self) -> None:
         packet = xmp(InitialViewHeadingDegrees=90, InitialViewPitchDegrees=20, InitialViewRollDegrees=20)
         assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
 
@@ -268,23 +268,23 @@ class TestMetadata:
             b"<!-- " + b"x" * 300_000 + b" -->" + xmp(PosePitchDegrees=45),
         ],
     )
-    def test_a_packet_that_cannot_be_read_says_nothing(self, packet: bytes) -> None:
+    def test_unreadable_packet_is_ignored(self, packet: bytes) -> None:
         assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
         np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)).pixels, opened(encoded(FULL)).pixels)
 
-    def test_an_entity_bomb_does_not_go_off(self) -> None:
+    def test_entity_bomb_is_harmless(self) -> None:
         levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
         bomb = f'<!DOCTYPE x [<!ENTITY e0 "{"x" * 100}">{levels}]>'.encode() + xmp(PosePitchDegrees="&e9;")
         begin = time.perf_counter()
         assert read_photo_sphere(bomb, width=1024, height=512) == PhotoSphere()
         assert time.perf_counter() - begin < 1.0
 
-    def test_no_file_is_read_for_a_packet(self, tmp_path: Path) -> None:
+    def test_external_entities_are_not_loaded(self, tmp_path: Path) -> None:
         (tmp_path / "pitch").write_text("45", encoding="ascii")
         packet = f'<!DOCTYPE x [<!ENTITY e SYSTEM "{(tmp_path / "pitch").as_uri()}">]>'.encode()
         assert read_photo_sphere(packet + xmp(PosePitchDegrees="&e;"), width=1024, height=512) == PhotoSphere()
 
-    def test_deep_elements_are_no_trouble(self) -> None:
+    def test_deep_elements_are_read(self) -> None:
         deep = b"<a>" * 30_000 + b"</a>" * 30_000
         assert read_photo_sphere(deep, width=1024, height=512) == PhotoSphere()
 

@@ -1,4 +1,4 @@
-"""Openings, holes, free-standing walls, types and ids of a plan: what is accepted, where it lands, what is refused."""
+"""Openings, holes, free-standing walls, types and ids of a plan: placement and validation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import pose_grid, random_poses
 from tests.strategies import plan_document, rectangle, seeds
 
-# Two rooms of 4 x 3 m with a wall of 20 cm between them.
+# Two rooms of 4 x 3 m, separated by a wall of 20 cm.
 ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, at=(4.2, 0.0)))
 DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 1.9]]}
 
@@ -39,7 +39,7 @@ def refused(make: Any, *arguments: Any, **extra: Any) -> str:
     return str(caught.value)
 
 
-def test_one_entry_serves_both_rooms_of_a_wall() -> None:
+def test_opening_belongs_to_both_rooms_of_a_wall() -> None:
     plan = with_openings(DOOR)
     first, second = plan.opening_faces
     assert (first.room, first.behind, second.room, second.behind) == (0, 1, 1, 0)
@@ -50,23 +50,35 @@ def test_one_entry_serves_both_rooms_of_a_wall() -> None:
 
 
 @pytest.mark.parametrize("at", [4.0, 4.2, 3.9, 4.3])
-def test_an_opening_may_be_drawn_on_either_face_or_a_little_off(at: float) -> None:
+def test_opening_near_a_wall_is_placed_on_it(at: float) -> None:
     plan = with_openings(DOOR | {"line": [[at, 1.0], [at, 1.9]]})
     assert [face.room for face in plan.opening_faces] == [0, 1]
 
 
-def test_the_tolerance_is_the_plans() -> None:
+def test_surveyed_coordinates_do_not_move_openings() -> None:
+    polygons = [rectangle(4.0, 3.0, at=at) for at in ((500_000.0, 5_300_000.0), (500_004.2, 5_300_000.0))]
+    line = [[500_004.1, 5_300_001.0], [500_004.1, 5_300_001.9]]
+    far = FloorPlan.from_dict(plan_document(*polygons) | {"openings": [{"kind": "door", "line": line}]})
+    near = with_openings(DOOR)
+    assert [(face.room, face.wall, face.behind) for face in far.opening_faces] == [
+        (face.room, face.wall, face.behind) for face in near.opening_faces
+    ]
+    for far_face, near_face in zip(far.opening_faces, near.opening_faces, strict=True):
+        assert (far_face.start, far_face.end) == pytest.approx((near_face.start, near_face.end), abs=1e-8)
+
+
+def test_plan_sets_the_opening_tolerance() -> None:
     door = DOOR | {"line": [[4.0, 1.0], [4.0, 1.9]]}
     assert len(with_openings(door, opening_tolerance_m=0.1).opening_faces) == 1
     assert len(with_openings(door, opening_tolerance_m=0.2).opening_faces) == 2
 
 
-def test_an_opening_that_names_its_rooms_is_in_those_only() -> None:
+def test_opening_with_rooms_belongs_to_those_only() -> None:
     plan = with_openings(DOOR | {"rooms": ["room-2"]})
     assert [(face.room, face.behind) for face in plan.opening_faces] == [(1, -1)]
 
 
-def test_a_passage_to_two_rooms_has_each_behind_its_part() -> None:
+def test_passage_to_two_rooms_is_split() -> None:
     polygons = [rectangle(4.0, 3.0), rectangle(1.9, 2.0, at=(0.0, 3.1)), rectangle(2.0, 2.0, at=(2.0, 3.1))]
     document = plan_document(*polygons) | {"openings": [{"kind": "passage", "line": [[0.5, 3.05], [3.5, 3.05]]}]}
     plan = FloorPlan.from_dict(document)
@@ -74,14 +86,14 @@ def test_a_passage_to_two_rooms_has_each_behind_its_part() -> None:
     assert parts == [(1, 1.4), (-1, 0.1), (2, 1.5)]
 
 
-def test_of_two_walls_one_behind_the_other_the_nearer_has_the_opening() -> None:
+def test_nearer_wall_gets_the_opening() -> None:
     """A recess as deep as a wall is thick."""
     recessed = [[0, 0], [4, 0], [4, 3], [3, 3], [3, 3.2], [1, 3.2], [1, 3], [0, 3]]
     document = plan_document(recessed) | {"openings": [{"kind": "window", "line": [[1.2, 3.2], [2.8, 3.2]]}]}
     assert [face.wall for face in FloorPlan.from_dict(document).opening_faces] == [4]
 
 
-def test_openings_may_touch_but_not_overlap() -> None:
+def test_openings_can_touch_but_not_overlap() -> None:
     beside = {"kind": "window", "line": [[4.0, 1.9], [4.0, 2.5]]}
     assert len(with_openings(DOOR, beside).openings) == 2
     over = {"kind": "window", "line": [[4.0, 1.8], [4.0, 2.5]], "name": "hatch"}
@@ -94,13 +106,13 @@ def test_openings_above_each_other_do_not_overlap() -> None:
     assert "overlap" in refused(with_openings, DOOR | {"head_m": 2.2}, light)
 
 
-def test_an_opening_on_no_wall_is_a_warning_and_an_error_where_there_is_no_other() -> None:
+def test_opening_on_no_wall_warns_or_fails() -> None:
     astray = {"kind": "window", "line": [[2.0, 1.0], [2.0, 2.0]], "name": "skylight"}
     assert with_openings(DOOR, astray).warnings == ("opening 1 (window 'skylight') lies on no wall",)
     assert "no opening lies on a wall: none is within 0.35 m" in refused(with_openings, astray)
 
 
-def test_openings_across_a_wall_are_on_no_wall() -> None:
+def test_opening_across_a_wall_is_on_no_wall() -> None:
     assert "no opening lies on a wall" in refused(with_openings, {"kind": "door", "line": [[3.8, 1.0], [4.4, 1.0]]})
 
 
@@ -122,11 +134,11 @@ def test_openings_across_a_wall_are_on_no_wall() -> None:
         (DOOR | {"rooms": "room-1"}, "rooms must be a list, not a string"),
     ],
 )
-def test_a_bad_opening_is_refused_by_its_number(opening: Any, reason: str) -> None:
+def test_bad_opening_error_names_its_number(opening: Any, reason: str) -> None:
     assert reason in refused(with_openings, opening)
 
 
-def test_kinds_that_are_shown_completely_are_those_that_occur_unless_said() -> None:
+def test_opening_kinds_default_to_those_that_occur() -> None:
     assert with_openings(DOOR).opening_kinds == {"door"}
     assert with_openings(DOOR, opening_kinds=["door", "window"]).opening_kinds == {"door", "window"}
     assert FloorPlan.from_dict(ROOMS).opening_kinds == frozenset()
@@ -135,7 +147,7 @@ def test_kinds_that_are_shown_completely_are_those_that_occur_unless_said() -> N
 
 
 @pytest.mark.parametrize("value", [0.0, 2.0, "0.3", None])
-def test_a_tolerance_out_of_range_is_refused(value: Any) -> None:
+def test_tolerance_out_of_range_is_refused(value: Any) -> None:
     if value is None:
         assert with_openings(DOOR, opening_tolerance_m=None).opening_tolerance_m == 0.35
     else:
@@ -153,7 +165,7 @@ def test_too_many_openings_are_refused() -> None:
     assert "room 'room 1': 6 openings on its walls; the limit is 5" in message
 
 
-def test_a_line_along_a_comb_of_walls_is_refused_soon() -> None:
+def test_opening_along_many_walls_is_refused() -> None:
     teeth = [
         [x, y]
         for k in range(40)
@@ -164,7 +176,7 @@ def test_a_line_along_a_comb_of_walls_is_refused_soon() -> None:
     assert "walls; the limit is 32 (PlanLimits.max_walls_per_opening)" in refused(FloorPlan.from_dict, document)
 
 
-def test_holes_are_no_floor_and_their_edges_are_walls() -> None:
+def test_holes_are_not_floor_and_have_walls() -> None:
     room = with_room(holes=[rectangle(1.0, 1.0, at=(1.0, 1.0))]).rooms[0]
     assert room.area_m2 == pytest.approx(11.0)
     assert len(room.walls_m) == 8
@@ -192,7 +204,7 @@ def test_holes_are_no_floor_and_their_edges_are_walls() -> None:
         ({"id": 7}, "the id must be a non-empty string"),
     ],
 )
-def test_what_a_room_cannot_have_is_refused_by_its_name(extra: dict[str, Any], reason: str) -> None:
+def test_bad_room_part_error_names_the_room(extra: dict[str, Any], reason: str) -> None:
     message = refused(with_room, **extra)
     assert reason in message
     assert "room 'room 1'" in message
@@ -204,7 +216,7 @@ def test_edges_of_holes_and_walls_count_as_vertices() -> None:
     assert "9 vertices; the limit is 8" in refused(with_room, PlanLimits(max_vertices_per_room=8), **extra)
 
 
-def test_poses_keep_off_holes_and_free_standing_walls() -> None:
+def test_poses_keep_the_margin_to_holes_and_inner_walls() -> None:
     plan = with_room(holes=[rectangle(1.0, 1.0, at=(1.0, 1.0))], walls=[[[3.0, 0.0], [3.0, 3.0]]])
     for poses in (pose_grid(plan, 0.1), random_poses(plan, 500, np.random.default_rng(0))):
         x, y = poses.position_m.T
@@ -213,14 +225,14 @@ def test_poses_keep_off_holes_and_free_standing_walls() -> None:
         assert (x > 3.0).any()
 
 
-def test_a_room_that_is_nothing_but_stubs_still_has_a_pose_off_them() -> None:
+def test_room_full_of_inner_walls_has_a_pose() -> None:
     plan = with_room(walls=[[[0.2 * k, 0.0], [0.2 * k, 3.0]] for k in range(1, 20)])
     position = pose_grid(plan, 1.0).position_m
     assert len(position) == 1
     assert abs(position[0, 0] % 0.2 - 0.1) < 0.06
 
 
-def test_ids_are_made_from_names_and_never_twice() -> None:
+def test_ids_from_names_are_unique() -> None:
     names = ["Bed room", "bed room!", "Küche", "bed-room-2", "???"]
     document = plan_document(*[rectangle(1.0, 1.0, at=(2.0 * k, 0.0)) for k in range(5)])
     for room, name in zip(document["rooms"], names, strict=True):
@@ -232,7 +244,7 @@ def test_ids_are_made_from_names_and_never_twice() -> None:
     assert "2 rooms have the id 'bed-room'; ids must be unique" in refused(FloorPlan.from_dict, document)
 
 
-def test_every_type_is_read_and_written() -> None:
+def test_room_types_round_trip() -> None:
     for name in ROOM_TYPES:
         assert with_room(type=name).rooms[0].type == name
     assert "type" not in with_room().to_dict()["rooms"][0]
@@ -251,11 +263,11 @@ def test_every_type_is_read_and_written() -> None:
         ("", "unknown"),
     ],
 )
-def test_labels_of_drawings_have_types(label: str, kind: str) -> None:
+def test_room_type_from_label(label: str, kind: str) -> None:
     assert room_type_from_label(label) == kind
 
 
-def test_everything_survives_being_written_and_read() -> None:
+def test_all_plan_fields_round_trip() -> None:
     document = ROOMS | {"openings": [DOOR | {"name": "front", "sill_m": 0.0, "head_m": 2.0, "rooms": ["room-1"]}]}
     document["rooms"][0] |= {"type": "kitchen", "holes": [rectangle(0.5, 0.5, at=(1, 1))], "walls": [[[3, 0], [3, 1]]]}
     document |= {"camera_height_std_m": 0.05, "opening_kinds": ["window", "door"], "opening_tolerance_m": 0.25}
@@ -270,13 +282,13 @@ def test_everything_survives_being_written_and_read() -> None:
 
 
 @pytest.mark.parametrize("value", [-0.1, 2.5, "0.1", True])
-def test_a_camera_height_that_is_off_by_no_length_is_refused(value: Any) -> None:
+def test_bad_camera_height_std_is_refused(value: Any) -> None:
     assert "camera_height_std_m" in refused(with_openings, DOOR, camera_height_std_m=value)
 
 
 @settings(max_examples=10, deadline=None)
 @given(seeds())
-def test_the_plan_of_a_synthetic_home_has_its_openings(seed: int) -> None:
+def test_synthetic_home_plan_has_its_openings(seed: int) -> None:
     home = generate_home(np.random.default_rng(seed))
     plan, kinds = home.plan, {"door_open": 1, "door_shut": 1, "window": 2, "opening": 3}
     faces = [(f.room, f.wall, f.behind, plan.openings[f.opening].code) for f in plan.opening_faces]
@@ -287,7 +299,7 @@ def test_the_plan_of_a_synthetic_home_has_its_openings(seed: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_the_plan_of_an_unfamiliar_home_has_its_openings(index: int) -> None:
+def test_heldout_home_plan_has_its_openings(index: int) -> None:
     home = home_of(HomeKey(0, 3, index))
     plan = home.plan.plan
     expected = [(o.wall.room, o.wall.edge, o.behind.room if o.behind else -1) for o in home.openings]
@@ -298,16 +310,16 @@ def test_the_plan_of_an_unfamiliar_home_has_its_openings(index: int) -> None:
 
 
 class TestJson:
-    def test_a_key_that_stands_twice_is_refused(self) -> None:
+    def test_repeated_key_is_refused(self) -> None:
         text = json.dumps(ROOMS)[:-1] + ', "name": "other"}'
         assert "the key 'name' occurs twice" in refused(FloorPlan.from_json, text)
 
-    def test_a_number_of_thousands_of_digits_is_refused_in_plain_words(self) -> None:
+    def test_number_with_thousands_of_digits_is_refused(self) -> None:
         message = refused(FloorPlan.from_json, '{"ceiling_height_m": ' + "9" * 5000 + "}")
         assert message == "a number has 5000 digits; the limit is 1000"
 
     @pytest.mark.parametrize("pattern", ['"' + '\\"' * 100_000, '"' * 200_001, '"' + '\\"' * 100_000 + "\\"])
-    def test_strings_without_an_end_take_time_that_grows_with_the_text(self, pattern: str) -> None:
+    def test_unterminated_strings_take_linear_time(self, pattern: str) -> None:
         def seconds(text: str) -> float:
             spent = []
             for _ in range(5):
@@ -319,12 +331,12 @@ class TestJson:
         half, whole = seconds(pattern[: len(pattern) // 2]), seconds(pattern)
         assert whole < 3.0 * half + 0.01
 
-    def test_coordinates_too_far_out_are_refused(self) -> None:
+    def test_coordinates_beyond_the_limit_are_refused(self) -> None:
         far = plan_document(rectangle(4.0, 3.0, at=(1e8, 0.0)))
         assert "at most 10000000 m from the origin (PlanLimits.max_coordinate_m)" in refused(FloorPlan.from_dict, far)
 
     @pytest.mark.parametrize(
         ("value", "word"), [([], "a list"), ("x", "a string"), (None, "null"), (True, "true"), (1, "a number")]
     )
-    def test_messages_speak_json(self, value: Any, word: str) -> None:
+    def test_messages_use_json_types(self, value: Any, word: str) -> None:
         assert f"a plan must be an object, not {word}" in refused(FloorPlan.from_dict, value)

@@ -1,4 +1,4 @@
-"""Work that plans may ask for: bounded, and growing with the plan."""
+"""Bounded work for validation and pose grids of adversarial plans."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.strategies import plan_document, rectangle
 
 
 def comb(corners: int, *, upright: bool, shift_m: float) -> list[list[float]]:
-    """A comb of 20 m with thin teeth; two of them, one turned, cross at every pair of teeth."""
+    """Return a comb of 20 m with thin teeth; two combs, one rotated, cross at every pair of teeth."""
     teeth = corners // 4 - 1
     step = 20.0 / teeth
     spine = [[-1.0, 0.0], [-1.0, 21.0]]
@@ -37,31 +37,31 @@ def crossing_combs(rooms: int, corners: int = 200) -> dict[str, Any]:
 
 
 def slivers(count: int) -> dict[str, Any]:
-    """Diagonal rooms of 5 cm across a square of 200 m."""
+    """Return diagonal rooms of 5 cm across a square of 200 m."""
     return plan_document(*[[[k, 0], [k + 200, 200], [k + 200.05, 200], [k + 0.05, 0]] for k in range(count)])
 
 
-def test_combs_that_cross_cost_no_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Intersections are asked of pairs until the walls that may cross are used up, however many rooms there are."""
-    asked = []
+def test_crossing_combs_stay_within_the_work_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The total size of intersected pairs is limited, independent of the number of rooms."""
+    intersected = []
     intersection = shapely.intersection
 
     def counted(first: shapely.Polygon, second: shapely.Polygon) -> shapely.Geometry:
-        asked.append(len(first.exterior.coords) * len(second.exterior.coords))
+        intersected.append(len(first.exterior.coords) * len(second.exterior.coords))
         return intersection(first, second)
 
     monkeypatch.setattr(checks.shapely, "intersection", counted)
     monkeypatch.setattr(checks, "_MAX_OVERLAPS", 10**6)
     spent = []
     for rooms in (8, 16):
-        asked.clear()
+        intersected.clear()
         plan = FloorPlan.from_dict(crossing_combs(rooms))
         assert plan.warnings[-1] == "more rooms may overlap; the remaining pairs were not checked"
-        spent.append(sum(asked))
+        spent.append(sum(intersected))
     assert 0 < spent[1] <= 1.5 * spent[0]
 
 
-def test_simple_rooms_are_looked_at_beside_combs_that_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simple_rooms_are_checked_beside_combs(monkeypatch: pytest.MonkeyPatch) -> None:
     document = crossing_combs(12)
     document["rooms"] += plan_document(rectangle(2.0, 2.0, at=(50.0, 0.0)), rectangle(2.0, 2.0, at=(51.0, 0.0)))[
         "rooms"
@@ -71,7 +71,7 @@ def test_simple_rooms_are_looked_at_beside_combs_that_are_not(monkeypatch: pytes
     assert "rooms 'left' and 'right' overlap by 2.00 m²" in FloorPlan.from_dict(document).warnings
 
 
-def test_a_stored_plan_is_read_without_looking_for_overlaps_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_plan_skips_the_overlap_search(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = FloorPlan.from_dict(plan_document(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(2.0, 0.0))))
     text = json.dumps(plan.to_dict())
     assert FloorPlan.from_stored(text, None).warnings == plan.warnings
@@ -85,7 +85,7 @@ def test_a_stored_plan_is_read_without_looking_for_overlaps_again(monkeypatch: p
     assert again.to_dict() == plan.to_dict()
 
 
-def test_limits_of_today_do_not_hold_for_stored_plans() -> None:
+def test_stored_plan_ignores_limits() -> None:
     far = plan_document(rectangle(4.0, 3.0, at=(1e8, 0.0)))
     with pytest.raises(InvalidFloorPlanError):
         FloorPlan.from_dict(far)
@@ -94,7 +94,7 @@ def test_limits_of_today_do_not_hold_for_stored_plans() -> None:
     assert FloorPlan.from_stored(json.dumps(low), []).camera_height_m == 0.05
 
 
-def test_boxes_around_rooms_are_limited() -> None:
+def test_bounding_box_area_is_limited() -> None:
     message = "the bounding boxes of all rooms cover 120030 m²; the limit is 100000 m² (LALALOC_MAX_BOUNDS_AREA_M2)"
     with pytest.raises(InvalidFloorPlanError) as caught:
         FloorPlan.from_dict(slivers(3), PlanLimits(max_bounds_area_m2=100_000.0))
@@ -102,12 +102,12 @@ def test_boxes_around_rooms_are_limited() -> None:
     FloorPlan.from_dict(slivers(2), PlanLimits(max_bounds_area_m2=100_000.0))
 
 
-def test_a_grid_in_slivers_takes_time_by_their_boxes_and_memory_by_none() -> None:
+def test_grid_in_slivers_needs_bounded_memory() -> None:
     plans = {count: FloorPlan.from_dict(slivers(count)) for count in (4, 8)}
     assert_no_worse_than_linear(lambda count: lambda: pose_grid(plans[count], 0.5), 4)
 
 
-def test_a_lattice_looked_at_in_pieces_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lattice_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = FloorPlan.from_dict(plan_document(rectangle(7.3, 5.1), [[10, 0], [19, 2], [15, 9]]))
     whole = pose_grid(plan, 0.1)
     monkeypatch.setattr("lalaloc_core.render.sampling._LATTICE_POINTS", 17)
@@ -123,7 +123,7 @@ def spiral(corners: int) -> list[list[float]]:
 
 
 @pytest.mark.parametrize("shape", [spiral, lambda corners: comb(corners, upright=True, shift_m=0.0)])
-def test_checking_one_room_grows_with_its_corners(shape: Any) -> None:
+def test_room_validation_takes_linear_time(shape: Any) -> None:
     def work_of(corners: int) -> Any:
         document = plan_document(shape(corners))
         return lambda: FloorPlan.from_dict(document, PlanLimits(max_vertices_per_room=10_000))
@@ -139,10 +139,11 @@ def test_coordinates_are_exact_up_to_the_limit() -> None:
 
 
 @pytest.mark.parametrize("offset_m", [1e5, -9.9e6])
-def test_single_precision_is_enough_however_far_out_a_plan_lies(offset_m: float) -> None:
-    plans = [FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0, at=(at, at)))) for at in (0.0, offset_m)]
+def test_far_plans_keep_precision_in_single(offset_m: float) -> None:
+    offsets_m = (0.0, offset_m)
+    plans = [FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0, at=(x, x)))) for x in offsets_m]
     near, far = (
-        profiles_at(plan, np.array([[at + 1.3, at + 1.1]]), np.array([0]), np.zeros(1), 32, np.float32)
-        for plan, at in zip(plans, (0.0, offset_m), strict=True)
+        profiles_at(plan, np.array([[x + 1.3, x + 1.1]]), np.array([0]), np.zeros(1), 32, np.float32)
+        for plan, x in zip(plans, offsets_m, strict=True)
     )
     np.testing.assert_allclose(far, near, atol=1e-5)

@@ -1,4 +1,4 @@
-"""The closed-form renderer against its slow oracle, its gradients against differences, and the pixel contract."""
+"""The renderer against the reference ray tracer, its gradients against differences, and the pixel conventions."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ def profile_of(scene: Scene, columns: int = COLUMNS) -> np.ndarray:
 
 
 def nearest_wall(position_m: np.ndarray, heading: np.ndarray, walls_m: np.ndarray) -> np.ndarray:
-    """Index of the wall that each column's ray hits, by casting against one wall at a time."""
+    """Return the index of the wall that each column's ray hits, by casting against one wall at a time."""
     alone = [wall_profile(position_m, heading, walls_m[:, k : k + 1], COLUMNS) for k in range(walls_m.shape[1])]
     return np.argmin(np.stack(alone), axis=0)
 
 
 class TestOracle:
     @given(scenes(count=1))
-    def test_layout_depth_is_what_ray_casting_on_the_extruded_mesh_gives(self, scene: Scene) -> None:
+    def test_layout_depth_matches_mesh_ray_casting(self, scene: Scene) -> None:
         rows = 24
         profile = profile_of(scene)
         depth = layout_depth(profile, np.full(1, CAMERA_M), scene.ceiling_height_m, rows)[0]
         position, heading = scene.poses.position_m[0], float(scene.heading[0])
         oracle = reference_depth(scene.plan.rooms[0], position, heading, CAMERA_M, rows, COLUMNS)
-        # Beside a corner that hides something, a ray's wall is decided by the last bit; such columns prove nothing.
+        # Next to an occluding corner rounding decides which wall a ray hits; such columns are skipped.
         before, after = (
             wall_profile(scene.poses.position_m, scene.heading + shift, scene.walls_m, COLUMNS)[0]
             for shift in (-1e-4, 1e-4)
@@ -60,7 +60,7 @@ class TestOracle:
         np.testing.assert_allclose(depth[checked], oracle[checked], rtol=2e-3, atol=2e-3)
 
     @given(plans())
-    def test_the_mesh_holds_the_volume_of_the_rooms(self, plan: FloorPlan) -> None:
+    def test_mesh_volume_matches_the_rooms(self, plan: FloorPlan) -> None:
         for room in plan.rooms:
             mesh = room_mesh(room)
             assert mesh.is_watertight
@@ -70,7 +70,7 @@ class TestOracle:
 
 class TestTorch:
     @given(scenes())
-    def test_numpy_and_torch_give_the_same_numbers(self, scene: Scene) -> None:
+    def test_numpy_and_torch_agree(self, scene: Scene) -> None:
         profile = profile_of(scene)
         heights = (np.full(len(profile), CAMERA_M), scene.ceiling_height_m)
         position, heading, walls = map(torch.tensor, (scene.poses.position_m, scene.heading, scene.walls_m))
@@ -92,7 +92,7 @@ class TestTorch:
         assert layout_depth(profile, heights, 2.0 * heights, 4).dtype == dtype
 
     @given(scenes(count=1))
-    def test_gradients_in_position_and_heading_are_the_differences(self, scene: Scene) -> None:
+    def test_gradients_match_differences(self, scene: Scene) -> None:
         step = 1e-6
         pose = np.array([[*scene.poses.position_m[0], scene.heading[0]]])
         walls = torch.tensor(scene.walls_m)
@@ -108,7 +108,7 @@ class TestTorch:
             forward = torch.func.jvp(render, (at,), (tangent,))[1]
             shifted = [pose + sign * step * tangent.numpy() for sign in (-1.0, 1.0)]
             walls_hit = [nearest_wall(p[:, :2], p[:, 2], scene.walls_m)[0] for p in (pose, *shifted)]
-            # Only where the same wall is hit on both sides is there a derivative.
+            # The derivative exists only where the same wall is hit on both sides.
             smooth = (walls_hit[0] == walls_hit[1]) & (walls_hit[0] == walls_hit[2])
             assert smooth.mean() > 0.9
             low, high = (render(torch.tensor(p)).numpy() for p in shifted)
@@ -117,8 +117,8 @@ class TestTorch:
             np.testing.assert_allclose(backward[smooth, unknown], difference[smooth], rtol=1e-4, atol=1e-4)
 
     @given(scenes())
-    def test_gradients_are_finite_even_along_walls(self, scene: Scene) -> None:
-        # Rays parallel to a wall divide by zero in the branch that is not taken.
+    def test_gradients_along_walls_are_finite(self, scene: Scene) -> None:
+        # Rays parallel to a wall divide by zero in the unused branch.
         room = scene.plan.rooms[0]
         edge = room.polygon_m[1] - room.polygon_m[0]
         heading = torch.full((len(scene.heading),), math.atan2(edge[0], edge[1]) - float(column_azimuths(COLUMNS)[5]))
@@ -128,7 +128,7 @@ class TestTorch:
         assert position.grad is not None
         assert bool(torch.isfinite(position.grad).all())
 
-    def test_layout_depth_differentiates_through_walls_only(self) -> None:
+    def test_layout_depth_gradient_is_through_walls_only(self) -> None:
         profile = torch.full((1, 4), 2.0, dtype=torch.float64, requires_grad=True)
         depth = layout_depth(profile, torch.tensor([1.5]).double(), torch.tensor([2.5]).double(), 8)
         (gradient,) = torch.autograd.grad(depth.sum(), profile)
@@ -147,33 +147,33 @@ class TestPixelContract:
     def profile(self, heading: float, columns: int) -> np.ndarray:
         return wall_profile(self.position, np.array([heading]), self.plan.walls_m[:1], columns)[0]
 
-    def test_at_heading_zero_the_centre_looks_up_the_plan_and_the_right_half_clockwise(self) -> None:
+    def test_heading_zero_looks_along_plus_y(self) -> None:
         profile = self.profile(0.0, 1024)
         half_pixel = math.cos(math.pi / 1024)
         for column, distance in ((512, self.ahead), (768, self.right), (0, self.behind), (256, self.left)):
             assert profile[column] == pytest.approx(distance / half_pixel, rel=1e-9)
-            # The contract is symmetric: the axis lies between two pixels.
+            # The axis lies between two pixels.
             assert profile[column - 1] == pytest.approx(distance / half_pixel, rel=1e-9)
 
-    def test_heading_east_puts_the_east_wall_in_the_centre(self) -> None:
+    def test_heading_east_centres_the_east_wall(self) -> None:
         profile = self.profile(math.pi / 2, 1024)
         assert profile[512] == pytest.approx(self.right, rel=1e-4)
         assert profile[256] == pytest.approx(self.ahead, rel=1e-4)
 
     @given(scenes(), st.integers(-COLUMNS, COLUMNS))
-    def test_turning_by_whole_columns_rolls_the_profile_to_the_left(self, scene: Scene, columns: int) -> None:
+    def test_turning_rolls_the_profile_left(self, scene: Scene, columns: int) -> None:
         turned = wall_profile(
             scene.poses.position_m, scene.heading + columns * TWO_PI / COLUMNS, scene.walls_m, COLUMNS
         )
         rolled = np.roll(profile_of(scene), -columns, axis=1)
-        # Rounding may decide differently at the very edge of what a corner hides.
+        # Rounding decides at the edge of an occluding corner.
         assert np.isclose(turned, rolled, rtol=1e-6).mean() > 0.98
 
-    def test_columns_and_rows_are_at_pixel_centres(self) -> None:
+    def test_columns_and_rows_are_pixel_centres(self) -> None:
         np.testing.assert_allclose(np.degrees(column_azimuths(4)), [-135.0, -45.0, 45.0, 135.0])
         np.testing.assert_allclose(np.degrees(row_elevations(2)), [45.0, -45.0])
 
-    def test_top_rows_see_the_ceiling_and_bottom_rows_the_floor(self) -> None:
+    def test_top_is_ceiling_and_bottom_is_floor(self) -> None:
         rows = 64
         depth = layout_depth(self.profile(0.0, 16)[None], np.array([1.5]), np.array([2.6]), rows)[0]
         elevation = row_elevations(rows)
@@ -192,7 +192,7 @@ class TestProperties:
         np.testing.assert_array_equal(again, profile_of(scene))
 
     @given(scenes())
-    def test_a_batch_is_its_poses_one_by_one(self, scene: Scene) -> None:
+    def test_batch_equals_single_poses(self, scene: Scene) -> None:
         alone = [
             wall_profile(scene.poses.position_m[k : k + 1], scene.heading[k : k + 1], scene.walls_m[k : k + 1], COLUMNS)
             for k in range(len(scene.heading))
@@ -200,9 +200,9 @@ class TestProperties:
         np.testing.assert_array_equal(np.concatenate(alone), profile_of(scene))
 
     @given(scenes(), st.sampled_from([np.float32, np.float64]))
-    def test_every_ray_inside_a_room_hits_even_when_aimed_at_a_corner(self, scene: Scene, dtype: type) -> None:
+    def test_rays_at_corners_hit_a_wall(self, scene: Scene, dtype: type) -> None:
         room = scene.plan.rooms[0]
-        # Relative to the camera, as single precision is used in this project.
+        # Relative to the camera, as this project uses single precision.
         offset = room.polygon_m[None] - scene.poses.position_m[:, None]
         walls = np.concatenate([offset, np.roll(offset, -1, axis=1)], axis=2)
         azimuth = np.concatenate(
@@ -213,7 +213,7 @@ class TestProperties:
         assert (distance > 0.0).all()
 
     @given(scenes())
-    def test_a_profile_is_the_distance_to_the_polygon(self, scene: Scene) -> None:
+    def test_profile_is_the_distance_to_the_polygon(self, scene: Scene) -> None:
         profile = profile_of(scene)
         azimuth = scene.heading[:, None] + column_azimuths(COLUMNS)[None]
         ends = scene.poses.position_m[:, None] + profile[..., None] * np.stack(
@@ -221,7 +221,7 @@ class TestProperties:
         )
         outline = scene.plan.rooms[0].shape.exterior
         assert shapely.distance(outline, shapely.points(ends)).max() < 1e-6
-        # And nothing nearer is skipped: what lies before the wall is inside the room.
+        # Points before the wall are inside the room, so no nearer wall is missed.
         before = scene.poses.position_m[:, None] + 0.999 * (ends - scene.poses.position_m[:, None])
         room = shapely.buffer(scene.plan.rooms[0].shape, 1e-3)
         rays = shapely.linestrings(np.stack([np.broadcast_to(scene.poses.position_m[:, None], ends.shape), before], 2))
@@ -229,7 +229,7 @@ class TestProperties:
 
     @given(scenes())
     @settings(max_examples=25)
-    def test_rays_outside_that_miss_are_infinite_and_never_nan(self, scene: Scene) -> None:
+    def test_missing_rays_are_infinite_not_nan(self, scene: Scene) -> None:
         outside = scene.poses.position_m + 1000.0
         profile = wall_profile(outside, scene.heading, scene.walls_m, COLUMNS)
         assert np.isinf(profile).any()
@@ -243,7 +243,7 @@ class TestProperties:
         assert cloud.shape == (len(depth), rows * COLUMNS, 3)
         np.testing.assert_allclose(np.linalg.norm(cloud, axis=-1), depth.reshape(len(depth), -1), rtol=1e-9)
         for k, points in enumerate(cloud):
-            # From the camera's frame to the plan's: y forward is along the heading, x right is a quarter clockwise.
+            # From the camera frame to the plan frame: y is along the heading, x a quarter turn clockwise.
             heading = scene.heading[k]
             x = points[:, 0] * math.cos(heading) + points[:, 1] * math.sin(heading)
             y = -points[:, 0] * math.sin(heading) + points[:, 1] * math.cos(heading)
@@ -254,14 +254,14 @@ class TestProperties:
             assert np.minimum(np.minimum(to_wall, to_floor), to_ceiling).max() < 1e-6
 
     @given(st.floats(-50.0, 50.0))
-    def test_wrapped_angles_lie_in_half_a_turn_and_mean_the_same(self, angle: float) -> None:
+    def test_wrapped_angles_are_equivalent(self, angle: float) -> None:
         wrapped = wrap_angle(angle)
         assert -math.pi <= wrapped <= math.pi
         assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-9)
         assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-9)
 
     @given(st.floats(-1000.0, 1000.0))
-    def test_degrees_survive_the_way_to_radians_and_back(self, degrees: float) -> None:
+    def test_degrees_round_trip_through_radians(self, degrees: float) -> None:
         back = heading_to_degrees(heading_from_degrees(degrees))
         assert 0.0 <= back < 360.0
         assert abs((back - degrees + 180.0) % 360.0 - 180.0) < 1e-9

@@ -1,4 +1,4 @@
-"""Camera poses: the grid, random poses and training triplets."""
+"""Camera poses: the pose grid, random poses and training triplets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BIG = plan_of(rectangle(8.0, 6.0), rectangle(6.0, 6.0, at=(8.2, 0.0)))
 
 
 def wall_distance(plan: FloorPlan, poses: PoseSet) -> np.ndarray:
-    """Distance of each pose to the walls of its room, negative where it lies outside."""
+    """Return the distance of each pose to the walls of its room, negative outside."""
     rooms = np.array([room.shape for room in plan.rooms], dtype=object)[poses.room_index]
     points = shapely.points(poses.position_m)
     sign = np.where(shapely.contains(rooms, points), 1.0, -1.0)
@@ -35,13 +35,13 @@ def wall_distance(plan: FloorPlan, poses: PoseSet) -> np.ndarray:
 
 class TestGrid:
     @given(plans(), st.floats(0.2, 1.5))
-    def test_every_pose_is_in_its_room_and_no_room_is_missing(self, plan: FloorPlan, step_m: float) -> None:
+    def test_grid_covers_every_room(self, plan: FloorPlan, step_m: float) -> None:
         poses = pose_grid(plan, step_m)
         assert (wall_distance(plan, poses) > 0.0).all()
         assert set(poses.room_index) == set(range(len(plan.rooms)))
 
     @given(room_polygons(offset_m=3.0), st.sampled_from([0.25, 0.5, 1.0]))
-    def test_the_grid_is_all_lattice_points_that_keep_the_margin(self, polygon: list, step_m: float) -> None:
+    def test_grid_is_the_lattice_within_the_margin(self, polygon: list, step_m: float) -> None:
         plan = plan_of(polygon)
         room = plan.rooms[0].shape
         index = np.arange(-60, 61)
@@ -50,7 +50,7 @@ class TestGrid:
         clearance = np.where(shapely.contains(room, points), shapely.distance(room.exterior, points), 0.0)
         poses = pose_grid(plan, step_m).position_m
         found = {tuple(pair) for pair in np.round(poses / step_m).astype(int)}
-        # The eroded room has rounded corners of finitely many segments: points at the very margin go either way.
+        # The eroded room's rounded corners have finitely many segments, so points at the margin are ambiguous.
         must = {tuple(pair) for pair in lattice[clearance > 1.02 * WALL_MARGIN_M]}
         may = {tuple(pair) for pair in lattice[clearance >= 0.999 * WALL_MARGIN_M]}
         if must:
@@ -59,33 +59,33 @@ class TestGrid:
         assert len(found) == len(poses)
 
     @pytest.mark.parametrize("polygon", [rectangle(0.5, 0.5, at=(0.1, 0.1)), rectangle(0.25, 8.0, at=(0.1, 0.1))])
-    def test_a_room_without_lattice_points_gets_one_pose_well_inside(self, polygon: list) -> None:
+    def test_tiny_room_gets_one_interior_pose(self, polygon: list) -> None:
         plan = plan_of(rectangle(3.0, 3.0, at=(10.0, 0.0)), polygon)
         poses = pose_grid(plan, 1.0)
         assert (poses.room_index == 1).sum() == 1
         assert wall_distance(plan, poses)[poses.room_index == 1] >= 0.1
 
-    def test_neighbouring_rooms_share_one_lattice(self) -> None:
+    def test_neighbouring_rooms_share_a_lattice(self) -> None:
         together = pose_grid(plan_of(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(3.1, 0.0))), 0.5).position_m
         np.testing.assert_allclose(together / 0.5, np.round(together / 0.5))
 
     @pytest.mark.parametrize("step_m", [0.0, -0.5, float("nan")])
-    def test_a_step_that_is_not_positive_is_refused(self, step_m: float) -> None:
+    def test_non_positive_step_is_refused(self, step_m: float) -> None:
         with pytest.raises(InvalidInputError, match="positive"):
             pose_grid(BIG, step_m)
 
     @given(plans())
-    def test_the_size_estimate_is_of_the_right_order(self, plan: FloorPlan) -> None:
+    def test_size_estimate_has_the_right_order(self, plan: FloorPlan) -> None:
         exact = len(pose_grid(plan, 0.5))
         assert exact / 2 <= grid_size(plan, 0.5) <= 4 * exact + 20
 
 
 class TestRandomPoses:
     @given(plans(), seeds(), st.integers(0, 40))
-    def test_poses_keep_the_margin_to_the_walls_of_their_room(self, plan: FloorPlan, seed: int, count: int) -> None:
+    def test_poses_keep_the_margin_to_walls(self, plan: FloorPlan, seed: int, count: int) -> None:
         poses = random_poses(plan, count, np.random.default_rng(seed), 0.15)
         assert len(poses) == len(poses.room_index) == count
-        # shapely rounds the corners of the eroded room with segments.
+        # Shapely approximates the rounded corners of the eroded room by segments.
         assert (wall_distance(plan, poses) > 0.98 * 0.15).all()
 
     @given(plans(), seeds())
@@ -105,14 +105,14 @@ class TestRandomPoses:
         counts = np.bincount(2 * cell + quarter, minlength=6)
         # Six equal cells; 4.5 standard deviations.
         np.testing.assert_allclose(counts, count / 6, atol=4.5 * np.sqrt(count / 6))
-        # In random order: a prefix is a sample of its own.
+        # The order is random: a prefix is a sample.
         assert 0.2 < (poses.room_index[:300] == 1).mean() < 0.47
 
-    def test_a_room_too_narrow_for_the_margin_gets_no_poses(self) -> None:
+    def test_room_narrower_than_the_margin_has_no_poses(self) -> None:
         plan = plan_of(rectangle(3.0, 3.0), rectangle(0.25, 3.0, at=(4.0, 0.0)))
         assert set(random_poses(plan, 200, np.random.default_rng(0), 0.15).room_index) == {0}
 
-    def test_a_plan_too_narrow_for_the_margin_is_refused(self) -> None:
+    def test_plan_narrower_than_the_margin_is_refused(self) -> None:
         with pytest.raises(InvalidInputError, match=r"0\.15 m"):
             random_poses(plan_of(rectangle(0.25, 3.0)), 5, np.random.default_rng(0), 0.15)
 
@@ -135,7 +135,7 @@ class TestTriplets:
             assert len(set(row)) == len(row), "a neighbour was drawn twice"
 
     @given(seeds())
-    def test_every_pose_lies_in_the_room_it_names(self, seed: int) -> None:
+    def test_poses_are_in_their_rooms(self, seed: int) -> None:
         plan = crooked_flat()
         drawn = sample_triplets(plan, 3, TripletSampling(positives=6, negatives=4), np.random.default_rng(seed))
         assert drawn is not None
@@ -148,15 +148,13 @@ class TestTriplets:
         np.testing.assert_array_equal(first[0].position_m, second[0].position_m)
         np.testing.assert_array_equal(first[1], second[1])
 
-    def test_a_plan_too_small_for_negatives_gives_none_rather_than_false_negatives(self) -> None:
+    def test_plan_too_small_for_negatives_gives_none(self) -> None:
         assert sample_triplets(plan_of(rectangle(1.5, 1.2)), 1, TripletSampling(), np.random.default_rng(0)) is None
 
 
 class TestNeighbours:
     @given(seeds(), st.integers(0, 6), st.integers(1, 20))
-    def test_positives_are_near_and_negatives_far_from_a_given_pose(
-        self, seed: int, positives: int, negatives: int
-    ) -> None:
+    def test_neighbours_of_a_pose_are_near_or_far(self, seed: int, positives: int, negatives: int) -> None:
         rng = np.random.default_rng(seed)
         sampling = TripletSampling(positives=positives, negatives=negatives)
         anchor = random_poses(BIG, 1, rng)
@@ -175,25 +173,25 @@ class TestNeighbours:
         assert second is not None
         np.testing.assert_array_equal(first.position_m, second.position_m)
 
-    def test_a_plan_without_a_far_place_gives_none(self) -> None:
+    def test_plan_without_far_poses_gives_none(self) -> None:
         plan = plan_of(rectangle(1.5, 1.2))
         anchor = random_poses(plan, 1, np.random.default_rng(0))
         assert sample_neighbours(plan, anchor, TripletSampling(), np.random.default_rng(0)) is None
 
     @given(seeds())
-    def test_rooms_too_low_for_the_camera_are_left_out(self, seed: int) -> None:
+    def test_low_rooms_are_excluded(self, seed: int) -> None:
         plan = plan_of(rectangle(3.0, 3.0), rectangle(6.0, 6.0, at=(3.1, 0.0)), rectangle(6.0, 6.0, at=(3.1, 6.1)))
         document = plan.to_dict()
         document["rooms"][1]["ceiling_height_m"] = 2.0
         plan, rng = FloorPlan.from_dict(document), np.random.default_rng(seed)
-        # The anchor stands at the wall to the low room, so that positives are drawn there as well.
+        # The anchor is at the wall to the low room, so positives are drawn there as well.
         anchor = PoseSet(np.array([[2.9, 1.0]]), np.array([0]))
         poses = sample_neighbours(plan, anchor, TripletSampling(positives=8, negatives=4), rng, lowest_ceiling_m=2.2)
         assert poses is not None
         assert set(poses.room_index[:8]) == {0}
         assert set(poses.room_index[8:]) <= {0, 2}
 
-    def test_a_pose_that_a_low_room_covers_is_its_own_neighbour(self) -> None:
+    def test_pose_in_a_low_room_is_its_own_neighbour(self) -> None:
         document = plan_document(rectangle(8.0, 8.0), rectangle(8.0, 8.0, at=(0.5, 0.0)))
         document["rooms"][0]["ceiling_height_m"] = 2.0
         plan = FloorPlan.from_dict(document)

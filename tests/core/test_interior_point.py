@@ -1,4 +1,4 @@
-"""A place well inside a room: inside, nearly as far from the walls as can be, and found in bounded time."""
+"""The interior point of a room: position, distance from walls, and bounded time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.strategies import plan_of, plans, rectangle, spiral
 
 @settings(max_examples=40, deadline=None)
 @given(plans())
-def test_it_is_inside_and_about_as_far_from_the_walls_as_can_be(plan: FloorPlan) -> None:
+def test_interior_point_is_far_from_walls(plan: FloorPlan) -> None:
     for room in plan.rooms:
         (x, y), distance_m = interior_point(room.shape)
         assert room.shape.buffer(1e-9).contains(shapely.Point(x, y))
@@ -24,19 +24,19 @@ def test_it_is_inside_and_about_as_far_from_the_walls_as_can_be(plan: FloorPlan)
         assert distance_m > 0.9 * shapely.maximum_inscribed_circle(room.shape, 0.01).length
 
 
-def test_of_a_square_it_is_the_middle() -> None:
+def test_interior_point_of_a_square_is_its_centre() -> None:
     (x, y), distance_m = interior_point(shapely.Polygon(rectangle(4.0, 4.0)))
     assert (x, y, distance_m) == pytest.approx((2.0, 2.0, 2.0), abs=0.01)
 
 
-def test_a_floor_thinner_than_any_lattice_has_one_too() -> None:
+def test_thin_floor_has_an_interior_point() -> None:
     sliver = shapely.Polygon([(0.0, 0.0), (0.008, 0.0), (265.0, 290.0), (264.992, 290.0)])
     (x, y), distance_m = interior_point(sliver)
     assert sliver.contains(shapely.Point(x, y))
     assert 0.0 < distance_m < 0.004
 
 
-def test_the_time_for_it_grows_with_the_corners_of_a_room_and_no_faster() -> None:
+def test_interior_point_takes_linear_time() -> None:
     def find(corners: int) -> Callable[[], object]:
         room = plan_of(spiral(corners)).rooms[0]
         return lambda: interior_point(room.shape)
