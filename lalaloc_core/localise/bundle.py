@@ -22,9 +22,9 @@ from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.files import atomic_write
 
 MANIFEST_NAME = "manifest.json"
-# The model card, which is no part of the model: it may be corrected without making it another one.
+# The model card, which can be corrected without changing the model's digest.
 CARD_NAME = "README.md"
-# Of the model that ships: in a checkout, and where a wheel puts it.
+# Folder of the model that ships: in a checkout, and in an installation.
 _CHECKOUT = Path("models/default")
 _INSTALLED = Path("share/lalaloc/models/default")
 FORMAT_VERSION = 2
@@ -42,11 +42,10 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 
 @dataclass(frozen=True, kw_only=True)
 class LogisticModel:
-    """Probability that a picture fits its plan by the signals of `localise.confidence`.
+    """Probability that a picture fits its plan, a logistic function of the signals of `localise.confidence`.
 
-    What a model was not fitted with it leaves at 0: in models of earlier versions `answer_to_chance`, and
-    `cost_to_chance` before there was a cohort; in those that are fitted now `cost_to_chance`, in whose place
-    `answer_to_chance` came, and `log_odds`, which stood for the posterior before there was one.
+    Weights of signals that a model was not fitted with are 0: `answer_to_chance` and, without a cohort,
+    `cost_to_chance` in models of earlier versions; `cost_to_chance` and `log_odds` in models that are fitted now.
     """
 
     bias: float
@@ -67,7 +66,7 @@ class LogisticModel:
         cost_to_chance: float = 0.0,
         answer_to_chance: float = 0.0,
     ) -> float:
-        """Confidence of an answer with these signals."""
+        """Return the probability for some signals."""
         logit = self.bias + self.log_odds * log_odds + self.cost * cost
         logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
         logit += self.cost_to_chance * cost_to_chance + self.answer_to_chance * answer_to_chance
@@ -76,11 +75,11 @@ class LogisticModel:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingWeights:
-    """How much each term of the evidence may count, fitted on validation queries; see `localise.matching_cost`.
+    """Weights of the terms of the matching cost, fitted on validation queries; see `localise.matching_cost`.
 
     Attributes:
         openings, ceiling, room_type: weights in units of the walls'.
-        temperature: T, how many independent azimuths a cost is worth: likelihoods are `exp(-T cost)`.
+        temperature: T, the number of independent azimuths: likelihoods are `exp(-T cost)`.
     """
 
     openings: float = 0.7
@@ -91,13 +90,13 @@ class MatchingWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class ConfidenceModel:
-    """How sure answers are, fitted on validation queries.
+    """Models of the confidence and covariance of answers, fitted on validation queries.
 
     Attributes:
-        known_heading, searched_heading: by the stage that the answer came from ("retrieval", "vdr", "lpo").
-        position_factor: covariance (m²) of the position, where the heading is known, in units of the inverse of the
-            cost's curvature.
-        position_factor_searched, heading_factor: of the position (m²) and the heading (radians²) where it is searched.
+        known_heading, searched_heading: models by the last stage of the search ("retrieval", "vdr", "lpo").
+        position_factor: covariance (m²) of the position over the inverse of the cost's curvature, for known headings.
+        position_factor_searched, heading_factor: the same of the position (m²) and the heading (radians²), for
+            searched headings.
     """
 
     known_heading: dict[str, LogisticModel]
@@ -107,14 +106,14 @@ class ConfidenceModel:
     heading_factor: float | None = None
 
     def fit_probability(self, stage: str, signals: Mapping[str, float], *, heading_known: bool) -> float | None:
-        """Probability that a picture is of the plan at all; None for a stage that no validation query came to."""
+        """Return the probability that a picture is of the plan; None for a stage that the model was not fitted on."""
         model = (self.known_heading if heading_known else self.searched_heading).get(stage)
         return None if model is None else model.probability(**signals)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileEntry:
-    """Size and digest of one file of the bundle."""
+    """Size and SHA-256 of one file of the bundle."""
 
     bytes: int
     sha256: str
@@ -122,7 +121,7 @@ class FileEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What a bundle is and how it came to be.
+    """Manifest of a bundle: architecture, inputs and outputs, calibration, and provenance.
 
     Attributes:
         architecture: "ring", "trunk" or "paper".
@@ -131,13 +130,13 @@ class Manifest:
         image_height, image_width: pixels the image encoder expects; pixel values are raw uint8 RGB and the
             normalisation stated in `image_mean` and `image_std` happens inside the network.
         ring_sectors: azimuth sectors of the ring, 0 for an architecture without one.
-        image_config: arguments that rebuild the image encoder in torch, where they are not those of the layout encoder.
-        opening_classes: what the image encoder tells apart at each azimuth; none where it tells nothing of the kind.
-        opening_prior: the classes' shares that its probabilities presume; dividing by them leaves likelihoods.
-        room_types: types of rooms that it tells apart, and `room_type_prior` their shares in what it was trained on.
-        confidence: fitted on validation queries; None leaves answers without a trained confidence.
-        evidence: weights of what poses are compared by.
-        training: commands, seeds, hardware, counts of how the model was trained.
+        image_config: arguments that rebuild the image encoder in torch, if they differ from the layout encoder's.
+        opening_classes: opening classes that the image encoder predicts; empty if it predicts none.
+        opening_prior: frequencies of the classes that its probabilities presume.
+        room_types: room types that it predicts; `room_type_prior` are their frequencies in the training data.
+        confidence: models of the confidence; None leaves answers without one.
+        evidence: weights of the matching cost.
+        training: commands, seeds, hardware and counts of the training.
         metrics: validation figures with their n.
     """
 
@@ -165,7 +164,7 @@ class Manifest:
     format_version: int = FORMAT_VERSION
 
     def to_json(self) -> str:
-        """The manifest as indented JSON text."""
+        """Return the manifest as indented JSON."""
         return json.dumps(dataclasses.asdict(self), indent=2, sort_keys=True) + "\n"
 
     @classmethod
@@ -182,7 +181,9 @@ class Manifest:
         if not isinstance(raw, dict):
             raise BundleError(f"{MANIFEST_NAME} must be a JSON object, not {type(raw).__name__}")
         if raw.get("format_version") != FORMAT_VERSION:
-            raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
+            raise BundleError(
+                f"the manifest's format_version is {raw.get('format_version')!r}; this version reads {FORMAT_VERSION}"
+            )
         try:
             return build_config(cls, raw, path="manifest")
         except ConfigError as error:
@@ -202,7 +203,7 @@ class Bundle:
         """Read the manifest of a bundle; files are checked when they are read.
 
         Raises:
-            BundleError: no manifest there, or not a valid one.
+            BundleError: the manifest is missing or not valid.
         """
         path = folder / MANIFEST_NAME
         try:
@@ -213,37 +214,39 @@ class Bundle:
         return cls(folder, manifest, _digest_of(manifest))
 
     def check(self) -> None:
-        """Read every file, and believe none.
+        """Check size and digest of every file.
 
         Raises:
-            BundleError: one is missing, or altered.
+            BundleError: a file is missing or altered.
         """
         for name in self.manifest.files:
             self.read(name)
 
     def read(self, name: str) -> bytes:
-        """The bytes of one file, checked against the manifest.
+        """Read one file and check it against the manifest.
 
         Raises:
             BundleError: the file is not listed, missing, or altered.
         """
         entry = self.manifest.files.get(name)
         if entry is None:
-            raise BundleError(f"bundle '{self.folder}' lists no file '{name}'")
+            raise BundleError(f"bundle '{self.folder}' has no file '{name}' in its manifest")
         try:
             content = (self.folder / name).read_bytes()
         except OSError as error:
             raise BundleError(f"bundle '{self.folder}': cannot read '{name}': {error.strerror}") from error
         digest = hashlib.sha256(content).hexdigest()
         if digest != entry.sha256:
-            raise BundleError(f"bundle '{self.folder}': '{name}' has SHA-256 {digest}, expected {entry.sha256}")
+            raise BundleError(
+                f"bundle '{self.folder}': '{name}' has the SHA-256 {digest}; the manifest states {entry.sha256}"
+            )
         return content
 
 
 def default_bundle() -> Path:
-    """The folder of the model that ships: that of the checkout which this file is in, else the installed one.
+    """Return the folder of the model that ships: in this checkout, else the installed one.
 
-    Where the working folder is the checkout, the path is relative, so that what runs write down holds elsewhere.
+    If the working folder is the checkout, the path is relative, so that recorded commands work elsewhere.
     """
     checkout = Path(__file__).resolve().parents[2] / _CHECKOUT
     if (checkout / MANIFEST_NAME).is_file():
@@ -253,12 +256,12 @@ def default_bundle() -> Path:
             path = Path(file.locate()).resolve()
             if path.name == MANIFEST_NAME and path.parent.match(f"*/{_INSTALLED}"):
                 return path.parent
-    # Nothing is there; whoever opens it is told so.
+    # Opening it raises an error that names the folder.
     return checkout
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
-    """Write the manifest over the files that lie in `folder`, but for its card, recording sizes and digests."""
+    """Write the manifest of the files in `folder`, except the model card, with their sizes and digests."""
     files = {}
     for path in sorted(folder.iterdir()):
         if path.name not in (MANIFEST_NAME, CARD_NAME):
@@ -270,6 +273,6 @@ def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
 
 
 def _digest_of(manifest: Manifest) -> str:
-    """Identity of the model: a digest over its files, so that re-scoring or renaming does not change it."""
+    """Return the model's identity: a digest over its files, which new metrics or names do not change."""
     listing = "\n".join(f"{name} {entry.sha256}" for name, entry in sorted(manifest.files.items()))
     return hashlib.sha256(listing.encode()).hexdigest()

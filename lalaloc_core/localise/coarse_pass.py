@@ -98,7 +98,7 @@ def likeliest(
     limits: PairLimits,
     hint_cost: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """Return the coarse costs, rising, of the best pairs, and the pairs: pose times number of hypotheses, plus hypothesis.
+    """Return the coarse costs, rising, and the pairs (pose times number of hypotheses, plus hypothesis) of the best.
 
     The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow.
 

@@ -316,7 +316,7 @@ class RefinementResult:
     Attributes:
         position_m: (k, 2) positions (m).
         heading: (k,) headings (radians) in the frame.
-        cost: (k,) minimised cost: of profiles the walls' term of the matching cost, else the distance of the embeddings.
+        cost: (k,) minimised cost: the walls' term of the matching cost, or the distance of the embeddings.
         latent_distance: (k,) distance of the embeddings; None if it is no part of the cost.
         information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
         converged: (k,) whether the poses converged.

@@ -1,7 +1,7 @@
 """Probability of the places of a plan, for maps: the posterior at the refined places.
 
-Candidates that end at one place can begin up to a metre from it, so a map of the grid's poses would show the probability
-beside the answer.
+Candidates that end at one place can begin up to a metre from it, so a map of the grid's poses would show the
+probability beside the answer.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is known of a photograph's camera before anything is compared: its heading and its height, and from where."""
+"""Heading and height of a photograph's camera as the caller, the metadata or the plan state them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 
 HeadingSource = Literal["given", "panorama", "searched"]
-# How far off (degrees) the compass heading in a panorama's metadata may be.
+# Largest error (degrees) of the compass heading in a panorama's metadata.
 COMPASS_TOLERANCE_DEG = 20.0
 
 
 @dataclass(frozen=True)
 class KnownHeading:
-    """A heading in radians, None when all have to be searched, and how far off it may be."""
+    """Known heading: radians, or None if all are searched; its largest error (radians); and its source."""
 
     heading: float | None
     tolerance: float
@@ -31,11 +31,14 @@ def known_heading(
     compass_heading: float | None,
     compass_tolerance_deg: float = COMPASS_TOLERANCE_DEG,
 ) -> KnownHeading:
-    """What is said, else what the panorama says where north is known, else nothing.
+    """Return the given heading, else the panorama's if north is known, else none.
 
     Args:
-        north: azimuth of true north (radians) in the plan.
-        compass_heading: clockwise from true north (radians), as the panorama's metadata have it.
+        north: azimuth of true north (radians) in the plan; None if unknown.
+        heading_deg: given heading (degrees).
+        tolerance_deg: largest error (degrees) of the given heading.
+        compass_heading: heading in the panorama's metadata, clockwise from true north (radians).
+        compass_tolerance_deg: largest error (degrees) of the compass heading.
     """
     if heading_deg is not None:
         return KnownHeading(heading_from_degrees(heading_deg), math.radians(tolerance_deg), "given")
@@ -46,13 +49,13 @@ def known_heading(
 
 
 def stated_height(plan: FloorPlan, height_m: float | None, std_m: float | None = None) -> CameraHeight:
-    """What is said, else what the plan says, else nothing: then any height is possible.
+    """Return the given camera height, else the plan's, else an unknown one.
 
     Raises:
-        InvalidPoseError: not a height.
+        InvalidPoseError: the height is not positive and finite, or its deviation negative.
     """
     if height_m is not None:
         return CameraHeight(height_m, DEFAULT_STD_M if std_m is None else std_m)
     usual = DEFAULT_STD_M if plan.states_camera_height else math.inf
-    said = (value for value in (std_m, plan.camera_height_std_m, usual) if value is not None)
-    return CameraHeight(plan.camera_height_m, next(said))
+    stated = (value for value in (std_m, plan.camera_height_std_m, usual) if value is not None)
+    return CameraHeight(plan.camera_height_m, next(stated))

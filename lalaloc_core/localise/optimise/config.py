@@ -11,16 +11,18 @@ class LpoConfig:
     """Settings of both optimisers.
 
     Attributes:
-        margin_m: poses keep this distance to walls, so that none ends on the other side of one.
-        max_iterations: evaluations of Levenberg-Marquardt at most, the first at the start.
-        profile_iterations, exact_cost: so many where wall profiles are compared, and more for poses of less than this
-            cost alone: what is predicted errs by more than the last steps gain, unless it fits so well.
+        method: the optimiser.
+        margin_m: smallest distance of poses to walls, so that none crosses one.
+        max_iterations: maximum number of Levenberg-Marquardt evaluations, including the first at the start.
+        profile_iterations: the same for wall profiles, as predictions are less accurate than the last steps.
+        exact_cost: poses below this cost continue up to `max_iterations`.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
-        tolerance_cost: and so does one that lowers the cost by less than this share, or would by the linear model.
+        tolerance_cost: a step that lowers the cost by less than this share, or would by the linear model, ends it too.
+        initial_damping: damping of the first step.
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
-        prune_after, prune_ratio: after so many evaluations, starts farther than the best by this factor are left
-            where they are: they will not become the answer.
-        prune_margin: the same of wall profiles, by how much their cost exceeds the best; it is a log likelihood.
+        prune_after: number of evaluations after which starts that cannot become the answer are left.
+        prune_ratio: such starts are farther than the best by this factor.
+        prune_margin: the same for wall profiles: their cost exceeds the best by this.
         adam_*: the paper's schedule.
     """
 

@@ -14,7 +14,7 @@ from lalaloc_core.localise.optimise.problem import Evaluation, Problem
 
 
 class DescentResult(NamedTuple):
-    """Where poses ended, what they are there, whether they converged, and how many evaluations it took."""
+    """Refined poses, their evaluation, whether they converged, and the number of evaluations."""
 
     pose: Float[Tensor, "k p"]
     evaluation: Evaluation
@@ -46,7 +46,7 @@ def levenberg_marquardt(problem: Problem, config: LpoConfig) -> DescentResult:
         there = part.evaluate(start + step)
         evaluations += 1
         better = there.cost < before.cost
-        # What the linear model promised: little promised is little to lose, whether the step was good or not.
+        # A small decrease predicted by the linear model ends the search, even if the step failed.
         curved = torch.einsum("kp,kpq,kq->k", step, before.information, step)
         promised = -(before.slope * step).sum(dim=1) - 0.5 * curved
         least = config.tolerance_cost * before.cost
@@ -61,13 +61,13 @@ def levenberg_marquardt(problem: Problem, config: LpoConfig) -> DescentResult:
 
 
 def _step(here: Evaluation, damping: Float[Tensor, "k"]) -> Float[Tensor, "k p"]:
-    """The step that the linear model asks for, shorter the more it is damped."""
+    """Return the damped step of the linear model."""
     scaling = torch.diagonal(here.information, dim1=1, dim2=2) * damping[:, None] + 1e-8
     return -torch.linalg.solve(here.information + torch.diag_embed(scaling), here.slope)
 
 
 def _worth_going_on(problem: Problem, here: Evaluation, config: LpoConfig) -> Tensor:
-    """The distance up to which poses may still become the best."""
+    """Return the distance up to which poses can still become the best."""
     nearest = here.distance.min()
     return nearest + config.prune_margin if problem.norm == "cauchy" else config.prune_ratio * nearest
 

@@ -1,4 +1,4 @@
-"""The optimiser of a model: from a job to refined poses."""
+"""Optimisers: from a refinement job to refined poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lalaloc_core.render.profile import wall_profile
 
 
 class PoseOptimiser:
-    """Refines poses until what an embedding makes of their layouts is nearest to the targets."""
+    """Optimiser that minimises the distance of embedded layouts to their targets."""
 
     def __init__(
         self,
@@ -32,14 +32,17 @@ class PoseOptimiser:
         config: LpoConfig | None = None,
         device: torch.device | None = None,
     ) -> None:
-        """Choose what is compared, and how.
+        """Set the embedding and the norm.
 
         Args:
-            embedding: what is compared with a job's targets; None: the log wall profile itself.
+            embedding: function of layouts that is compared with a job's targets; None: the log wall profile itself.
             columns: azimuth columns of the wall profiles that the embedding takes.
+            norm: distance that is minimised.
+            config: settings.
+            device: device of the computation; default: the CPU.
 
         Raises:
-            ConfigError: Levenberg-Marquardt is asked to minimise absolute differences.
+            ConfigError: Levenberg-Marquardt with absolute differences.
         """
         self.config = config or LpoConfig()
         if norm == "l1" and self.config.method != "adam":
@@ -50,7 +53,7 @@ class PoseOptimiser:
         self._device = device or torch.device("cpu")
 
     def refine(self, job: RefinementJob) -> RefinementResult:
-        """Refine every starting pose of a job within its own room by its `targets`, and `precision` where it has some.
+        """Refine every starting pose of a job within its own room, by its `targets` and, if it has one, `precision`.
 
         Both distances of the result are by this optimiser's norm.
         """
@@ -74,7 +77,7 @@ class PoseOptimiser:
 
 
 class PoseRefiner:
-    """Refines poses with one layout encoder, by predicted wall profiles where a job has them."""
+    """Refiner with one layout encoder; it compares wall profiles if a job has predicted ones."""
 
     def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
         layout_encoder = layout_encoder.eval().requires_grad_(False)
@@ -113,7 +116,7 @@ class PoseRefiner:
 
     @torch.no_grad()
     def _latent_distance(self, job: RefinementJob, result: RefinementResult) -> Float[np.ndarray, "k"]:
-        """How far the latents of the refined poses are from the query's."""
+        """Return the distances of the refined poses' latents to the query's."""
 
         def tensor(array: np.ndarray) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=self._device)
@@ -125,6 +128,6 @@ class PoseRefiner:
 
 
 def _without_last(information: Float[Tensor, "k p p"]) -> Float[Tensor, "k q q"]:
-    """Information about all unknowns but the last, which is integrated out (Schur complement)."""
+    """Return the information about all unknowns but the last, which is integrated out (Schur complement)."""
     cross, last = information[:, :-1, -1], information[:, -1, -1].clamp_min(1e-9)
     return information[:, :-1, :-1] - cross[:, :, None] * cross[:, None, :] / last[:, None, None]

@@ -1,4 +1,4 @@
-"""What is optimised: the residuals of a job as a function of the unknowns, and all that both optimisers ask of them."""
+"""Problem of pose refinement: the residuals of a job as a function of the unknowns, and their derivatives."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.poses import RefinementJob
 from lalaloc_core.render.gradient import ProfileJacobian, log_distance_gradient, log_profile_gradient
 
-# What is compared with the targets (k, d): a function of wall profiles (k, columns), camera and ceiling heights (k,).
+# Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
 Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
-# The distance that is minimised: Euclidean, the mean absolute difference, or the mean of log(1 + r²).
+# Distance that is minimised: Euclidean, mean absolute difference, or the mean of log(1 + r²).
 Norm = Literal["l2", "l1", "cauchy"]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Poses with all that the optimisers need of their residuals r and the derivatives J by the unknowns.
+    """Costs of k poses with derivatives by p unknowns, from the residuals r and their Jacobian.
 
     Attributes:
-        cost: (k,) what Levenberg-Marquardt lowers: half the sum of r², or of log(1 + r²), and half the squares of the
-            unknowns that are held at zero by a normal prior, in units of its deviation.
-        slope: (k, p) its derivative.
-        information: (k, p, p) its curvature, after Gauss and Newton.
-        distance: (k,) the distance by the norm, without what holds the unknowns.
-        gradient: (k, p) its derivative.
+        cost: (k,) cost that Levenberg-Marquardt lowers: half the sum of r², or of log(1 + r²), plus half the squares of
+            unknowns with a normal prior, in units of its deviation.
+        slope: (k, p) derivative of the cost.
+        information: (k, p, p) curvature of the cost (Gauss-Newton).
+        distance: (k,) distance by the norm, without the prior.
+        gradient: (k, p) derivative of the distance.
     """
 
     cost: Float[Tensor, "k"]
@@ -41,7 +41,7 @@ class Evaluation:
     gradient: Float[Tensor, "k p"]
 
     def rows(self, index: Int[Tensor, "m"]) -> Evaluation:
-        """Some of the poses alone."""
+        """Return the evaluation of some of the poses."""
         return Evaluation(*(value[index] for value in vars(self).values()))
 
     def take_over(self, index: Int[Tensor, "m"], other: Evaluation) -> None:
@@ -51,18 +51,22 @@ class Evaluation:
 
 
 class Problem:
-    """The residuals of one job as a function of the unknowns: x, y, then heading and height offset where wanted.
+    """Residuals of one job as a function of the unknowns: x, y, then heading and height offset if they are refined.
 
-    Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
+    Positions are relative to each starting pose, to keep millimetres in single precision in large plans.
     """
 
     def __init__(
         self, embedding: Embedding | None, columns: int, norm: Norm, job: RefinementJob, device: torch.device
     ) -> None:
-        """State a problem.
+        """Set up the problem.
 
         Args:
-            embedding: None compares the log wall profiles themselves.
+            embedding: function of layouts; None compares the log wall profiles themselves.
+            columns: azimuth columns of the wall profiles.
+            norm: distance that is minimised.
+            job: the refinement job.
+            device: device of the computation.
         """
 
         def tensor(array: np.ndarray) -> Tensor:
@@ -78,7 +82,7 @@ class Problem:
         self._ceiling_height_m = tensor(job.ceiling_height_m)
         self._targets = tensor(job.targets)
         self._precision = None if job.precision is None else tensor(job.precision)
-        # Those that move the layout; the camera height is one more behind them.
+        # Number of unknowns that move the layout; the camera height follows them.
         self._moving = 3 if job.optimise_heading else 2
         self._height_bounds = job.height_bounds
         stiffness = [0.0] * self._moving
@@ -87,18 +91,17 @@ class Problem:
             start = torch.cat([start, tensor(job.height_offset)[:, None]], dim=1)
             stiffness.append(job.height_stiffness)
         self.start = start
-        # Squared, as it is never needed otherwise.
         self._stiffness = torch.tensor(stiffness, device=device).square()
 
     def unpack(
         self, pose: Float[Tensor, "k p"]
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"], Float[Tensor, "k"] | None]:
-        """Position (m, relative to the start), heading (radians), and the height's offset where it is solved for."""
+        """Return position (m, relative to the start), heading (radians), and height offset if it is solved for."""
         turned = self._heading + pose[:, 2] if self._moving == 3 else self._heading
         return pose[:, :2], turned, pose[:, self._moving] if pose.shape[1] > self._moving else None
 
     def rows(self, index: Int[Tensor, "m"]) -> Problem:
-        """The problem of some of the poses alone."""
+        """Return the problem of some of the poses."""
         part = object.__new__(Problem)
         part.__dict__.update(self.__dict__)
         for name in ("_walls_m", "_heading", "_camera_height_m", "_ceiling_height_m", "_targets", "_precision"):
@@ -108,7 +111,7 @@ class Problem:
         return part
 
     def evaluate(self, pose: Float[Tensor, "k p"]) -> Evaluation:
-        """Residuals at these poses, and what they change by."""
+        """Return the costs at these poses with their derivatives."""
         position_m, heading, height_offset = self.unpack(pose)
         layout = log_profile_gradient(position_m, heading, self._walls_m, self._columns)
         value, jacobian = self._embedded(layout)
@@ -122,7 +125,7 @@ class Problem:
         return self._weighed(pose, residual, jacobian)
 
     def _embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
-        """What the embedding makes of layouts, and its derivatives by the unknowns that move them."""
+        """Return embedded layouts, and their derivatives by the unknowns that move them."""
         by_pose = layout.by_pose[:, : self._moving]
         if self._embedding is None:
             return layout.log_m, by_pose
@@ -143,7 +146,7 @@ class Problem:
     def _weighed(
         self, pose: Float[Tensor, "k p"], residual: Float[Tensor, "k d"], jacobian: Float[Tensor, "k p d"]
     ) -> Evaluation:
-        """Costs by the norm; that of Cauchy, which is `localise.matching_cost`'s, by squares weighted anew everywhere."""
+        """Return the costs by the norm; Cauchy's, that of `localise.matching_cost`, by re-weighted squares."""
         held = pose * self._stiffness
         prior = 0.5 * (pose * held).sum(dim=1)
         if self.norm == "cauchy":
@@ -167,7 +170,7 @@ class Problem:
     def stay_inside(
         self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig
     ) -> Float[Tensor, "k p"]:
-        """The step, shortened where it is too long or would come closer to a wall than the margin."""
+        """Shorten steps that are too long or would come closer to a wall than the margin."""
         length = torch.linalg.vector_norm(step[:, :2], dim=1)
         azimuth = torch.atan2(step[:, 0], step[:, 1])
         free = log_distance_gradient(pose[:, :2], azimuth[:, None], self._walls_m).log_m[:, 0].exp() - config.margin_m
