@@ -2,8 +2,8 @@
 
 A photograph of a dim or cluttered room has a high cost at its own place, and a photograph of another building a low
 cost at some place, so the cost alone does not separate the two. The cost relative to that at a cohort of unrelated
-places does; speaker verification normalises its scores in this way (Auckenthaler, Carey and Lloyd-Thomas, 2000). The cohort
-consists of poses of training homes. It is made when a model is calibrated, and is part of its bundle.
+places does; speaker verification normalises its scores in this way (Auckenthaler, Carey and Lloyd-Thomas, 2000). The
+cohort consists of poses of training homes. It is made when a model is calibrated, and is part of its bundle.
 """
 
 from __future__ import annotations

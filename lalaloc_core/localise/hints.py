@@ -7,7 +7,7 @@ probability 1 - ε; otherwise the camera can be anywhere:
 
 `g` is 1 inside the region and 0 outside. Around a point it falls off beyond the radius r, by
 `exp(-½ ((d - r) / (r / 3))²)` at the distance d, as a stated radius is approximate. Because of ε a place outside wins
-if the picture makes it likelier by the factor `1 + (1 - ε) / (ε s)`. Hints that are `strict` exclude every place outside.
+if the picture makes it likelier by the factor `1 + (1 - ε) / (ε s)`. `strict` hints exclude every place outside.
 """
 
 from __future__ import annotations
