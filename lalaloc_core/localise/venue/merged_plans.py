@@ -81,7 +81,7 @@ class MergedPlans:
         return index, replace(candidate, x_m=float(x_m), y_m=float(y_m), room_index=room)
 
     def by_plan(self, pose: Float[np.ndarray, "n"]) -> Float[np.ndarray, "p"]:
-        """Sums over the poses of each plan."""
+        """Return the sums over the poses of each plan."""
         return np.add.reduceat(pose, _starts(self._poses))
 
 
@@ -90,7 +90,7 @@ def _starts(counts: Sequence[int] | Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"
 
 
 def _places(plans: Sequence[FloorPlan]) -> Float[np.ndarray, "p 2"]:
-    """What to move each plan by, so that they lie in the cells of a square."""
+    """Return the shift of each plan that places them in the cells of a square."""
     bounds = np.array([plan.bounds_m for plan in plans])
     cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + _GAP_M
     columns = int(np.ceil(np.sqrt(len(plans))))

@@ -73,7 +73,7 @@ class PlanIndex:
         step_m: float,
         cells: Cells,
     ) -> PlanIndex:
-        """An index of the plans whose prototypes are `count` rows from `begin` on."""
+        """Return an index of the plans whose prototypes are `count` rows from `begin` on."""
         plan = np.repeat(np.arange(len(count), dtype=np.int32), count)
         ends = np.cumsum(count)
         member = np.arange(len(plan)) + np.repeat(begin - (ends - count), count)
@@ -99,7 +99,7 @@ class PlanIndex:
 
     @classmethod
     def of_parts(cls, parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
-        """An index of the prototypes of some plans, which are sorted into cells here."""
+        """Return an index of the prototypes of some plans, which are sorted into cells here."""
         rows = joined(parts).rows.copy()
         rows["cell"] = cells.sort(rows)
         count = np.array([len(part) for part in parts])

@@ -53,7 +53,7 @@ class Cells:
         return FAMILIES * len(self.log_profile)
 
     def sort(self, rows: np.ndarray) -> UInt16[np.ndarray, "n"]:
-        """The cell of each prototype."""
+        """Return the cell of each prototype."""
         feature, centre = features(rows), _features(self.log_profile, self.share)
         family, cell = family_of(rows["claims"]), np.empty(len(rows), np.uint16)
         for number in np.unique(family).tolist():
@@ -82,7 +82,7 @@ class Cells:
 
 @lru_cache(maxsize=1)
 def shipped_cells() -> Cells:
-    """The cells that come with the package."""
+    """Return the cells that come with the package."""
     with np.load(CELLS_FILE) as file:
         return Cells(
             file["log_profile"].astype(np.float32), file["share"].astype(np.float32) / 255.0, int(file["version"])
@@ -90,7 +90,7 @@ def shipped_cells() -> Cells:
 
 
 def family_of(claims: UInt8[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """The family of cells that prototypes of plans are sorted into, by what these claim."""
+    """Return the family of cells that prototypes of plans are sorted into, by what these claim."""
     return claims >> (WALL_CODE + 1) & (FAMILIES - 1)
 
 
@@ -100,7 +100,7 @@ def claims_of(family: int) -> int:
 
 
 def _claimed_features(family: int) -> Int[np.ndarray, "f"]:
-    """The columns of `features` that count for a family."""
+    """Return the columns of `features` that count for a family."""
     kinds = np.arange(1, len(OPENING_CLASSES))
     claimed = np.tile(claims_of(family) >> kinds & 1, AZIMUTHS).astype(bool)
     return np.concatenate([np.arange(AZIMUTHS), AZIMUTHS + np.flatnonzero(claimed)])
@@ -118,7 +118,7 @@ def _features(log_profile: np.ndarray, share: np.ndarray) -> Float[np.ndarray, "
 
 
 def nearest(feature: Float[np.ndarray, "n f"], centre: Float[np.ndarray, "v f"]) -> Int[np.ndarray, "n"]:
-    """The nearest centre of each."""
+    """Return the nearest centre of each."""
     found, half = np.empty(len(feature), np.intp), 0.5 * np.square(centre).sum(axis=1)
     for begin in range(0, len(feature), _CHUNK):
         part = slice(begin, begin + _CHUNK)

@@ -42,7 +42,7 @@ _CHUNK = 65_536
 
 
 def codes_of(rows: np.ndarray) -> UInt8[np.ndarray, "n b"]:
-    """The codes of prototypes (of `prototypes.ROW`), two values to a byte, the first one lower."""
+    """Return the codes of prototypes (of `prototypes.ROW`), two values to a byte, the first one lower."""
     distance, ceiling = _value_of(np.log(_EDGES_M)), _value_of(np.array(_CEILING_EDGES_M))
     code = np.empty((len(rows), CODE_BYTES), np.uint8)
     openings = AZIMUTHS // 2
@@ -87,7 +87,7 @@ class CodeScan:
     def best(
         self, tables: Float[np.ndarray, "q d"], lists: Bool[np.ndarray, "q l"], count: int
     ) -> tuple[Int[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
-        """The codes of some lists that cost least by tables, and what they cost; -1 where there are not so many.
+        """Return the codes of some lists that cost least by tables, and what they cost; -1 where there are not so many.
 
         Args:
             tables: of the parts of a code (50), the 16 values of each, see `tables_of`.
@@ -129,6 +129,6 @@ def _value_of(edges: Float[np.ndarray, "e"]) -> UInt8[np.ndarray, "65536"]:
 
 
 def _within(edges: Float[np.ndarray, "17"]) -> Float[np.ndarray, "16 s"]:
-    """Some numbers between each two edges."""
+    """Return some numbers between each two edges."""
     share = (np.arange(_WITHIN) + 0.5) / _WITHIN
     return (edges[:-1, None] + np.diff(edges)[:, None] * share).astype(np.float32)

@@ -87,7 +87,7 @@ class PrototypeCosts:
         return self.centre[:, None] + self.offsets[None, :, None].astype(np.float32)
 
     def of_ceilings(self, ceiling_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "j n"]:
-        """What ceilings cost under every hypothesis of the camera's height."""
+        """Return the cost of ceilings under every hypothesis of the camera's height."""
         if self._query.ceiling is None or not self._config.use_ceiling:
             return np.zeros((len(self.offsets), len(ceiling_m)))
         return self._ceilings(self._query.ceiling, ceiling_m, self.offsets[:, None])
@@ -154,7 +154,7 @@ class PrototypeCosts:
 
 
 def _offsets(query: Query) -> Float[np.ndarray, "j"]:
-    """The logs of true over stated camera height that are tried."""
+    """Return the logs of true over stated camera height that are tried."""
     tried = query.camera_height.offsets
     reach = float(tried[-1] - tried[0])
     if reach <= _OFFSETS_APART * (1.0 + 1e-9):

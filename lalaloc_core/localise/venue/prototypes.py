@@ -67,7 +67,7 @@ class Prototypes:
 
 
 def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
-    """The prototypes of a plan, in cell 0."""
+    """Return the prototypes of a plan, in cell 0."""
     place = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
     chosen, of_room = place.sum(axis=1) % 2 == 0, grid.poses.room_index
     # Rooms that have none so, which are narrow ones, keep all of theirs.
@@ -100,13 +100,13 @@ def packed_openings(kind: UInt8[np.ndarray, "n a"]) -> UInt8[np.ndarray, "n b"]:
 
 
 def unpacked_openings(packed: UInt8[np.ndarray, "n b"]) -> UInt8[np.ndarray, "n a"]:
-    """What `packed_openings` packed."""
+    """Unpack the codes of `packed_openings`."""
     place = 2 * np.arange(PER_BYTE, dtype=np.uint8)
     return ((packed[:, :, None] >> place) & 3).reshape(len(packed), -1)
 
 
 def azimuths(columns: int) -> Int[np.ndarray, "a"]:
-    """The columns of a wall profile that prototypes have; of a profile with fewer, some twice."""
+    """Return the columns of a wall profile that prototypes have; of a profile with fewer, some twice."""
     return np.arange(AZIMUTHS) * columns // AZIMUTHS
 
 
