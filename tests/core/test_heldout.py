@@ -216,9 +216,9 @@ class TestScenes:
     @pytest.mark.parametrize(
         ("wrong", "message"),
         [
-            ({"homes": -1}, "homes is -1, it must be at least 0"),
-            ({"homes": 1, "shots_per_home": 0}, "shots_per_home is 0, it must be at least 1"),
-            ({"homes": 1, "seed": -2}, "seed is -2, it must be at least 0"),
+            ({"homes": -1}, "homes is -1; the minimum is 0"),
+            ({"homes": 1, "shots_per_home": 0}, "shots_per_home is 0; the minimum is 1"),
+            ({"homes": 1, "seed": -2}, "seed is -2; the minimum is 0"),
         ],
     )
     def test_invalid_arguments_are_refused(self, wrong: dict, message: str) -> None:

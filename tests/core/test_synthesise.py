@@ -522,7 +522,7 @@ def test_scenes_are_divided_like_the_official_splits() -> None:
 
 @pytest.mark.parametrize(("scenes", "split"), [(250, "test"), (3475, "all"), (0, "all"), (-1, "train")])
 def test_too_many_scenes_for_a_split_are_refused(scenes: int, split: Any) -> None:
-    with pytest.raises(InvalidInputError, match=rf"^{scenes} scenes asked for, from 1 to \d+ are possible"):
+    with pytest.raises(InvalidInputError, match=rf"^scenes is {scenes}; the limits of .* are 1 to \d+"):
         share_out(scenes, split)
 
 
@@ -546,11 +546,11 @@ def test_command_writes_and_extends_scenes(root: Path, tmp_path: Path, capsys: p
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--scenes", "250", "--split", "test"], "250 scenes asked for, from 1 to 249"),
-        (["--scenes", "1", "--height", "33"], "panoramas of 33 rows, an even number"),
-        (["--scenes", "1", "--height", "8"], "panoramas of 8 rows"),
-        (["--scenes", "1", "--seed", "-1"], "the seed is -1"),
-        (["--scenes", "1", "--workers", "0"], "0 worker processes, at least 1"),
+        (["--scenes", "250", "--split", "test"], "scenes is 250; the limits of split 'test' are 1 to 249"),
+        (["--scenes", "1", "--height", "33"], "height is 33; it must be an even number"),
+        (["--scenes", "1", "--height", "8"], "height is 8"),
+        (["--scenes", "1", "--seed", "-1"], "seed is -1"),
+        (["--scenes", "1", "--workers", "0"], "workers is 0; the minimum is 1"),
         (["--scenes", "1", "--textures", "nowhere"], "no <category>/<material>/*.jpg below 'nowhere'"),
     ],
 )
