@@ -566,7 +566,7 @@ def test_folder_with_other_scenes_is_refused(root: Path, tmp_path: Path, capsys:
     before = content(root)
     assert main(["synth", "--scenes", "3", "--out", str(root), "--height", "64", "--seed", str(SEED)]) == 2
     message = capsys.readouterr().err
-    assert f"its scenes were made with height {HEIGHT}, not 64; width {2 * HEIGHT}, not 128" in message
+    assert f"its scenes were generated with height {HEIGHT}, not 64; width {2 * HEIGHT}, not 128" in message
     assert "seed" not in message
     assert content(root) == before
     (tmp_path / "scene_00000").mkdir()
