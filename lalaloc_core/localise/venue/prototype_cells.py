@@ -95,7 +95,7 @@ def family_of(claims: UInt8[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
 
 
 def claims_of(family: int) -> int:
-    """What plans claim whose prototypes are sorted into a family of cells."""
+    """Return the opening classes that the plans of a family of cells claim."""
     return family << (WALL_CODE + 1)
 
 
@@ -107,7 +107,7 @@ def _claimed_features(family: int) -> Int[np.ndarray, "f"]:
 
 
 def features(rows: np.ndarray) -> Float[np.ndarray, "n f"]:
-    """What prototypes are sorted by."""
+    """Return the features that prototypes are sorted by."""
     kind = unpacked_openings(rows["openings"])
     return _features(rows["log_profile"], (kind[:, :, None] == np.arange(len(OPENING_CLASSES))))
 

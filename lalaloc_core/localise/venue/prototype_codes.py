@@ -103,7 +103,7 @@ class CodeScan:
 
 
 def tables_of(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j p c"]:
-    """What each value of a code costs under the hypotheses of the heading and the height, for plans of some claims."""
+    """Return the cost of each value of a code under every heading and height, for plans of some claims."""
     (k, j), azimuth = costs.shape, np.arange(AZIMUTHS)
     tables = np.zeros((k, j, _PARTS, _VALUES), np.float32)
     distance = _within(np.log((_MIN_DISTANCE_M, *_EDGES_M, _MAX_DISTANCE_M)))

@@ -1,4 +1,4 @@
-"""How badly prototypes fit a panorama: walls, openings, ceiling and type of the room, as in `evidence`, but coarser.
+"""Cost of prototypes: walls, openings, ceiling and room type as in `matching_cost.py`, but coarser.
 
 There are 32 azimuths and as many hypotheses of the heading at most, and the reach is that of a grid as fine as the
 prototypes. What is seen through openings is left out. A prototype may stand half a metre away from the camera, where
@@ -67,7 +67,7 @@ class PrototypeCosts:
     def of(
         self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]
     ) -> Float[np.ndarray, "n"]:
-        """The cost of prototypes, each under one hypothesis of the heading and one of the height, by their numbers."""
+        """Return the cost of prototypes, each under one hypothesis of heading and height, by their numbers."""
         cost = np.empty(len(rows), np.float32)
         for begin in range(0, len(rows), _CHUNK):
             part = slice(begin, begin + _CHUNK)

@@ -113,7 +113,7 @@ def azimuths(columns: int) -> Int[np.ndarray, "a"]:
 def most_probable(
     log_mass: Float[np.ndarray, "p"], poses: Int[np.ndarray, "p"], *, most_plans: int, most_poses: int
 ) -> Int[np.ndarray, "m"]:
-    """The plans that are to be searched in full, the most probable first: at least one, and none that weighs nothing.
+    """Return the plans to search in full, most probable first: at least one, and none without mass.
 
     Args:
         poses: of the grid of each plan.
