@@ -45,6 +45,7 @@ class MergedPlans:
         """Lay plans out, in rows and columns: a single row of many would be so long that single precision feels it.
 
         Args:
+            plans: the plans.
             grids: one for each plan, all with the same step and for the same model.
             camera_height_m: that of the query.
         """

@@ -128,6 +128,9 @@ class PlanIndex:
         """Log of each plan's mass; -inf for plans none of whose prototypes was compared as it is.
 
         Args:
+            query: the encoded panorama.
+            weights: weights of the matching cost.
+            config: settings of the matching cost.
             compared: pairs that are compared as they are.
             scanned: pairs that are compared by codes; a few more, so that the last cell is compared whole.
         """

@@ -1,6 +1,6 @@
 """Prototypes of floor plans: a few poses of each, by which those of a large venue are chosen that are searched in full.
 
-The *prototypes* of a plan are every other pose of its latent grid, as the black squares of a chessboard, with the floor
+The *prototypes* of a plan are every other pose of its pose grid, as the black squares of a chessboard, with the floor
 that each stands for, the wall profile and the openings at 32 azimuths, and the room's ceiling and type. They are
 compared with the panorama much as all poses are (`prototype_costs`), and give every plan a probability; the plans that
 have most of it are then searched in full.
@@ -116,7 +116,9 @@ def most_probable(
     """Return the plans to search in full, most probable first: at least one, and none without mass.
 
     Args:
-        poses: of the grid of each plan.
+        log_mass: log mass of each plan.
+        poses: number of grid poses of each plan.
+        most_plans: maximum number of plans.
         most_poses: how many the grids of all of them may have.
     """
     order = np.argsort(-log_mass, kind="stable")[:most_plans]
@@ -135,6 +137,8 @@ def share_searched(
     do that were searched.
 
     Args:
+        log_mass: log mass of each plan.
+        searched: numbers of the plans that were searched.
         probability: of each plan that was searched, given that it is one of them.
     """
     left_out = np.delete(log_mass, searched)
