@@ -61,13 +61,15 @@ class CodeScan:
     """Codes in lists, and the search of some of these for those that fit a query best."""
 
     def __init__(self, code: UInt8[np.ndarray, "n b"], first: Int[np.ndarray, "w"]) -> None:
-        """Args:
-        code: list by list.
-        first: where in `code` each list begins, and where the last one ends.
+        """Build the index.
+
+        Args:
+            code: codes, list by list.
+            first: begin of each list in `code`, and the end of the last.
         """
         dimensions = _PARTS * _VALUES
         lists = len(first) - 1
-        # Lists are chosen by whoever asks, not by their centres. To be kept: the index points there.
+        # Callers choose the lists, not their centres. The index points to this object, so keep it.
         self._unused = faiss.IndexFlatIP(dimensions)
         filled = faiss.IndexIVFPQ(self._unused, dimensions, lists, _PARTS, 4, faiss.METRIC_INNER_PRODUCT)
         filled.by_residual, filled.is_trained = False, True
