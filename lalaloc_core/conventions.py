@@ -25,7 +25,7 @@ MIN_CAMERA_HEIGHT_M = 0.1
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 
-# Room types; the index is the code. docs/reference/conventions.md describes each.
+# Room types; the index is the code. docs/reference/plan-format.md describes each.
 ROOM_TYPES = (
     "unknown",
     "bedroom",

@@ -1,7 +1,7 @@
 """Import of floor plans from the files of drawing, building and mapping tools, and export to them.
 
 `import_plan` and `import_plans` detect a file's format from its bytes. They return a document in the native format
-(docs/reference/conventions.md) and a report of the layers used and the likely mistakes.
+(docs/reference/plan-format.md) and a report of the layers used and the likely mistakes.
 
 registry.py  table of all formats
 formats/     one module per format: reader and writer (DXF: `formats/dxf.py`)

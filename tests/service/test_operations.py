@@ -18,7 +18,8 @@ from service.settings import SETTING_NAMES
 from tests.service.conftest import StartApp, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
-PAGE = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
+GUIDES = Path(__file__).parents[2] / "docs" / "how-to"
+PAGE = (GUIDES / "operate.md").read_text(encoding="utf-8")
 
 
 def stored(client: httpx.Client, panorama: bytes) -> tuple[list[dict[str, object]], object]:
@@ -90,7 +91,8 @@ def test_replicas_of_two_models_coexist(
 
 
 def test_documented_settings_exist() -> None:
-    named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", PAGE))
+    text = "".join(page.read_text(encoding="utf-8") for page in GUIDES.glob("*.md"))
+    named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", text))
     known = {name.upper() for name in SETTING_NAMES}
     # Variables of the compose files.
     assert named - known == {"DATABASE_PASSWORD", "PUBLISH"}

@@ -1,6 +1,6 @@
 """A user's own data: plans in the native format, panoramas, and a table of their poses.
 
-    ROOT/<scene>/plan.json      floor plan (docs/reference/conventions.md)
+    ROOT/<scene>/plan.json      floor plan (docs/reference/plan-format.md)
     ROOT/<scene>/poses.csv      panorama,x_m,y_m,heading_deg,camera_height_m
     ROOT/<scene>/...            panoramas, named in poses.csv by their path below the scene's folder
     ROOT/splits.csv             scene,split; without it every scene is a test scene
