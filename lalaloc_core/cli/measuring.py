@@ -83,7 +83,9 @@ def add_commands(commands: Any) -> None:
         metavar="DIR",
         help="folder of models, runs and tables (default: %(default)s)",
     )
-    reproduce.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle of the rows `ring`")
+    reproduce.add_argument(
+        "--bundle", type=Path, default=default_bundle(), help="model bundle of the shipped model's rows"
+    )
     reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row (default: by --budget)")
     reproduce.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
     reproduce.add_argument("--skip-bad", action="store_true", help="skip and count unusable samples")

@@ -47,14 +47,18 @@ def _localisation() -> Table:
             name="Explicit layout + localisation",
             query=RowQuery(method="explicit", kind="layout", model=SHIPPED),
         ),
-        Row(group=_LAYOUT, name="VDR + decode, `ring`", query=RowQuery(method="decode", kind="layout", model=SHIPPED)),
+        Row(
+            group=_LAYOUT,
+            name="VDR + decode, shipped model",
+            query=RowQuery(method="decode", kind="layout", model=SHIPPED),
+        ),
         Row(
             group=_LAYOUT,
             name="LaLaLoc `paper`",
             query=_lalaloc("paper", "layout"),
             paper=_paper(columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
         ),
-        Row(group=_LAYOUT, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, "layout")),
+        Row(group=_LAYOUT, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, "layout")),
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
@@ -67,14 +71,14 @@ def _localisation() -> Table:
             query=RowQuery(method="explicit", model=SHIPPED),
             paper=_paper(columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
         ),
-        Row(group=_PANORAMA, name="VDR + decode, `ring`", query=RowQuery(method="decode", model=SHIPPED)),
+        Row(group=_PANORAMA, name="VDR + decode, shipped model", query=RowQuery(method="decode", model=SHIPPED)),
         Row(
             group=_PANORAMA,
             name="LaLaLoc `paper`",
             query=_lalaloc("paper"),
             paper=_paper(columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
         ),
-        Row(group=_PANORAMA, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED)),
+        Row(group=_PANORAMA, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED)),
     ]
     return Table(
         name="localisation",
@@ -108,7 +112,7 @@ def _coarse_grid() -> Table:
             query=_lalaloc("paper", "layout", **coarse),
             paper=_paper(columns, 0.5, 0.561, 0.705, 0.843),
         ),
-        Row(group=_LAYOUT, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, "layout", **coarse)),
+        Row(group=_LAYOUT, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, "layout", **coarse)),
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
@@ -121,7 +125,7 @@ def _coarse_grid() -> Table:
             query=_lalaloc("paper", **coarse),
             paper=_paper(columns, 11.5, 0.026, 0.461, 0.795),
         ),
-        Row(group=_PANORAMA, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, **coarse)),
+        Row(group=_PANORAMA, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, **coarse)),
     ]
     return Table(
         name="coarse-grid",
@@ -155,7 +159,7 @@ def _furniture() -> Table:
                 query=_lalaloc("paper", furniture=level),
                 paper=_paper(_RETRIEVAL, *lalaloc),
             ),
-            Row(group=group, name="LaLaLoc `ring`", query=_lalaloc(SHIPPED, furniture=level)),
+            Row(group=group, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, furniture=level)),
         ]
     return Table(
         name="furniture",
@@ -356,11 +360,11 @@ TABLES: tuple[Table, ...] = (
                 paper={"seconds:retrieve": 0.05, "seconds:vdr": 2.87, "seconds:lpo": 1.73, "seconds": 4.65},
             ),
             Row(
-                group="`ring`",
+                group="shipped model",
                 name="LaLaLoc without VDR",
                 query=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}),
             ),
-            Row(group="`ring`", name="LaLaLoc", query=_lalaloc(SHIPPED)),
+            Row(group="shipped model", name="LaLaLoc", query=_lalaloc(SHIPPED)),
         ),
         form="times",
     ),
