@@ -270,13 +270,11 @@ class TestDocumentation:
     page = (ROOT / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
 
     def test_page_lists_every_bad_scene(self) -> None:
-        expected = []
         for split, excluded in EXCLUDED_BY_PAPER.items():
-            for number in sorted(set(excluded) | {number for number in ERRATA if number in OFFICIAL[split]}):
-                sources = ["paper"] * (number in excluded) + ["errata"] * (number in ERRATA)
-                used = "no" if number in excluded else "yes"
-                expected.append(f"| {number} | {split} | {', '.join(sources)} | {used} |")
-        assert [line for line in self.page.splitlines() if re.match(r"\| \d", line)] == expected
+            assert f"| {split} | {', '.join(map(str, excluded))} |" in self.page
+        excluded = {number for numbers in EXCLUDED_BY_PAPER.values() for number in numbers}
+        *numbers, last = (str(number) for number in ERRATA if number not in excluded)
+        assert f"{', '.join(numbers)} and {last}" in self.page
 
     def test_page_shows_the_actual_error(self, tmp_path: Path) -> None:
         shutil.copytree(EXAMPLE, tmp_path / "own_data")
