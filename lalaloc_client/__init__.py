@@ -1,4 +1,4 @@
-"""Client of the LaLaLoc service: `Client` blocks, `AsyncClient` is for asyncio; their methods are the same.
+"""Client of the LaLaLoc service: `Client` blocks, `AsyncClient` is for asyncio; both have the same methods.
 
 from lalaloc_client import Client
 

@@ -1,4 +1,4 @@
-"""Scripts for maintainers: setting up, generated documentation, cells of the venue index.
+"""Scripts for maintainers: set-up, generated documentation, and the cells of the venue index.
 
 Begin with `write_docs.py`.
 """

@@ -25,11 +25,11 @@ ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
 # Purpose and first file of the folders without a package docstring.
 _OTHER_FOLDERS = {
-    "web": ("The web pages, in TypeScript; `make web` builds `service/web/` of them.", "src/app.ts"),
-    "models/default": ("The model that ships, with its card.", "README.md"),
-    "docker": ("Image, compose files, nginx, Kubernetes, Grafana dashboard.", "compose.yaml"),
+    "web": ("Web pages in TypeScript; `make web` builds `service/web/` from them.", "src/app.ts"),
+    "models/default": ("The shipped model and its card.", "README.md"),
+    "docker": ("Image, compose files, nginx, Kubernetes manifests, Grafana dashboard.", "compose.yaml"),
     "tests": (
-        "Tests, in folders named as what they test: `core/`, `plans/` (plan files), `service/`, `client/`, `web/`.",
+        "Tests, one folder per subject: `core/`, `plans/` (plan files), `service/`, `client/`, `web/`.",
         "test_boundaries.py",
     ),
 }

@@ -1,4 +1,4 @@
-"""The HTTP service.
+"""HTTP service around the query side of `lalaloc_core`.
 
 Begin with `app.py`, the application, and `runtime.py`, its parts; a query begins in `routes/localise.py`.
 

@@ -23,7 +23,7 @@ def openapi_text() -> str:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("file", nargs="?", type=Path, help="where to write; standard output when left out")
+    parser.add_argument("file", nargs="?", type=Path, help="file to write (default: standard output)")
     file = parser.parse_args().file
     if file is None:
         sys.stdout.write(openapi_text())

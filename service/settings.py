@@ -27,7 +27,7 @@ from service.setting_types import Area, Count, HostNames, Metres, Origins, PortM
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
 
-# Requests that may be uploading, in addition to the queries in work.
+# Requests that may be uploading, in addition to the queries in progress.
 _UPLOADS = 38
 
 # Settings of earlier versions that are constants now. A variable that still sets one is ignored with a warning.
@@ -93,8 +93,8 @@ class ComputeSettings(_Group):
         default=0,
         ge=0,
         le=256,
-        description="Queries that the main process computes at a time, not counting LPO. 0: the cores that the LPO "
-        "workers leave free.",
+        description="Queries that the main process computes at a time, without LPO. 0: the cores that the LPO workers "
+        "leave free.",
     )
 
 
@@ -104,14 +104,12 @@ class LpoSettings(_Group):
     prefix = "lpo_"
 
     queue: Count = Field(
-        default=16, description="LPO jobs that can wait for a worker. Queries beyond that keep the VDR pose."
+        default=16, description="Maximum number of LPO jobs that wait for a worker; further queries keep the VDR pose."
     )
     deadline_s: Seconds = Field(
         default=2.0, description="LPO timeout per query; the answer then falls back to the VDR pose."
     )
-    stall_s: Seconds = Field(
-        default=10.0, description="An LPO worker that is busy with one job for longer is restarted."
-    )
+    stall_s: Seconds = Field(default=10.0, description="Timeout for one LPO job; its worker is then restarted.")
 
 
 class DecodeSettings(_Group):
@@ -123,7 +121,7 @@ class DecodeSettings(_Group):
         default=2,
         ge=1,
         le=64,
-        description="Decoder processes, each with one panorama at a time. One is reserved for idle tenants.",
+        description="Processes that decode panoramas, one at a time each. One is reserved for idle tenants.",
     )
     stall_s: Seconds = Field(
         default=4.0, description="Timeout for decoding one panorama; the process is then replaced and the query fails."
@@ -134,7 +132,7 @@ class DecodeSettings(_Group):
 
 
 class ImportSettings(_Group):
-    """Reading plan files."""
+    """Import of plan files."""
 
     prefix = "import_"
 
@@ -157,7 +155,7 @@ class AccessSettings(_Group):
 
     api_keys: bool = Field(
         default=False,
-        description="Require an API key on every route except health and metrics; create keys with `lalaloc-service "
+        description="Require an API key on every route except health and the pages; create keys with `lalaloc-service "
         "keys create`.",
     )
     allow_anonymous: bool = Field(
@@ -166,8 +164,8 @@ class AccessSettings(_Group):
     )
     allowed_hosts: HostNames = Field(
         default="",
-        description="Without API keys: host names, separated by commas, that requests can use (`Host`, `Origin`) in "
-        "addition to this machine's; `*` for any.",
+        description="Without API keys: host names, separated by commas, that requests can use (`Host`, `Origin`) "
+        "besides this machine's; `*` for any.",
     )
     cors_origins: Origins = Field(
         default="",
@@ -241,31 +239,33 @@ class UploadSettings(_Group):
 class RequestSettings(_Group):
     """Requests and connections."""
 
-    request_deadline_s: Seconds = Field(default=10.0, description="Timeout for a query once it is uploaded.")
+    request_deadline_s: Seconds = Field(default=10.0, description="Timeout for a query after its upload.")
     max_pending_requests: int = Field(
         default=0,
         ge=0,
-        description="Uploads and queries in work, counted from the first byte; more get a 503. 0: "
+        description="Uploads and queries in progress, from the first byte; further ones get 503. 0: "
         "`LALALOC_MAX_QUERIES` plus 38.",
     )
     max_queries: int = Field(
         default=0,
         ge=0,
-        description="Queries computed at a time; more wait, see `LALALOC_MAX_WAITING_QUERIES`. 0: enough for one "
-        "tenant to keep every LPO worker and compute thread busy twice.",
+        description="Queries computed at a time; further ones wait (`LALALOC_MAX_WAITING_QUERIES`). 0: enough that one "
+        "tenant can run two queries per LPO worker and compute thread.",
     )
     max_waiting_queries: int = Field(
-        default=16, ge=0, description="Queries that can wait for a slot; more get a 503 before their upload is read."
+        default=16, ge=0, description="Queries that wait for a slot; further ones get 503 before their upload is read."
     )
-    max_reads: Count = Field(default=64, description="Read-only requests in work; more get a 503.")
-    max_streams: Count = Field(default=64, description="Open event streams; more get a 503.")
-    max_connections: Count = Field(default=1024, description="Open connections, idle ones included; more get a 503.")
+    max_reads: Count = Field(default=64, description="Read-only requests in progress; further ones get 503.")
+    max_streams: Count = Field(default=64, description="Open event streams; further ones get 503.")
+    max_connections: Count = Field(
+        default=1024, description="Open connections, including idle ones; further ones get 503."
+    )
     keep_alive_s: Seconds = Field(default=15.0, description="Timeout for an idle connection between requests.")
     stop_deadline_s: float = Field(
         default=20.0,
         ge=1.0,
         le=3600.0,
-        description="Timeout for stopping: requests in work are finished, new ones refused.",
+        description="Timeout for stopping: requests in progress finish, new ones are refused.",
     )
     stop_notice_s: float = Field(
         default=0.0, ge=0.0, le=3600.0, description="Time for which `/readyz` reports 503 before the service stops."
@@ -278,7 +278,7 @@ class GridSettings(_Group):
     grid_step_m: float = Field(
         default=0.5, ge=0.1, le=5.0, description="Distance between neighbouring poses of a pose grid."
     )
-    max_grid_poses: Count = Field(default=900_000, description="Poses in the pose grid of one plan.")
+    max_grid_poses: Count = Field(default=900_000, description="Maximum number of poses in the pose grid of one plan.")
     inline_grid_poses: int = Field(
         default=1000,
         ge=0,
@@ -289,7 +289,8 @@ class GridSettings(_Group):
         ge=0.1,
         le=3600.0,
         allow_inf_nan=False,
-        description="A replica that is silent for longer loses the pose grid that it computes to another replica.",
+        description="Lifetime of the lease on a pose grid: if the owner is silent for longer, another replica computes "
+        "the grid.",
     )
     sweep_s: float = Field(
         default=5.0,
@@ -306,7 +307,7 @@ class StorageSettings(_Group):
     plan_cache_bytes: int = Field(
         default=64 * 2**20,
         ge=0,
-        description="Floor plans kept in memory, for speed and for queries while the database is away. 0: none.",
+        description="Floor plans kept in memory, for speed and for queries while the database is down. 0: none.",
     )
     grid_cache_bytes: int = Field(default=2**30, ge=0, description="Pose grids kept in memory.")
     venue_cache_bytes: int = Field(
@@ -324,9 +325,9 @@ class StorageSettings(_Group):
         default=0.0,
         ge=0.0,
         le=366 * 86400.0,
-        description="Lifetime of answers that a link can reopen; panoramas are never kept. 0: answers are not kept.",
+        description="Lifetime of kept answers, which a link reopens; panoramas are never kept. 0: no answers are kept.",
     )
-    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is dropped first.")
+    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is deleted first.")
 
 
 class PlanSettings(_Group):
@@ -334,11 +335,11 @@ class PlanSettings(_Group):
 
     max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
     max_revisions: int = Field(
-        default=10, ge=2, description="Revisions kept per floor plan; the oldest is dropped first."
+        default=10, ge=2, description="Revisions kept per floor plan; the oldest is deleted first."
     )
-    max_plan_bytes: Count = Field(default=40 * 2**20, description="Upload of a floor plan, in any format.")
+    max_plan_bytes: Count = Field(default=40 * 2**20, description="Size of a plan file, in any format.")
     max_unpacked_bytes: Count = Field(
-        default=200_000_000, description="Size of an archive, or of a compressed part of a plan file, once unpacked."
+        default=200_000_000, description="Unpacked size of an archive, or of a compressed part of a plan file."
     )
     max_entities: Count = Field(
         default=300_000, description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
@@ -346,8 +347,8 @@ class PlanSettings(_Group):
     max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a floor plan picture.")
     max_import_s: Seconds = Field(
         default=30.0,
-        description="Timeout for reading a plan file. The process is replaced 10 s later; waiting included, an upload "
-        "can take twice this time.",
+        description="Timeout for reading a plan file. The process is replaced 10 s later. Including the wait for a "
+        "process, an upload can take twice this time.",
     )
     max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
     max_vertices: int = Field(default=200, ge=3, description="Vertices per room.")
@@ -361,7 +362,7 @@ class PlanSettings(_Group):
     max_openings: int = Field(default=20_000, ge=0, description="Doors, windows and passages of a floor plan.")
     max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
-    max_venue_bytes: Count = Field(default=4 * 2**20, description="Upload of a venue document.")
+    max_venue_bytes: Count = Field(default=4 * 2**20, description="Size of a venue document.")
 
     @property
     def plan_limits(self) -> PlanLimits:
@@ -397,9 +398,11 @@ class PlanSettings(_Group):
 class PanoramaSettings(_Group):
     """Limits of panoramas and queries."""
 
-    max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
+    max_panorama_bytes: Count = Field(default=40 * 2**20, description="Size of a panorama file.")
     max_sequence_panoramas: int = Field(default=10, ge=2, le=20, description="Panoramas per sequence query.")
-    max_sequence_bytes: Count = Field(default=100 * 2**20, description="Upload of all panoramas of a sequence query.")
+    max_sequence_bytes: Count = Field(
+        default=100 * 2**20, description="Size of all panorama files of a sequence query."
+    )
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")
     max_top_k: int = Field(default=10, ge=1, le=100, description="Candidates per answer.")
@@ -407,7 +410,7 @@ class PanoramaSettings(_Group):
         default=20.0,
         ge=0.0,
         le=45.0,
-        description="Tolerance of the compass heading in a panorama's metadata: headings within it are searched.",
+        description="Tolerance of the compass heading in a panorama's metadata: the search covers headings within it.",
     )
 
     @property
@@ -506,12 +509,12 @@ class Settings(BaseModel):
 
     @property
     def pending_limit(self) -> int:
-        """Limit of uploads and queries in work, resolved."""
+        """Limit of uploads and queries in progress, resolved."""
         return self.requests.max_pending_requests or self.query_limit + _UPLOADS
 
     @property
     def query_limit(self) -> int:
-        """Limit of queries in work, resolved."""
+        """Limit of queries in progress, resolved."""
         return self.requests.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
 
     @property

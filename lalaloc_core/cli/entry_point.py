@@ -38,7 +38,9 @@ def main(argv: list[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("lalaloc"):
             raise
-        print(f"error: '{error.name}' is not installed; the README lists the extra that brings it", file=sys.stderr)
+        print(
+            f"error: '{error.name}' is not installed; pyproject.toml lists the extra that contains it", file=sys.stderr
+        )
         return 1
     return 0
 
@@ -53,7 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
     )
-    completion.add_argument("shell", choices=("bash", "zsh"))
+    completion.add_argument("shell", choices=("bash", "zsh"), help="shell")
     completion.set_defaults(run=lambda arguments: _complete(parser, arguments.shell))
     return parser
 

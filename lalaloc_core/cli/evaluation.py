@@ -57,7 +57,7 @@ def add_commands(commands: Any) -> None:
         help="step of the pose grid, metres (default: %(default)s)",
     )
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
-    evaluate.add_argument("--limit", type=count, metavar="N", help="largest number of queries (default: all)")
+    evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
     evaluate.add_argument("--skip-bad", action="store_true", help="skip and list unusable samples")
     evaluate.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
     evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; an existing run is continued")

@@ -50,13 +50,16 @@ def add_commands(commands: Any) -> None:
         "compass if the plan has north_deg, otherwise estimated)",
     )
     localise.add_argument(
-        "--heading-tolerance", type=tolerance, metavar="DEG", help="largest error of --heading (default: 0)"
+        "--heading-tolerance",
+        type=tolerance,
+        metavar="DEG",
+        help="maximum error of --heading, at most 45 degrees (default: 0)",
     )
     localise.add_argument(
         "--camera-height",
         type=positive,
         metavar="M",
-        help="metres over the floor (default: the plan's, otherwise estimated)",
+        help="metres above the floor (default: the plan's, otherwise estimated)",
     )
     localise.add_argument(
         "--out",

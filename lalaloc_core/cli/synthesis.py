@@ -21,16 +21,22 @@ def add_commands(commands: Any) -> None:
     synth.add_argument("--split", choices=("all", *SPLITS), default="all", help="split (default: %(default)s)")
     synth.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
     synth.add_argument(
-        "--height", type=int, default=256, help="pixels of a panorama's height, half its width (default: %(default)s)"
+        "--height", type=int, default=256, help="height of a panorama in pixels, half its width (default: %(default)s)"
     )
     synth.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     synth.add_argument("--workers", type=int, default=1, help="rendering processes (default: %(default)s)")
     synth.set_defaults(run=_synth)
 
-    sheet = commands.add_parser("contact-sheet", help="write a sheet of synthetic panoramas to look at")
-    sheet.add_argument("--out", type=Path, default=Path("contact_sheet.jpg"))
-    sheet.add_argument("--seed", type=int, default=0)
-    sheet.add_argument("--textures", type=Path)
+    sheet = commands.add_parser("contact-sheet", help="write a picture with examples of synthetic panoramas")
+    sheet.add_argument(
+        "--out",
+        type=Path,
+        default=Path("contact_sheet.jpg"),
+        metavar="FILE",
+        help="picture to write (default: %(default)s)",
+    )
+    sheet.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
+    sheet.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     sheet.set_defaults(run=_contact_sheet)
 
 

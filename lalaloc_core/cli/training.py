@@ -27,13 +27,18 @@ def add_commands(commands: Any) -> None:
     train.add_argument(
         "stage", choices=("layout", "image", "end-to-end"), help="stage to train; end-to-end trains both at once"
     )
-    train.add_argument("--preset", default="ring", choices=("ring", "trunk", "paper", "tiny", "tiny-trunk"))
+    train.add_argument(
+        "--preset",
+        default="ring",
+        choices=("ring", "trunk", "paper", "tiny", "tiny-trunk"),
+        help="networks and schedule (default: %(default)s)",
+    )
     train.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run, shared by both stages"
     )
     train.add_argument("--data", type=Path, metavar="DIR", help="data set (default: homes generated during training)")
     train.add_argument("--skip-bad", action="store_true", help="skip unusable files and log each once")
-    train.add_argument("--minutes", type=float, help="wall-clock budget; replaces --steps in the schedule")
+    train.add_argument("--minutes", type=float, help="training time, instead of --steps")
     train.add_argument("--steps", type=int, help="number of updates (default: the preset's)")
     train.add_argument("--seed", type=int, help="random seed (default: the preset's)")
     train.add_argument(
@@ -80,7 +85,7 @@ def add_commands(commands: Any) -> None:
         type=int,
         default=_VALIDATION_HOMES,
         metavar="N",
-        help="largest number of homes or scenes for validation (default: %(default)s)",
+        help="maximum number of homes or scenes for validation (default: %(default)s)",
     )
     train.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     train.set_defaults(run=_train)

@@ -1,1 +1,1 @@
-"""Learning side: data sets, synthetic homes, training and export. Begin with `training/loop.py`."""
+"""Training of models: data sets, synthetic homes, training and export. Begin with `training/loop.py`."""

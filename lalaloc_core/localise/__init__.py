@@ -1,4 +1,4 @@
-"""The search: from an encoded panorama to a pose. Service and evaluation run the same code.
+"""Search for the pose of an encoded panorama; service and evaluation run the same code.
 
 Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's pose grid, `vogel.py` samples
 more poses around the best, `optimise/` refines them (LPO, the only part that imports torch), and `posterior.py`,

@@ -1,4 +1,4 @@
-"""The networks, in torch: layout encoders, image encoders, and the decoder of latents.
+"""Networks in torch: layout encoders, image encoders, and the decoder of latents.
 
 Begin with `image_encoder.py` and `layout_encoder.py`, the two of the shipped model. The image encoder extends a trunk
 pretrained on photographs (`trunk.py`), predicts `image_features.py`, and uses the attention of `horizon_attention.py`.

@@ -1,6 +1,6 @@
-"""The layout renderer: bare walls, floor and ceiling of a plan as a camera sees them, in closed form.
+"""Layout renderer: bare walls, floor and ceiling of a plan from the pose of a camera, in closed form.
 
-Begin with `profile.py`: it casts rays at walls. `layout.py` adds openings and the rooms behind them, `depth.py` adds
+Begin with `profile.py`, which casts rays at walls. `layout.py` adds openings and the rooms behind them, `depth.py` adds
 floor and ceiling, and `gradient.py` computes derivatives by the pose. These modules run on numpy and on torch alike.
 `sweep.py` renders many poses of a plan at once, for numpy only; search and training use it. `sampling.py` draws poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.

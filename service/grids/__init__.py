@@ -1,4 +1,4 @@
-"""Pose grids of plans: found in memory or in the store, computed by one replica for all of them.
+"""Pose grids of plans: read from memory or the store, or computed by one replica for all.
 
 Begin with `grid_provider.py`, the interface for all other packages. `builder.py` computes the grids that `grid_jobs.py`
 queues, under leases; `throttle.py` gives queries priority, and `sweeper.py` reacts to other replicas.

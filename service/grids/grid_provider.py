@@ -88,11 +88,13 @@ class GridProvider:
         self._inline = threading.Lock()
         self._jobs = GridBuilder(store, encoders, self._cache, self.throttle, settings, telemetry).jobs
         self._unprepared = 0
-        telemetry.gauge("lalaloc_grids_pending", "Pose grids computed or queued in this replica.", lambda: self.pending)
+        telemetry.gauge(
+            "lalaloc_grids_pending", "Pose grids being computed or queued in this replica.", lambda: self.pending
+        )
         telemetry.gauge(
             "lalaloc_grids_preparing", "Plans without a pose grid, in all replicas.", lambda: self.preparing
         )
-        telemetry.gauge("lalaloc_grid_cache_bytes", "Pose grids in memory.", lambda: self._cache.bytes)
+        telemetry.gauge("lalaloc_grid_cache_bytes", "Size of the pose grids in memory.", lambda: self._cache.bytes)
 
     @property
     def pending(self) -> int:

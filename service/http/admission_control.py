@@ -209,14 +209,14 @@ class Admission:
         self.reading = FairSemaphore(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
-        telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in work.", lambda: self.requests.in_use)
+        telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in progress.", lambda: self.requests.in_use)
         telemetry.gauge(
             "lalaloc_queries_in_work",
-            "Queries computed, not counting those that wait for a pose grid.",
+            "Queries being computed, without those that wait for a pose grid.",
             lambda: self.queries.in_use,
         )
-        telemetry.gauge("lalaloc_queries_waiting", "Queries that wait for a slot.", lambda: self.queries.waiting)
-        telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in work.", lambda: self.reads.in_use)
+        telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
+        telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
 
     def drain(self) -> None:

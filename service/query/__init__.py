@@ -3,8 +3,8 @@
 Begin with `localiser.py`, whose `_localise` shows the steps in order. `stated_camera.py` reads the fields about the
 camera, `answers.py` composes the answer. `venue_localiser.py` does the same for a venue: `venue_plans.py` chooses the
 plans by the prototypes in `prototype_file.py`, and `venue_hints.py` applies the hints to them. `decoding.py` and
-`lpo_pool.py` are pools of worker processes. `queries.py` has the queries and the interfaces of what may run in other
-processes.
+`lpo_pool.py` are pools of worker processes. `queries.py` has the queries and the interfaces of the components that can
+run in other processes.
 """
 
 from service.query.decoding import Decoder

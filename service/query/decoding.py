@@ -54,7 +54,7 @@ class Decoder:
             "lalaloc_decode_queue_depth", "Panoramas waiting for a decoding worker.", lambda: self._pool.waiting
         )
         telemetry.gauge(
-            "lalaloc_decode_workers_ready", "Decoding workers that are warm.", lambda: self._pool.state.ready
+            "lalaloc_decode_workers_ready", "Decoding workers that are ready.", lambda: self._pool.state.ready
         )
         telemetry.gauge(
             "lalaloc_decode_workers_resident_bytes",

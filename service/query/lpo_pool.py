@@ -40,7 +40,7 @@ class LpoPool:
         for reason in get_args(LostReason):
             telemetry.lpo_missed.labels(reason)
         telemetry.gauge("lalaloc_lpo_queue_depth", "LPO jobs waiting for a worker.", lambda: self._workers.waiting)
-        telemetry.gauge("lalaloc_lpo_workers_ready", "LPO workers that are warm.", lambda: self.state.ready)
+        telemetry.gauge("lalaloc_lpo_workers_ready", "LPO workers that are ready.", lambda: self.state.ready)
         telemetry.gauge(
             "lalaloc_lpo_workers_resident_bytes", "Memory of all LPO workers.", lambda: self._workers.resident_bytes
         )

@@ -13,8 +13,8 @@ from service.schemas.localise_answer import ModelAnswer
 class LimitsAnswer(ResponseModel):
     """Limits of requests; most are settings, and errors name them."""
 
-    max_plan_bytes: int = Field(description="Upload of a floor plan, in any format.")
-    max_unpacked_bytes: int = Field(description="Size of an archive or of a compressed part of a plan file, unpacked.")
+    max_plan_bytes: int = Field(description="Size of a plan file, in any format.")
+    max_unpacked_bytes: int = Field(description="Unpacked size of an archive, or of a compressed part of a plan file.")
     max_entities: int = Field(
         description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
     )
@@ -28,32 +28,32 @@ class LimitsAnswer(ResponseModel):
     max_area_m2: float = Field(description="Floor area of all rooms of a floor plan.")
     max_bounds_area_m2: float = Field(description="Area of the bounding boxes of all rooms.")
     max_openings: int = Field(description="Doors, windows and passages of a floor plan.")
-    max_grid_poses: int = Field(description="Poses in the pose grid of one plan.")
+    max_grid_poses: int = Field(description="Maximum number of poses in the pose grid of one plan.")
     max_venues: int = Field(description="Stored venues per tenant.")
     max_venue_plans: int = Field(description="Floor plans of a venue.")
-    max_venue_bytes: int = Field(description="Upload of a venue document.")
-    max_panorama_bytes: int = Field(description="Upload of a panorama.")
+    max_venue_bytes: int = Field(description="Size of a venue document.")
+    max_panorama_bytes: int = Field(description="Size of a panorama file.")
     max_sequence_panoramas: int = Field(description="Panoramas per sequence query.")
-    max_sequence_bytes: int = Field(description="Upload of all panoramas of a sequence query.")
+    max_sequence_bytes: int = Field(description="Size of all panorama files of a sequence query.")
     max_pixels: int = Field(description="Pixels of a panorama.")
     max_scans: int = Field(description="Scans of a progressive JPEG.")
     max_top_k: int = Field(description="Candidates per answer.")
-    max_pending_requests: int = Field(description="Uploads and queries in work.")
-    max_queries: int = Field(description="Queries computed at a time; more wait.")
+    max_pending_requests: int = Field(description="Uploads and queries in progress.")
+    max_queries: int = Field(description="Queries computed at a time; further ones wait.")
     max_queries_per_tenant: int = Field(
         description="Queries computed at a time for one tenant (without API keys: for one client address). A tenant "
         "that is alone and stays within it is never refused."
     )
-    max_waiting_queries: int = Field(description="Queries that can wait; more get a 503.")
-    max_reads: int = Field(description="Read-only requests in work; more get a 503.")
-    max_streams: int = Field(description="Open event streams; more get a 503.")
+    max_waiting_queries: int = Field(description="Queries that wait for a slot; further ones get 503.")
+    max_reads: int = Field(description="Read-only requests in progress; further ones get 503.")
+    max_streams: int = Field(description="Open event streams; further ones get 503.")
     max_revisions: int = Field(description="Revisions kept per floor plan.")
     upload_deadline_s: float = Field(description="Timeout for an upload.")
     upload_idle_s: float = Field(description="Timeout for the next bytes of an upload.")
     upload_bytes_per_s: float = Field(
         description="Minimum upload rate; an upload can lag behind it by `upload_idle_s`."
     )
-    request_deadline_s: float = Field(description="Timeout for a query once it is uploaded.")
+    request_deadline_s: float = Field(description="Timeout for a query after its upload.")
 
 
 class HealthAnswer(ResponseModel):
@@ -67,7 +67,7 @@ class PoolAnswer(ResponseModel):
 
     workers: int = Field(description="Configured worker processes.")
     ready: int = Field(description="Worker processes that are ready now.")
-    warmed_up: bool = Field(description="True once every worker has been ready.")
+    warmed_up: bool = Field(description="True after every worker has been ready.")
     fault: str | None = Field(description="Reason why a worker failed to start; null if none did.")
 
 

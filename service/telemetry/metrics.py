@@ -30,26 +30,28 @@ class Telemetry:
         self._gauges: dict[str, Gauge] = {}
         self._counters: dict[str, Counter] = {}
         ProcessCollector(registry=self.registry)
-        self.requests = self.counter("lalaloc_http_requests", "Requests answered.", ["method", "route", "status"])
+        self.requests = self.counter("lalaloc_http_requests", "Answered requests.", ["method", "route", "status"])
         self.request_seconds = Histogram(
             "lalaloc_http_request_seconds",
-            "Time to answer, upload included.",
+            "Duration of requests, including the upload.",
             ["route"],
             buckets=_SECONDS,
             registry=self.registry,
         )
-        self.rejections = self.counter("lalaloc_rejections", "Requests refused, by the kind of problem.", ["reason"])
+        self.rejections = self.counter("lalaloc_rejections", "Refused requests, by problem kind.", ["reason"])
         self.disconnects = self.counter(
             "lalaloc_disconnects", "Requests whose client disconnected before the end of the answer.", ["route"]
         )
         self.stage_seconds = Histogram(
-            "lalaloc_stage_seconds", "Time per stage of a query.", ["stage"], buckets=_SECONDS, registry=self.registry
+            "lalaloc_stage_seconds",
+            "Duration of each stage of a query.",
+            ["stage"],
+            buckets=_SECONDS,
+            registry=self.registry,
         )
-        self.answers = self.counter(
-            "lalaloc_localise_answers", "Queries answered, by the stage that answered.", ["stage"]
-        )
+        self.answers = self.counter("lalaloc_localise_answers", "Answered queries, by last stage.", ["stage"])
         self.lpo_missed = self.counter(
-            "lalaloc_lpo_missed", "LPO jobs without an answer in time, by reason.", ["reason"]
+            "lalaloc_lpo_missed", "LPO jobs without a result in time, by reason.", ["reason"]
         )
         self.pool_restarts = self.counter("lalaloc_pool_restarts", "Replaced worker processes, by pool.", ["pool"])
         # Exported as 0 from the start, so that the first restart shows as an increase.
@@ -59,7 +61,10 @@ class Telemetry:
         self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Pose grids not found in memory.")
         self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Pose grids evicted from memory.")
         self.grid_seconds = Histogram(
-            "lalaloc_grid_seconds", "Time to compute a pose grid.", buckets=_GRID_SECONDS, registry=self.registry
+            "lalaloc_grid_seconds",
+            "Duration of the computation of a pose grid.",
+            buckets=_GRID_SECONDS,
+            registry=self.registry,
         )
 
     def counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:

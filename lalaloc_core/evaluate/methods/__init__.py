@@ -1,4 +1,4 @@
-"""Localisation methods, each a row of a results table: a question in, the pose after each stage out.
+"""Localisation methods: each takes a query and returns the pose after each stage.
 
 Begin with `method.py`, the question and the answer. `lalaloc.py` is this project's search. `icp.py`, `explicit.py` and
 `decode.py` are the paper's baselines. `similarity.py` retrieves with the true layout or pose.

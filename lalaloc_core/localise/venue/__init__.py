@@ -1,7 +1,7 @@
-"""A panorama in a venue of several plans, perhaps in very many.
+"""Search for the pose of a panorama in a venue of many plans.
 
-Begin with `merged_plans.py`, which makes one plan of those that are searched in full. Where there are too many for
-that, `plan_index.py` says which these are: by prototypes, a few poses of each plan (`prototypes.py`), that lie in the
-cells of an inverted file (`prototype_cells.py`), are compared by short codes (`prototype_codes.py`), and the best of
-them as they are (`prototype_costs.py`). The search itself is that of a single plan, `localise.pipeline`.
+Begin with `merged_plans.py`, which merges the plans to search into one; `localise.pipeline` then searches it like a
+single plan. For a large venue, `plan_index.py` selects these plans by prototypes, a few poses of each plan
+(`prototypes.py`). Prototypes are stored in the cells of an inverted file (`prototype_cells.py`), compared by short
+codes (`prototype_codes.py`), and the best ones exactly (`prototype_costs.py`).
 """

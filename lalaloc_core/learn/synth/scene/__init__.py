@@ -1,4 +1,4 @@
-"""Scenes: the view of one camera in a home, as arrays to render: walls, decals, furniture, materials, light.
+"""Scenes: surroundings of one camera in a home as arrays to render (walls, decals, furniture, materials, light).
 
 Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`); `facts.py` lists
 properties that make a shot hard.
