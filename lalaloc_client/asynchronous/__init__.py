@@ -1,1 +1,4 @@
-"""`AsyncClient`, from which `make client` generates `blocking/`. Begin with `client.py`."""
+"""`AsyncClient`, from which `make client` generates `blocking/`.
+
+Begin with `client.py`.
+"""

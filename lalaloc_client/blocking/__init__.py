@@ -1,1 +1,4 @@
-"""`Client`; `make client` generates all but `backend.py` from `asynchronous/`. Begin with `client.py`."""
+"""`Client`; `make client` generates all but `backend.py` from `asynchronous/`.
+
+Begin with `client.py`.
+"""

@@ -1,1 +1,4 @@
-"""Training of models: data sets, synthetic homes, training and export. Begin with `training/loop.py`."""
+"""Training of models: data sets, synthetic homes, training and export.
+
+Begin with `training/loop.py`.
+"""
