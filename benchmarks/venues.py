@@ -73,7 +73,7 @@ def prototypes(plans: int, seed: int) -> list[np.ndarray]:
     for number in range(plans):
         home, _ = home_of(_TEST, seed, number)
         rows = prototypes_of(grid_without_latents(home), home.plan).rows
-        rows["cell"] = shipped_cells().sort(rows)
+        rows["cell"] = shipped_cells().assign(rows)
         blocks.append(rows)
         if number % 1000 == 999:
             print(f"  {number + 1} homes", flush=True)
@@ -150,7 +150,7 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
         opened = time.process_time()
         found = file.find(keys)
         first = np.array([found[key][0] for key in keys])
-        index = PlanIndex.of(file.rows(), first, count, step_m=_STEP_M, cells=cells)
+        index = PlanIndex.build(file.rows(), first, count, step_m=_STEP_M, cells=cells)
         built = time.process_time()
         index.prepare()
         print(
@@ -192,7 +192,7 @@ def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
     homes = [home_of(_TEST, options.seed, number)[0] for number in range(options.plans)]
     plans, grids = [home.plan for home in homes], [grid_without_latents(home) for home in homes]
     parts = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]
-    index, poses = PlanIndex.of_parts(parts, shipped_cells()), np.array([len(grid.poses) for grid in grids])
+    index, poses = PlanIndex.from_prototypes(parts, shipped_cells()), np.array([len(grid.poses) for grid in grids])
 
     def best_plan(query: Query, chosen: list[int]) -> int:
         merged = MergedPlans.of([plans[k] for k in chosen], [grids[k] for k in chosen], query.camera_height.height_m)
@@ -204,7 +204,7 @@ def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
     for number, name, query in queries(bundle, photographed, options.seed):
         begin = time.process_time()
         mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
-        chosen = most_probable(mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, limit)).tolist()
+        chosen = most_probable(mass, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, limit)).tolist()
         indexed = time.process_time()
         by_index = best_plan(query, chosen)
         searched = time.process_time()

@@ -193,7 +193,7 @@ class VenuePlans:
         """
         log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
         poses = np.array([row.poses for row in known])
-        chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, self._max_poses))
+        chosen = most_probable(log_mass, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses))
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
@@ -255,13 +255,13 @@ class VenuePlans:
         if not all(key in found for key in keys):
             return None
         begin, count = np.array([found[key] for key in keys], np.int64).T
-        return PlanIndex.of(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
+        return PlanIndex.build(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
 
     def _in_memory(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex:
         blocks = [fresh[_key(row)].in_shipped_cells() for row in known]
         count = np.array([len(block) for block in blocks])
         rows, begin = np.concatenate(blocks), np.cumsum(count) - count
-        return PlanIndex.of(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
+        return PlanIndex.build(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
 
     def _opened(self) -> PrototypeFile:
         if self._file is None:

@@ -40,7 +40,7 @@ class SortedPrototypes:
     def of(cls, prototypes: Prototypes, cells: Cells) -> SortedPrototypes:
         """Sort prototypes into cells."""
         rows = prototypes.rows.copy()
-        rows["cell"] = cells.sort(rows)
+        rows["cell"] = cells.assign(rows)
         return cls(rows, cells.version)
 
     @classmethod

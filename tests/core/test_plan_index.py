@@ -24,7 +24,7 @@ from lalaloc_core.localise.poses import (
 )
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
-from lalaloc_core.localise.venue.prototype_codes import CodeScan, codes_of, tables_of
+from lalaloc_core.localise.venue.prototype_codes import CodeScan, lookup_tables, product_codes
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
@@ -166,7 +166,7 @@ def test_prototypes_cost_what_they_are_said_to(kinds: tuple[str, ...] | None) ->
     n, (k, j) = len(prototypes), costs.shape
     assert (k, j) == (8, len(costs.offsets))
     number, hypothesis, offset = rng.integers(n, size=60), rng.integers(k, size=60), rng.integers(j, size=60)
-    found = costs.of(prototypes.rows[number], hypothesis, offset)
+    found = costs.pairs(prototypes.rows[number], hypothesis, offset)
     slow = [
         slow_cost(prototypes.rows[a], query, int(b), float(costs.offsets[c]))
         for a, b, c in zip(number, hypothesis, offset, strict=True)
@@ -188,13 +188,13 @@ def test_codes_cost_about_what_their_prototypes_do(kinds: tuple[str, ...] | None
     # As much of the ceiling as is bounded nowhere.
     costs = PrototypeCosts(query, STEP_M, replace(WEIGHTS, ceiling=0.02), CONFIG)
     (k, j), n = costs.shape, len(prototypes)
-    value = values_of(codes_of(prototypes.rows))
+    value = values_of(product_codes(prototypes.rows))
     (family,) = np.unique(family_of(prototypes.rows["claims"])).tolist()
-    tables = tables_of(costs, claims_of(family))
+    tables = lookup_tables(costs, claims_of(family))
     for hypothesis in range(k):
         for offset in range(j):
             coded = tables[hypothesis, offset][np.arange(value.shape[1]), value].sum(axis=1)
-            exact = costs.of(prototypes.rows, np.full(n, hypothesis), np.full(n, offset))
+            exact = costs.pairs(prototypes.rows, np.full(n, hypothesis), np.full(n, offset))
             np.testing.assert_allclose(coded, exact, atol=0.15)
             assert np.corrcoef(coded, exact)[0, 1] > 0.98
 
@@ -205,7 +205,7 @@ def test_the_codes_that_cost_least_are_found_in_the_lists_that_are_searched() ->
     tables = rng.random((3, 50, 16)).astype(np.float32)
     cost = tables[:, np.arange(50), values_of(code)].sum(axis=2)
     lists = np.array([[True, False, True, False], [True, True, True, True], [False, False, False, False]])
-    found, told = CodeScan(code, first).best(tables.reshape(3, -1), lists, 250)
+    found, told = CodeScan(code, first).search(tables.reshape(3, -1), lists, 250)
     within = np.where(np.arange(500) < 200, cost[0], np.inf)
     assert set(found[0, :200].tolist()) == set(range(200))
     assert (found[0, 200:] == -1).all()
@@ -220,10 +220,10 @@ def test_masses_are_sums_over_prototypes_and_hypotheses(parts: list[Prototypes])
     few, rng = parts[:4], np.random.default_rng(4)
     query = query_of(few[1], 3, rng, hypotheses=4)
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
-    index = PlanIndex.of_parts(few, shipped_cells())
+    index = PlanIndex.from_prototypes(few, shipped_cells())
     expected = []
     for part in few:
-        cost = np.stack([costs.of(part.rows, np.full(len(part), k), np.zeros(len(part), int)) for k in range(4)])
+        cost = np.stack([costs.pairs(part.rows, np.full(len(part), k), np.zeros(len(part), int)) for k in range(4)])
         weighed = part.rows["log_area"] - WEIGHTS.temperature * cost.astype(float)
         expected.append(np.logaddexp.reduce(weighed, axis=None))
     found = index.log_masses(query, WEIGHTS, CONFIG)
@@ -232,7 +232,7 @@ def test_masses_are_sums_over_prototypes_and_hypotheses(parts: list[Prototypes])
 
 
 def test_few_comparisons_find_what_all_of_them_do(parts: list[Prototypes]) -> None:
-    index, rng = PlanIndex.of_parts(parts, shipped_cells()), np.random.default_rng(5)
+    index, rng = PlanIndex.from_prototypes(parts, shipped_cells()), np.random.default_rng(5)
     pairs = sum(map(len, parts)) * 16
     for number in range(len(parts)):
         query = query_of(parts[number], 5, rng, hypotheses=16)
@@ -251,14 +251,14 @@ def test_an_unknown_camera_height_is_searched(parts: list[Prototypes]) -> None:
     # Read at 1.5 m, taken at 1.95 m: everything looks smaller than it is.
     smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
-    index = PlanIndex.of_parts(parts, shipped_cells())
+    index = PlanIndex.from_prototypes(parts, shipped_cells())
     assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
     assert index.log_masses(unknown, WEIGHTS, CONFIG, compared=2000).argmax() == 7
 
 
 def test_copies_have_equal_masses_however_few_are_compared(parts: list[Prototypes]) -> None:
     several = [*parts, parts[3], parts[3]]
-    index, rng = PlanIndex.of_parts(several, shipped_cells()), np.random.default_rng(7)
+    index, rng = PlanIndex.from_prototypes(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
         query = query_of(parts[3], 1, rng, hypotheses=8)
         masses = index.log_masses(query, WEIGHTS, CONFIG, compared=compared, scanned=scanned)
@@ -274,11 +274,11 @@ def test_plans_with_and_without_openings_are_sorted_and_found_alike() -> None:
         whole.append(prototypes_of(grid_of(complete), complete))
         parts.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
     rows = joined(parts).rows.copy()
-    rows["cell"] = cells.sort(rows)
+    rows["cell"] = cells.assign(rows)
     # None, or doors and windows.
     assert np.unique(rows["cell"] // (len(cells) // FAMILIES)).tolist() == [0, 3]
     assert np.unique(family_of(rows["claims"])).tolist() == [0, 3]
-    index = PlanIndex.of_parts(parts, cells)
+    index = PlanIndex.from_prototypes(parts, cells)
     for number in range(12):
         query = query_of(whole[number], 2, rng, hypotheses=8)
         masses = index.log_masses(query, WEIGHTS, CONFIG, compared=3000)
@@ -292,11 +292,11 @@ def test_cells_cost_about_what_prototypes_in_their_middle_do(parts: list[Prototy
     cells = Cells(rows["log_profile"].astype(np.float32), share, version=1)
     rows["claims"] = sum(1 << code for code in range(1, CLASSES))
     family = FAMILIES - 1
-    assert cells.sort(rows).tolist() == list(range(family * 50, family * 50 + 50))
+    assert cells.assign(rows).tolist() == list(range(family * 50, family * 50 + 50))
     query = query_of(parts[0], 1, np.random.default_rng(9), hypotheses=4)
     query = replace(query, ceiling=None, room_type=None)
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
     by_cell = cells.costs(costs, [family])[family]
     for hypothesis in range(4):
-        exact = costs.of(rows, np.full(50, hypothesis), np.zeros(50, int))
+        exact = costs.pairs(rows, np.full(50, hypothesis), np.zeros(50, int))
         np.testing.assert_allclose(by_cell[:, hypothesis, 0], exact, atol=0.1)

@@ -119,13 +119,13 @@ def test_places_are_told_in_the_frames_of_their_plans(merged_plans: MergedPlans)
 
 def test_the_most_probable_plans_are_searched_as_far_as_they_go() -> None:
     log_mass, poses = np.array([-3.0, -1.0, -2.0, -9.0]), np.array([10, 500, 20, 30])
-    assert most_probable(log_mass, poses, most_plans=3, most_poses=1000).tolist() == [1, 2, 0]
-    assert most_probable(log_mass, poses, most_plans=2, most_poses=1000).tolist() == [1, 2]
-    assert most_probable(log_mass, poses, most_plans=4, most_poses=525).tolist() == [1, 2]
-    assert most_probable(log_mass, poses, most_plans=4, most_poses=5).tolist() == [1]
+    assert most_probable(log_mass, poses, max_plans=3, max_poses=1000).tolist() == [1, 2, 0]
+    assert most_probable(log_mass, poses, max_plans=2, max_poses=1000).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=525).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=5).tolist() == [1]
     # Nor those that weigh nothing.
     nothing = np.array([-np.inf, -1.0, -np.inf, -9.0])
-    assert most_probable(nothing, poses, most_plans=4, most_poses=1000).tolist() == [1, 3]
+    assert most_probable(nothing, poses, max_plans=4, max_poses=1000).tolist() == [1, 3]
 
 
 def test_what_was_left_out_keeps_its_share() -> None:

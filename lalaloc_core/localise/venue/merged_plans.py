@@ -1,7 +1,7 @@
-"""Several plans as one: laid side by side, so far apart that nothing of one is near anything of another.
+"""Several plans merged into one plan, side by side with gaps between them.
 
-A panorama is then searched for in all of them at once, by the same code and at the same cost as in a single plan, and
-the posterior over all their poses is the one of that plan, with the same prior for every square metre of floor.
+The search of a single plan then searches all of them, with the same code and the same cost per pose. Its posterior
+covers the poses of all plans, with an equal prior for every square metre of floor.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from lalaloc_core.localise.layouts import joined_layouts
 from lalaloc_core.localise.poses import Candidate, PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 
-# Between the boxes around two plans; farther than any two poses that are taken for one place.
+# Gap between the bounding boxes of two plans, larger than any distance at which poses count as one place.
 _GAP_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class MergedPlans:
-    """Some plans and their grids as one plan and one grid.
+    """Merged plan of p plans, and its pose grid.
 
     Attributes:
-        plans: the plans themselves.
-        plan: all of them in one frame. Of the openings, those kinds count that every one of them shows completely: what
-            only some of them show would make these fit worse than those that say nothing.
-        grid: their poses in that frame, in the order of the plans.
-        shift_m: (p, 2) what each plan was moved by.
+        plans: the plans, each in its own frame.
+        plan: the merged plan. It claims the opening kinds that every plan claims, as a kind that only some plans show
+            would make these fit worse than plans without it.
+        grid: poses of all plans in the merged frame, in the order of the plans.
+        shift_m: (p, 2) translation (m) of each plan into the merged frame.
     """
 
     plans: tuple[FloorPlan, ...]
@@ -42,14 +42,16 @@ class MergedPlans:
 
     @classmethod
     def of(cls, plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], camera_height_m: float) -> MergedPlans:
-        """Lay plans out, in rows and columns: a single row of many would be so long that single precision feels it.
+        """Merge plans, laid out in a square of cells.
+
+        A single row would be so long that coordinates lose precision in single precision.
 
         Args:
             plans: the plans.
-            grids: one for each plan, all with the same step and for the same model.
-            camera_height_m: that of the query.
+            grids: pose grid of each plan, all with the same step and for the same model.
+            camera_height_m: camera height (m) of the query.
         """
-        shift_m = _places(plans)
+        shift_m = _shifts(plans)
         plan = FloorPlan(
             name="",
             rooms=tuple(_moved(room, shift) for plan, shift in zip(plans, shift_m, strict=True) for room in plan.rooms),
@@ -63,35 +65,35 @@ class MergedPlans:
             opening_faces=_faces(plans),
         )
         grid = _grid(plans, grids, shift_m, camera_height_m)
-        return cls(tuple(plans), plan, grid, shift_m, np.array([len(one.poses) for one in grids]))
+        return cls(tuple(plans), plan, grid, shift_m, np.array([len(grid.poses) for grid in grids]))
 
     @cached_property
     def first_room(self) -> Int[np.ndarray, "p"]:
-        """The index that the first room of each plan has among all."""
+        """Number of each plan's first room in the merged plan."""
         return _starts([len(plan.rooms) for plan in self.plans])
 
     def plan_of(self, room_index: int) -> int:
-        """Which plan a room of the one plan is of."""
+        """Return the number of the plan that a room of the merged plan belongs to."""
         return int(np.searchsorted(self.first_room, room_index, side="right")) - 1
 
     def in_own_plan(self, candidate: Candidate) -> tuple[int, Candidate]:
-        """Which plan a candidate lies in, and the candidate in the frame of that plan."""
+        """Return the number of a candidate's plan, and the candidate in that plan's frame."""
         index = self.plan_of(candidate.room_index)
         x_m, y_m = candidate.position_m - self.shift_m[index]
         room = candidate.room_index - int(self.first_room[index])
         return index, replace(candidate, x_m=float(x_m), y_m=float(y_m), room_index=room)
 
-    def by_plan(self, pose: Float[np.ndarray, "n"]) -> Float[np.ndarray, "p"]:
-        """Return the sums over the poses of each plan."""
-        return np.add.reduceat(pose, _starts(self._poses))
+    def by_plan(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "p"]:
+        """Return the sum of each plan's values, given one value for each grid pose."""
+        return np.add.reduceat(values, _starts(self._poses))
 
 
 def _starts(counts: Sequence[int] | Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"]:
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
 
 
-def _places(plans: Sequence[FloorPlan]) -> Float[np.ndarray, "p 2"]:
-    """Return the shift of each plan that places them in the cells of a square."""
+def _shifts(plans: Sequence[FloorPlan]) -> Float[np.ndarray, "p 2"]:
+    """Return the translation (m) of each plan into its cell of a square of equal cells."""
     bounds = np.array([plan.bounds_m for plan in plans])
     cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + _GAP_M
     columns = int(np.ceil(np.sqrt(len(plans))))
@@ -109,7 +111,7 @@ def _moved(room: Room, shift_m: Float[np.ndarray, "2"]) -> Room:
 
 
 def _faces(plans: Sequence[FloorPlan]) -> tuple[OpeningFace, ...]:
-    """Pieces of walls that openings take up, with the indices that rooms and openings have among all."""
+    """Return the opening faces of all plans, with the numbers of rooms and openings in the merged plan."""
     rooms = _starts([len(plan.rooms) for plan in plans])
     openings = _starts([len(plan.openings) for plan in plans])
     return tuple(

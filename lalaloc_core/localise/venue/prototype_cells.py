@@ -1,12 +1,13 @@
-"""Cells that prototypes are sorted into, so that of millions only those are compared that are like the panorama.
+"""Coarse quantiser of the inverted file: cells of prototypes with similar walls and openings.
 
-A cell is a mean of prototypes that look alike, walls and openings, *without* turning one against the other: k-means,
-the coarse quantiser of an inverted file (Sivic and Zisserman, *Video Google*, 2003; Jégou et al., *Product quantization
-for nearest neighbor search*, 2011). The cells come with the package, made of generated homes by
-`scripts/make_prototype_cells.py`. They bear on speed and recall, never on what a prototype costs.
+The centroids are k-means of prototypes of generated homes, without alignment of their headings, and come with the
+package (`scripts/make_prototype_cells.py`). An inverted file probes only the cells whose centroids fit the query (Sivic
+and Zisserman, *Video Google*, 2003; Jégou et al., *Product quantization for nearest neighbor search*, 2011). Cells
+determine which prototypes are compared, and so speed and recall; they do not change the cost of a prototype.
 
-Plans that do not claim all kinds of openings are sorted by those that they do, into cells of their own: there is a
-*family* of them for every set of kinds.
+A plan claims the opening classes that it shows completely. Prototypes are assigned by the claimed classes alone, so
+there is a *family* of cells for every set of claimed classes. All families share the centroids; cell numbers are
+`family · centroids + centroid`.
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, unpacked_openings
 
 CELLS_FILE = Path(__file__).with_name("prototype_cells.npz")
-# What log distances and classes count where prototypes are sorted: about as much as they cost at a usual precision.
+# Scales of log distances and classes in the features, proportional to their cost at a typical precision.
 _LOG_SCALE, _CLASS_SCALE = 0.95, 0.74
-# Robust costs of log distances are looked up, between these (0.25 to 33 m) and so far apart.
+# Bins of log distances (0.25 to 33 m) with tabulated costs.
 _LOWEST, _HIGHEST, _BIN = -1.4, 3.5, 0.35
 _BINS = round((_HIGHEST - _LOWEST) / _BIN) + 1
 _CHUNK = 2048
-# Sets of kinds of openings that a plan may claim, and as many families of cells.
+# Number of families: sets of opening classes that a plan can claim.
 FAMILIES = 1 << (len(OPENING_CLASSES) - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The centres of the cells.
+    """Centroids of the cells of each family.
 
     Attributes:
         log_profile: (v, a) mean log wall profiles (m).
         share: (v, a, c) shares of the opening classes by azimuth.
-        version: tells sorted prototypes of one set of cells from those of another.
+        version: identifier of the centroids, stored with the prototypes that were assigned by them.
     """
 
     log_profile: Float[np.ndarray, "v a"]
@@ -49,31 +50,35 @@ class Cells:
     version: int
 
     def __len__(self) -> int:
-        """How many cells there are in all: these for plans that claim none of the kinds of openings, and so on."""
+        """Return the number of cells of all families."""
         return FAMILIES * len(self.log_profile)
 
-    def sort(self, rows: np.ndarray) -> UInt16[np.ndarray, "n"]:
-        """Return the cell of each prototype."""
-        feature, centre = features(rows), _features(self.log_profile, self.share)
+    def assign(self, rows: np.ndarray) -> UInt16[np.ndarray, "n"]:
+        """Return the cell of each prototype: its family's, with the nearest centroid."""
+        feature, centroid = features(rows), _features(self.log_profile, self.share)
         family, cell = family_of(rows["claims"]), np.empty(len(rows), np.uint16)
         for number in np.unique(family).tolist():
-            own, seen = family == number, _claimed_features(number)
-            cell[own] = number * len(centre) + nearest(feature[np.ix_(own, seen)], centre[:, seen])
+            row, column = family == number, _claimed_features(number)
+            cell[row] = number * len(centroid) + nearest(feature[np.ix_(row, column)], centroid[:, column])
         return cell
 
-    def costs(self, compared: PrototypeCosts, families: Iterable[int]) -> dict[int, Float[np.ndarray, "v k j"]]:
-        """About what prototypes of some families cost by cell, under every hypothesis of the heading and the height."""
-        (k, j), v = compared.shape, len(self.log_profile)
+    def costs(self, query_costs: PrototypeCosts, families: Iterable[int]) -> dict[int, Float[np.ndarray, "v k j"]]:
+        """Return the approximate mean cost of each cell's prototypes under every hypothesis, for some families.
+
+        It has the terms of walls and openings and the penalty of the height; the ceiling and the room type are left
+        out. The walls' term interpolates between tabulated bins, a product of matrices for all cells and hypotheses.
+        """
+        (k, j), v = query_costs.shape, len(self.log_profile)
         position = _LOWEST + _BIN * np.arange(_BINS)
-        centre = compared.centre[:, None] + compared.offsets[None, :, None].astype(np.float32)
-        residual = (position - centre[..., None]) * compared.precision[:, None, :, None]
+        centre = query_costs.centre[:, None] + query_costs.offsets[None, :, None].astype(np.float32)
+        residual = (position - centre[..., None]) * query_costs.precision[:, None, :, None]
         by_bin = (np.log1p(np.square(residual)) / AZIMUTHS).astype(np.float32).reshape(k * j, -1)
-        walls = (self._bins @ by_bin.T).reshape(v, k, j) + compared.penalty.astype(np.float32)
-        if compared.opening_loss is None:
+        walls = (self._bins @ by_bin.T).reshape(v, k, j) + query_costs.penalty.astype(np.float32)
+        if query_costs.opening_loss is None:
             return dict.fromkeys(families, walls)
         share = self.share.reshape(v, -1)
-        told = {family: compared.opening_loss[claims_of(family)].reshape(k, -1) for family in families}
-        return {family: walls + (share @ loss.T)[:, :, None] for family, loss in told.items()}
+        losses = {family: query_costs.opening_loss[claims_of(family)].reshape(k, -1) for family in families}
+        return {family: walls + (share @ loss.T)[:, :, None] for family, loss in losses.items()}
 
     @cached_property
     def _bins(self) -> Float[np.ndarray, "v b"]:
@@ -90,47 +95,47 @@ def shipped_cells() -> Cells:
 
 
 def family_of(claims: UInt8[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """Return the family of cells that prototypes of plans are sorted into, by what these claim."""
+    """Return the families of prototypes: the bits of their claimed opening classes, without the walls' bit."""
     return claims >> (WALL_CODE + 1) & (FAMILIES - 1)
 
 
 def claims_of(family: int) -> int:
-    """Return the opening classes that the plans of a family of cells claim."""
+    """Return the `claims` of the prototypes of a family, see `family_of`."""
     return family << (WALL_CODE + 1)
 
 
 def _claimed_features(family: int) -> Int[np.ndarray, "f"]:
-    """Return the columns of `features` that count for a family."""
-    kinds = np.arange(1, len(OPENING_CLASSES))
-    claimed = np.tile(claims_of(family) >> kinds & 1, AZIMUTHS).astype(bool)
+    """Return the columns of `features` that a family is assigned by: walls and claimed opening classes."""
+    classes = np.arange(1, len(OPENING_CLASSES))
+    claimed = np.tile(claims_of(family) >> classes & 1, AZIMUTHS).astype(bool)
     return np.concatenate([np.arange(AZIMUTHS), AZIMUTHS + np.flatnonzero(claimed)])
 
 
 def features(rows: np.ndarray) -> Float[np.ndarray, "n f"]:
-    """Return the features that prototypes are sorted by."""
+    """Return the features that prototypes are assigned by: scaled log distances and opening classes by azimuth."""
     kind = unpacked_openings(rows["openings"])
     return _features(rows["log_profile"], (kind[:, :, None] == np.arange(len(OPENING_CLASSES))))
 
 
 def _features(log_profile: np.ndarray, share: np.ndarray) -> Float[np.ndarray, "n f"]:
-    n, others = len(log_profile), np.delete(share, WALL_CODE, axis=2).astype(np.float32)
-    return np.concatenate([_LOG_SCALE * log_profile.astype(np.float32), _CLASS_SCALE * others.reshape(n, -1)], axis=1)
+    n, openings = len(log_profile), np.delete(share, WALL_CODE, axis=2).astype(np.float32)
+    return np.concatenate([_LOG_SCALE * log_profile.astype(np.float32), _CLASS_SCALE * openings.reshape(n, -1)], axis=1)
 
 
-def nearest(feature: Float[np.ndarray, "n f"], centre: Float[np.ndarray, "v f"]) -> Int[np.ndarray, "n"]:
-    """Return the nearest centre of each."""
-    found, half = np.empty(len(feature), np.intp), 0.5 * np.square(centre).sum(axis=1)
+def nearest(feature: Float[np.ndarray, "n f"], centroid: Float[np.ndarray, "v f"]) -> Int[np.ndarray, "n"]:
+    """Return the number of the nearest centroid of each row of features."""
+    number, half_norm = np.empty(len(feature), np.intp), 0.5 * np.square(centroid).sum(axis=1)
     for begin in range(0, len(feature), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        found[part] = (half - feature[part] @ centre.T).argmin(axis=1)
-    return found
+        number[part] = (half_norm - feature[part] @ centroid.T).argmin(axis=1)
+    return number
 
 
 def _soft_bins(log_profile: Float[np.ndarray, "v a"]) -> Float[np.ndarray, "v b"]:
-    """Log distances as weights of the two bins that each lies between."""
-    place = (np.clip(log_profile, _LOWEST, _HIGHEST - 1e-6) - _LOWEST) / _BIN
-    lower = place.astype(np.intp)
+    """Return linear interpolation weights of log distances: two adjacent bins each, the others 0."""
+    position = (np.clip(log_profile, _LOWEST, _HIGHEST - 1e-6) - _LOWEST) / _BIN
+    lower = position.astype(np.intp)
     weight = np.zeros((*log_profile.shape, _BINS), np.float32)
-    np.put_along_axis(weight, lower[..., None], (1.0 - (place - lower))[..., None], axis=2)
-    np.put_along_axis(weight, lower[..., None] + 1, (place - lower)[..., None], axis=2)
+    np.put_along_axis(weight, lower[..., None], (1.0 - (position - lower))[..., None], axis=2)
+    np.put_along_axis(weight, lower[..., None] + 1, (position - lower)[..., None], axis=2)
     return weight.reshape(len(log_profile), -1)

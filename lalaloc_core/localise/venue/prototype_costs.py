@@ -1,10 +1,13 @@
-"""Cost of prototypes: walls, openings, ceiling and room type as in `matching_cost.py`, but coarser.
+"""Exact cost of prototypes: walls, openings, ceiling and room type as in `matching_cost.py`, but coarser.
 
-There are 32 azimuths and as many hypotheses of the heading at most, and the reach is that of a grid as fine as the
-prototypes. What is seen through openings is left out. A prototype may stand half a metre away from the camera, where
-openings appear displaced, so these count for less. Kinds of openings that a plan does not claim are neither for nor
-against it: in their place stands what an unknown class would cost, so that plans with and without openings can be
-compared.
+Differences to the matching cost of grid poses:
+
+* There are 32 azimuths, and at most 32 hypotheses of the heading.
+* The reach is that of a grid with the prototypes' spacing.
+* Views through openings are ignored.
+* Openings have less weight, as they appear displaced from a prototype up to half a metre away from the camera.
+* The openings' term is relative to the best class of a plan that claims all classes, so that plans with different
+  claims can be compared. Classes that a plan does not claim are merged with the wall.
 """
 
 from __future__ import annotations
@@ -27,31 +30,34 @@ from lalaloc_core.localise.matching_cost import (
 from lalaloc_core.localise.poses import PredictedCeiling, Query
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
-# Camera heights whose logs are nearer than this are not told apart by prototypes, whose distances are farther off.
-_OFFSETS_APART = 0.2
-# What openings count, as a share of what they count where poses are half a step away.
+# Spacing of the tried logs of the camera height; prototypes' distances are too coarse for smaller differences.
+_OFFSET_SPACING = 0.2
+# Weight of openings relative to the matching cost's.
 _OPENINGS_SHARE = 0.6
-# Pairs that are compared at a time, few enough to stay in the processor's cache.
+# Pairs compared at a time, few enough to stay in the processor's cache.
 _CHUNK = 1024
-# Of so many factors, none above the limit, the product is taken before the logarithm.
+# `log` is slow, so multiply this many factors, each at most the maximum, before taking it.
 _FACTORS, _MAX_FACTOR = 8, 1e4
 _CLASSES = len(OPENING_CLASSES)
-# All combinations of classes that a byte can say.
-_BYTES = unpacked_openings(np.arange(256, dtype=np.uint8)[:, None])
+# Classes at the four azimuths of every byte.
+_CLASSES_BY_BYTE = unpacked_openings(np.arange(256, dtype=np.uint8)[:, None])
 
 
 class PrototypeCosts:
-    """Compares prototypes with one query, each under hypotheses of the heading (k) and of the camera height (j).
+    """Costs of prototypes for one query under k hypotheses of the heading and j of the camera height.
 
     Attributes:
-        penalty: (j,) what each height has against it, in units of the cost.
+        centre: (k, a) predicted log wall profile (m) at the prototypes' azimuths.
+        precision: (k, a) factors that turn differences of log distance into residuals.
+        offsets: (j,) logs of true over stated camera height.
+        penalty: (j,) prior cost of each height.
     """
 
     def __init__(self, query: Query, step_m: float, weights: MatchingWeights, config: MatchingConfig) -> None:
         assert query.profile is not None, "without a predicted profile there is nothing to compare prototypes with"
         self._query, self._weights, self._config = query, weights, config
         self._columns = azimuths(query.profile.log_m.shape[1])
-        # Hypotheses between two azimuths of the prototypes tell nothing new.
+        # Hypotheses closer than two azimuths of the prototypes cannot be distinguished.
         self._every = max(1, len(query.roll) // AZIMUTHS)
         self._reach_m = config.grid_reach * STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
@@ -61,23 +67,29 @@ class PrototypeCosts:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """The numbers of hypotheses of the heading and of the height."""
+        """Numbers of hypotheses of the heading and of the height."""
         return len(self.centre), len(self.offsets)
 
-    def of(
+    def pairs(
         self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]
     ) -> Float[np.ndarray, "n"]:
-        """Return the cost of prototypes, each under one hypothesis of heading and height, by their numbers."""
+        """Return the cost of prototypes, each under one hypothesis.
+
+        Args:
+            rows: records of type `prototypes.ROW`.
+            hypothesis: number of each prototype's heading hypothesis.
+            offset: number of each prototype's height hypothesis.
+        """
         cost = np.empty(len(rows), np.float32)
         for begin in range(0, len(rows), _CHUNK):
             part = slice(begin, begin + _CHUNK)
-            cost[part] = self._of(rows[part], hypothesis[part], offset[part])
+            cost[part] = self._pairs(rows[part], hypothesis[part], offset[part])
         return cost
 
-    def _of(self, rows: np.ndarray, hypothesis: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
+    def _pairs(self, rows: np.ndarray, hypothesis: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
         log_profile = rows["log_profile"].astype(np.float32)
         cost = _walls(log_profile - self._shifted[hypothesis, offset], self.precision[hypothesis])
-        cost += self._by_room(rows, offset)
+        cost += self._room_costs(rows, offset)
         if self.opening_loss is not None:
             cost += self._openings(rows, hypothesis)
         return cost
@@ -86,21 +98,22 @@ class PrototypeCosts:
     def _shifted(self) -> Float[np.ndarray, "k j a"]:
         return self.centre[:, None] + self.offsets[None, :, None].astype(np.float32)
 
-    def of_ceilings(self, ceiling_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "j n"]:
-        """Return the cost of ceilings under every hypothesis of the camera's height."""
+    def ceilings(self, ceiling_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "j n"]:
+        """Return the cost of ceilings at some heights (m) under every hypothesis of the camera's height."""
         if self._query.ceiling is None or not self._config.use_ceiling:
             return np.zeros((len(self.offsets), len(ceiling_m)))
         return self._ceilings(self._query.ceiling, ceiling_m, self.offsets[:, None])
 
     @cached_property
-    def of_room_types(self) -> Float[np.ndarray, "t"]:
-        """What types of rooms cost."""
+    def room_types(self) -> Float[np.ndarray, "t"]:
+        """Cost of each room type."""
         if self._query.room_type is None or not self._config.use_room_type:
             return np.zeros(len(ROOM_TYPES))
         return self._weights.room_type * room_type_losses(self._query.room_type, self._config)
 
-    def _by_room(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
-        cost = self.penalty[offset] + self.of_room_types[rows["room_type"]]
+    def _room_costs(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
+        """Return the cost of each prototype's room type and ceiling, and the penalty of its height hypothesis."""
+        cost = self.penalty[offset] + self.room_types[rows["room_type"]]
         if self._query.ceiling is not None and self._config.use_ceiling:
             cost += self._ceilings(self._query.ceiling, rows["ceiling_m"].astype(np.float64), self.offsets[offset])
         return cost
@@ -110,18 +123,19 @@ class PrototypeCosts:
         return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._config)
 
     def _openings(self, rows: np.ndarray, hypothesis: np.ndarray) -> Float[np.ndarray, "n"]:
+        """Return the openings' term, by one table entry for every byte."""
         table, packed = self._byte_losses, rows["openings"]
         begin = (rows["claims"].astype(np.intp) * len(self.centre) + hypothesis) * packed.shape[1]
         cost = np.zeros(len(rows), np.float32)
-        for place in range(packed.shape[1]):
-            cost += table[(begin + place) * 256 + packed[:, place]]
+        for byte in range(packed.shape[1]):
+            cost += table[(begin + byte) * 256 + packed[:, byte]]
         return cost
 
     @cached_property
     def opening_loss(self) -> Float[np.ndarray, "m k a c"] | None:
-        """Weighted cost of each class by azimuth and by what a plan claims, which has a bit for each class.
+        """Weighted cost of each opening class by claims (m of them, as in `prototypes.ROW`), hypothesis and azimuth.
 
-        Sums over the azimuths are costs. None where openings are not compared.
+        The openings' term is the sum over the azimuths. None if openings are not compared.
         """
         predicted = self._query.openings
         if predicted is None or not self._config.use_openings:
@@ -141,29 +155,29 @@ class PrototypeCosts:
             for code in range(_CLASSES):
                 if code != WALL_CODE and not claims >> code & 1:
                     loss[claims, ..., code] = loss[claims, ..., WALL_CODE]
-        # The best that a plan could say which claims everything.
+        # Costs are relative to the best class for a plan that claims all classes.
         loss -= loss[-1].min(axis=-1, keepdims=True)
         return loss * np.float32(_OPENINGS_SHARE * self._weights.openings / AZIMUTHS)
 
     @cached_property
     def _byte_losses(self) -> Float[np.ndarray, "t"]:
-        """`opening_loss` of four azimuths at a time, by claims, hypothesis, byte and what the byte says."""
+        """Sums of `opening_loss` over the four azimuths of a byte, by claims, hypothesis, byte and its value."""
         assert self.opening_loss is not None
         loss = self.opening_loss.reshape(-1, PER_BYTE, _CLASSES)
-        return np.ascontiguousarray(sum(loss[:, place, _BYTES[:, place]] for place in range(PER_BYTE))).ravel()
+        return np.ascontiguousarray(sum(loss[:, i, _CLASSES_BY_BYTE[:, i]] for i in range(PER_BYTE))).ravel()
 
 
 def _offsets(query: Query) -> Float[np.ndarray, "j"]:
     """Return the logs of true over stated camera height that are tried."""
     tried = query.camera_height.offsets
     reach = float(tried[-1] - tried[0])
-    if reach <= _OFFSETS_APART * (1.0 + 1e-9):
+    if reach <= _OFFSET_SPACING * (1.0 + 1e-9):
         return np.array([0.5 * (tried[0] + tried[-1])])
-    return np.linspace(tried[0], tried[-1], int(np.ceil(reach / _OFFSETS_APART)) + 1)
+    return np.linspace(tried[0], tried[-1], int(np.ceil(reach / _OFFSET_SPACING)) + 1)
 
 
 def _walls(factor: Float[np.ndarray, "n a"], precision: Float[np.ndarray, "n a"]) -> Float[np.ndarray, "n"]:
-    """Mean log of 1 + r² by azimuth, of differences, which are overwritten."""
+    """Return the mean over azimuths of log(1 + r²); `factor` has log differences and is overwritten."""
     factor *= precision
     np.square(factor, out=factor)
     factor += 1.0

@@ -1,14 +1,13 @@
-"""Prototypes of floor plans: a few poses of each, by which those of a large venue are chosen that are searched in full.
+"""Prototypes of floor plans: a subset of each plan's poses, used to select the plans of a large venue to search.
 
-The *prototypes* of a plan are every other pose of its pose grid, as the black squares of a chessboard, with the floor
-that each stands for, the wall profile and the openings at 32 azimuths, and the room's ceiling and type. They are
-compared with the panorama much as all poses are (`prototype_costs`), and give every plan a probability; the plans that
-have most of it are then searched in full.
+The *prototypes* of a plan are every other pose of its pose grid, like the black squares of a chessboard. Each has the
+floor area that it represents, the wall profile and openings at 32 azimuths, and the room's ceiling and type. Their cost
+is a coarser matching cost (`prototype_costs`), and gives every plan a mass, its unnormalised probability:
 
-    mass(plan) = sum over its prototypes and the hypotheses of  floor · exp(-T cost)
+    mass(plan) = sum over its prototypes and the hypotheses of  area · exp(-T cost)
 
-`plan_index` finds the prototypes that are worth comparing. What the plans left out would have weighed is estimated
-(`share_searched`).
+`plan_index` finds the prototypes with relevant terms of this sum. The most probable plans are searched in full
+(`most_probable`); `share_searched` estimates the probability of the plans that were left out.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 
 AZIMUTHS = 32
-# Neighbouring prototypes are so many grid steps apart.
+# Distance of neighbouring prototypes in grid steps: the diagonal of a chessboard square.
 STEPS = math.sqrt(2.0)
-# Opening classes at so many azimuths share a byte, two bits each, the first one lowest.
+# Number of opening classes packed into a byte, two bits each, the first azimuth lowest.
 PER_BYTE = 4
-# What is kept of a prototype; as it lies in files and in the database. `claims` has a bit for each opening class that
-# the plan shows completely; `cell` is its cell of `prototype_cells`.
+# Record of a prototype, in memory, files and the database. `log_profile` is in log metres, `log_area` in log square
+# metres. `claims` has a bit for each opening class that the plan shows completely; `cell` is that of `prototype_cells`.
 ROW = np.dtype(
     [
         ("log_profile", "<f2", (AZIMUTHS,)),
@@ -44,19 +43,19 @@ ROW = np.dtype(
         ("claims", "u1"),
     ]
 )
-# A plan that weighs nothing in the posterior counts as this improbable, in logs: posteriors leave out what is less.
+# Minimum log probability of a searched plan: posteriors leave out pairs below it (`posterior.NEGLIGIBLE`).
 _NEGLIGIBLE = -12.0
-# Plans whose log masses are nearer than this are alike in all their prototypes.
-_ALIKE = 1e-4
+# Plans whose log masses differ by less than this count as copies of each other.
+_COPY_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Prototypes:
-    """Prototypes of one plan, or of several, one after the other.
+    """Prototypes of one plan, or of several plans, concatenated.
 
     Attributes:
-        rows: (n,) of `ROW`.
-        step_m: of the grid that they were taken from.
+        rows: (n,) records of type `ROW`.
+        step_m: step of the pose grid that they were taken from.
     """
 
     rows: np.ndarray
@@ -67,87 +66,87 @@ class Prototypes:
 
 
 def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
-    """Return the prototypes of a plan, in cell 0."""
-    place = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
-    chosen, of_room = place.sum(axis=1) % 2 == 0, grid.poses.room_index
-    # Rooms that have none so, which are narrow ones, keep all of theirs.
-    chosen |= ~np.isin(of_room, of_room[chosen])
-    first = np.flatnonzero(chosen)
-    rows, floor_m2 = np.zeros(len(first), ROW), grid.step_m**2 * np.bincount(of_room)
-    compared, room = azimuths(grid.profile_m.shape[1]), grid.poses.room_index[first]
-    rows["log_profile"] = np.log(grid.profile_m[first][:, compared])
-    # Of these poses alone: the others are looked at when they are searched.
-    poses, columns = PoseSet(grid.poses.position_m[first], room), grid.profile_m.shape[1]
-    kind = layouts_at(plan, poses, np.zeros(len(first)), columns).kind if plan.opening_faces else None
-    kind = np.full((len(first), columns), WALL_CODE, np.uint8) if kind is None else kind
-    rows["openings"] = packed_openings(kind[:, compared])
+    """Return the prototypes of a plan, not yet assigned to cells (all in cell 0)."""
+    square = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
+    is_chosen, pose_room = square.sum(axis=1) % 2 == 0, grid.poses.room_index
+    # Narrow rooms can have no pose on a black square; they keep all of their poses.
+    is_chosen |= ~np.isin(pose_room, pose_room[is_chosen])
+    chosen = np.flatnonzero(is_chosen)
+    rows, floor_m2 = np.zeros(len(chosen), ROW), grid.step_m**2 * np.bincount(pose_room)
+    columns, room = azimuths(grid.profile_m.shape[1]), pose_room[chosen]
+    rows["log_profile"] = np.log(grid.profile_m[chosen][:, columns])
+    # Openings are rendered for the prototypes alone; for all other poses when the plan is searched.
+    poses, width = PoseSet(grid.poses.position_m[chosen], room), grid.profile_m.shape[1]
+    kind = layouts_at(plan, poses, np.zeros(len(chosen)), width).kind if plan.opening_faces else None
+    kind = np.full((len(chosen), width), WALL_CODE, np.uint8) if kind is None else kind
+    rows["openings"] = packed_openings(kind[:, columns])
     rows["log_area"] = np.log(floor_m2[room] / np.bincount(room)[room])
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
-    rows["room_type"] = np.array([ROOM_TYPES.index(one.type) for one in plan.rooms], np.uint8)[room]
-    rows["claims"] = sum(1 << OPENING_CLASSES.index(claimed) for claimed in plan.opening_kinds)
+    rows["room_type"] = np.array([ROOM_TYPES.index(plan_room.type) for plan_room in plan.rooms], np.uint8)[room]
+    rows["claims"] = sum(1 << OPENING_CLASSES.index(kind) for kind in plan.opening_kinds)
     return Prototypes(rows, grid.step_m)
 
 
 def joined(parts: Sequence[Prototypes]) -> Prototypes:
-    """Prototypes of several plans, one after the other."""
+    """Concatenate the prototypes of several plans."""
     return Prototypes(np.concatenate([part.rows for part in parts]), parts[0].step_m)
 
 
 def packed_openings(kind: UInt8[np.ndarray, "n a"]) -> UInt8[np.ndarray, "n b"]:
-    """Codes of opening classes by azimuth, four to a byte."""
-    place = 2 * np.arange(PER_BYTE, dtype=np.uint8)
-    return (kind.reshape(len(kind), -1, PER_BYTE) << place).sum(axis=2, dtype=np.uint8)
+    """Pack opening classes by azimuth, four to a byte."""
+    shift = 2 * np.arange(PER_BYTE, dtype=np.uint8)
+    return (kind.reshape(len(kind), -1, PER_BYTE) << shift).sum(axis=2, dtype=np.uint8)
 
 
 def unpacked_openings(packed: UInt8[np.ndarray, "n b"]) -> UInt8[np.ndarray, "n a"]:
-    """Unpack the codes of `packed_openings`."""
-    place = 2 * np.arange(PER_BYTE, dtype=np.uint8)
-    return ((packed[:, :, None] >> place) & 3).reshape(len(packed), -1)
+    """Unpack the opening classes of `packed_openings`."""
+    shift = 2 * np.arange(PER_BYTE, dtype=np.uint8)
+    return ((packed[:, :, None] >> shift) & 3).reshape(len(packed), -1)
 
 
 def azimuths(columns: int) -> Int[np.ndarray, "a"]:
-    """Return the columns of a wall profile that prototypes have; of a profile with fewer, some twice."""
+    """Return the columns of a wall profile at the prototypes' azimuths; narrower profiles repeat columns."""
     return np.arange(AZIMUTHS) * columns // AZIMUTHS
 
 
 def most_probable(
-    log_mass: Float[np.ndarray, "p"], poses: Int[np.ndarray, "p"], *, most_plans: int, most_poses: int
+    log_mass: Float[np.ndarray, "p"], poses: Int[np.ndarray, "p"], *, max_plans: int, max_poses: int
 ) -> Int[np.ndarray, "m"]:
     """Return the plans to search in full, most probable first: at least one, and none without mass.
 
     Args:
         log_mass: log mass of each plan.
         poses: number of grid poses of each plan.
-        most_plans: maximum number of plans.
-        most_poses: how many the grids of all of them may have.
+        max_plans: maximum number of plans.
+        max_poses: maximum number of poses of their grids in total.
     """
-    order = np.argsort(-log_mass, kind="stable")[:most_plans]
+    order = np.argsort(-log_mass, kind="stable")[:max_plans]
     order = order[np.isfinite(log_mass[order])]
-    within = np.cumsum(poses[order]) <= most_poses
-    return order[: max(int(within.sum()), 1)]
+    fits = np.cumsum(poses[order]) <= max_poses
+    return order[: max(int(fits.sum()), 1)]
 
 
 def share_searched(
     log_mass: Float[np.ndarray, "p"], searched: Int[np.ndarray, "m"], probability: Float[np.ndarray, "m"]
 ) -> float:
-    """How much of the posterior over all plans those have that were searched.
+    """Estimate the probability, among all plans, that the right one was searched.
 
-    A full search changes what a plan weighs. Those left out are taken to change as most of those searched did: by the
-    median of their ratios, which is that of wrong plans. But what is left out of equal plans changes as those of them
-    do that were searched.
+    A full search replaces a plan's mass by a posterior probability. For plans that were left out, the ratio of the two
+    is estimated by the median ratio of the searched plans, most of which are wrong ones as well. If some copies of a
+    plan were searched and others left out, these get the median ratio of the searched copies.
 
     Args:
         log_mass: log mass of each plan.
         searched: numbers of the plans that were searched.
-        probability: of each plan that was searched, given that it is one of them.
+        probability: probability of each searched plan, given that the right one was searched.
     """
     left_out = np.delete(log_mass, searched)
     if not len(left_out):
         return 1.0
     log_probability = np.log(np.maximum(probability, np.exp(_NEGLIGIBLE)))
-    change = log_probability - log_mass[searched]
-    # The most probable plans are searched, so only the least of them can have equals that are not.
-    least = log_mass[searched].min() + _ALIKE
-    equals = change[log_mass[searched] <= least]
-    expected = left_out + np.where(left_out >= least - 2 * _ALIKE, np.median(equals), np.median(change))
+    log_ratio = log_probability - log_mass[searched]
+    # The most probable plans are searched, so only the least probable of these can have copies that were left out.
+    highest = log_mass[searched].min() + _COPY_TOLERANCE
+    copies = log_ratio[log_mass[searched] <= highest]
+    expected = left_out + np.where(left_out >= highest - 2 * _COPY_TOLERANCE, np.median(copies), np.median(log_ratio))
     return float(1.0 / (1.0 + np.exp(np.logaddexp.reduce(expected))))
