@@ -1,4 +1,4 @@
-# LaLaLoc: `make demo` shows it, `make serve` runs it, `make test` checks it.
+# Tasks for users and developers; `make help` lists them.
 
 PYTHON ?= python3
 PORT ?= 8000
@@ -21,24 +21,24 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh scripts/install_torch.
 demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 	$(BIN)/python -m examples.demo
 
-serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (PORT=8001: there) with the example plan, data in ./data
+serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
 	$(BIN)/python -m examples.serve --port $(PORT)
 
-# Computation runs in two processes with one thread each; the service's tests need the machine for themselves. The second
-# half runs even if the first fails.
+# The core's tests run in two processes with one thread each; the service's tests need an otherwise idle machine. The
+# second half runs even if the first fails.
 test: lint site ## lint, build the site, run the tests
 	status=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web || status=1; \
 	$(BIN)/python -m pytest tests/service tests/client tests/web || status=1; \
 	exit $$status
 
-# A cluster for each file: what one of them leaves behind is not the next one's.
+# A new cluster per file, so that files do not share state.
 ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence
-ray: $(STAMP) ## the tests of Ray, and those of the API on it (some 20 minutes)
+ray: $(STAMP) ## run the tests of Ray, and the API's tests on Ray (about 20 minutes)
 	$(BIN)/python -m pytest -m "slow or not slow" tests/service/test_on_ray.py
 	for file in $(ON_RAY); do TEST_DATABASE=ray $(BIN)/python -m pytest tests/service/test_$$file.py || exit 1; done
 
-lint: $(STAMP) ## ruff and pyright
+lint: $(STAMP) ## run ruff and pyright
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
@@ -52,12 +52,12 @@ docs: $(STAMP) ## write the generated parts of docs/
 site: $(STAMP) ## build the documentation site into build/site; warnings are errors
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs build/site
 
-client: $(STAMP) ## generate the blocking client, lalaloc_client/blocking, from the one for asyncio
+client: $(STAMP) ## generate lalaloc_client/blocking from lalaloc_client/asynchronous
 	$(BIN)/python -m scripts.generate_client
 
 web: ## build the web pages from web/ into service/web (needs node and npm)
 	cd web && npm ci --no-audit --no-fund && npm run types && npm run check && npm run build
 
-clean: ## remove the environment and everything that was made; ./data and ./runs stay
+clean: ## remove .venv and all build products; keep ./data and ./runs
 	rm -rf $(VENV) web/node_modules build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
