@@ -323,7 +323,7 @@ class OverloadedError(ServiceError):
 
     def __init__(self, limit: int, retry_after_s: int = 1) -> None:
         self.retry_after_s = retry_after_s
-        super().__init__(f"The service is full: {limit} requests are in work. Retry after {retry_after_s} s.")
+        super().__init__(f"The service is full: {limit} requests are in progress. Retry after {retry_after_s} s.")
 
 
 class ShareExceededError(OverloadedError):
@@ -332,8 +332,8 @@ class ShareExceededError(OverloadedError):
     def __init__(self, held: int, limit: int, retry_after_s: int = 1) -> None:
         ServiceError.__init__(
             self,
-            f"{held} of your requests are in work, and the rest of the {limit} slots is reserved for other tenants. "
-            f"Retry after {retry_after_s} s.",
+            f"{held} of your requests are in progress, and the rest of the {limit} slots is reserved for other tenants."
+            f" Retry after {retry_after_s} s.",
         )
         self.retry_after_s = retry_after_s
 

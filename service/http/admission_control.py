@@ -162,7 +162,7 @@ class Slots:
 
 @dataclass(frozen=True)
 class AdmissionLimits:
-    """Limits of requests in work.
+    """Limits of requests in progress.
 
     Attributes:
         requests: uploads and queries, from the first byte of the body.
@@ -224,12 +224,12 @@ class Admission:
         self.draining = True
 
     def stop(self) -> None:
-        """Refuse new requests; those in work go on. Safe to call in a signal handler."""
+        """Refuse new requests; those in progress go on. Safe to call in a signal handler."""
         self.draining = self.stopping = True
 
     @property
     def idle(self) -> bool:
-        """True if nothing is in work except streams."""
+        """True if nothing is in progress except streams."""
         return self.requests.in_use == self.reads.in_use == 0
 
     @contextmanager

@@ -176,7 +176,7 @@ class IdempotentRequest:
         try:
             self._claims.abandon(*self._place, self._key, token)
         except StoreUnavailableError:
-            logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in work for its lease")
+            logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in progress for its lease")
 
 
 class _Waiting:

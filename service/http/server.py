@@ -1,4 +1,4 @@
-"""HTTP server of the app, with bounded connections and a stop that finishes requests in work.
+"""HTTP server of the app, with bounded connections and a stop that finishes requests in progress.
 
 The app also runs under other ASGI servers, which then have to bound connections and stop by themselves.
 """
@@ -29,8 +29,8 @@ from service.telemetry import LOGGER_NAME
 _MAX_HEAD_BYTES = 16 * 1024
 # Timeout for the head of a request, and for the rest of a refused body.
 _HEAD_DEADLINE_S = 10.0
-# Fractions of the stop deadline: for requests in work, then for closing connections. The rest is for workers, threads
-# and the store.
+# Fractions of the stop deadline: for requests in progress, then for closing connections. The rest is for workers,
+# threads and the store.
 _FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
 # Descriptors for pipes of workers, listeners, files of the model and of the interpreter.
 _OTHERS = 192
@@ -56,7 +56,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         loop="asyncio",
         ws="none",
         log_level="warning",
-        # Idle connections make room first; this applies if all of them have a request in work.
+        # Idle connections make room first; this applies if all of them have a request in progress.
         limit_concurrency=max_connections + 1,
         # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
         proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
@@ -67,7 +67,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 
 
 class Server(uvicorn.Server):
-    """Server that stops in steps: reports that it stops, refuses new requests, finishes those in work, closes."""
+    """Server that stops in steps: reports that it stops, refuses new requests, finishes those in progress, closes."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
         super().__init__(config)
@@ -118,7 +118,7 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
     """Return an HTTP/1.1 protocol that bounds connections, request heads and bodies of refused requests."""
 
     class BoundedProtocol(H11Protocol):
-        """Protocol that ends a connection which has no request in work for too long.
+        """Protocol that ends a connection which has no request in progress for too long.
 
         The server's own keep-alive timer stops at the first byte of a head; this one does not.
         """

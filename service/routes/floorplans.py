@@ -150,7 +150,7 @@ async def replace_floorplan(
 ) -> Response:
     """Store a new revision of a floor plan, from a file of any format that `POST /floorplans` accepts.
 
-    Queries in work use the revision that they began with, and return it as `floorplan_revision`.
+    Queries in progress use the revision that they began with, and return it as `floorplan_revision`.
     """
     current = await runtime.uploads.run(client, plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
@@ -162,7 +162,7 @@ async def replace_floorplan(
         record = runtime.store.plans.add_revision(
             tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
         )
-        # Before the new grid starts. The old grid stays in memory for queries in work.
+        # Before the new grid starts. The old grid stays in memory for queries in progress.
         runtime.grids.cancel(current.revision_id)
         runtime.grids.on_plan_stored(record, grid)
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)

@@ -77,7 +77,7 @@ class KeyCache:
         return key
 
     def close(self) -> None:
-        """Finish the look-up in work, drop the others."""
+        """Finish the look-up in progress, drop the others."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def _look_up(self, key_hash: str) -> ApiKey | None:

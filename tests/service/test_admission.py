@@ -59,7 +59,7 @@ def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
         begin = monotonic()
         response = small.post("/floorplans", json=FLAT)
         assert monotonic() - begin < 0.5
-        assert f"{PLACES} of your requests are in work" in assert_problem(response, 503, "overloaded")["detail"]
+        assert f"{PLACES} of your requests are in progress" in assert_problem(response, 503, "overloaded")["detail"]
         assert 1 <= int(response.headers["retry-after"]) <= 30
         # Reads have slots of their own; health and metrics need none.
         assert small.get("/floorplans").status_code == 200
@@ -108,7 +108,7 @@ def test_slot_queue_is_bounded_and_round_robin() -> None:
                 order.append(client)
                 await goes_on.wait()
 
-        # One in work and three that wait leave one of each to others.
+        # One in progress and three that wait leave one of each to others.
         own = [asyncio.create_task(query("a")) for _ in range(6)]
         await asyncio.sleep(0)
         assert (slots.in_use, slots.waiting) == (1, 3)

@@ -190,7 +190,7 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
             problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
             assert (
-                "6 of your requests are in work, and the rest of the 8 slots is reserved for other tenants."
+                "6 of your requests are in progress, and the rest of the 8 slots is reserved for other tenants."
                 in problem["detail"]
             )
 
