@@ -79,7 +79,7 @@ class Layouts:
         return Layouts(self.log_profile[index], self.room_index[index], kind, seen)
 
     def thinned(self, stride: int) -> Layouts:
-        """Return the layouts with every `stride`th azimuth alone."""
+        """Return the layouts at every azimuth whose column is a multiple of `stride`."""
         seen = self.seen
         if seen is not None:
             kept = np.flatnonzero(seen.column % stride == 0)

@@ -133,7 +133,7 @@ class MatchingCost:
         reach_m: distance (m) from the camera within which the best of the poses lies.
         weights: weights of the terms, from the model's bundle.
         config: settings.
-        stride: compare every `stride`th azimuth alone.
+        stride: compare only azimuths whose column is a multiple of `stride`.
     """
 
     def __init__(

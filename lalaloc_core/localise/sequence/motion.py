@@ -1,7 +1,7 @@
 """Measured motions between two pictures, and the likelihood of pairs of poses.
 
 With the displacement v from the first place to the second, the measured distance d, the turn τ (second heading minus
-first, clockwise) and, where it was measured, the direction φ (of the displacement against the first heading):
+first, clockwise) and, if it was measured, the direction φ (of the displacement against the first heading)::
 
     r_turn = (heading' - heading - τ) / σ_τ
     r_dist = (|v| - d) / σ_d                                      without a direction
