@@ -17,7 +17,7 @@ conversion/ plan files, read and written in worker processes
 on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
-Also here: `settings.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP), `cores.py` (division
-of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`, and the command lines
-`cli.py`, `openapi.py`, `__main__.py`.
+Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP),
+`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`, and the
+command lines `cli.py`, `openapi.py`, `__main__.py`.
 """

@@ -10,7 +10,7 @@ LaLaLocError
     ├── UnknownAnswerError          no kept answer with this id
     ├── UnanchoredPlanError         the floor plan has no anchor
     ├── NoPlanNearbyError           no anchored floor plan near the given place
-    ├── UploadTooLargeError         more bytes than allowed
+    ├── UploadTooLargeError         the body exceeds its size limit
     ├── UploadTimeoutError          an upload that is too slow
     ├── UnsupportedMediaError       an unsupported media type
     │   └── UnsupportedEncodingError    a compressed body
@@ -79,18 +79,18 @@ class UnknownFloorPlanError(ServiceError):
     """No floor plan has this id."""
 
     def __init__(self, plan_id: str) -> None:
-        super().__init__(f"there is no floor plan '{plan_id[:64]}'")
+        super().__init__(f"floor plan '{plan_id[:64]}' does not exist")
 
 
 class UnknownVenueError(ServiceError):
     """No venue has this id."""
 
     def __init__(self, venue_id: str) -> None:
-        super().__init__(f"there is no venue '{venue_id[:64]}'")
+        super().__init__(f"venue '{venue_id[:64]}' does not exist")
 
 
 class UnknownRevisionError(ServiceError):
-    """The floor plan has no such revision, or dropped it."""
+    """The floor plan has no such revision, or the revision was dropped."""
 
     def __init__(self, plan_id: str, revision_id: str) -> None:
         super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}'; old revisions are dropped")
@@ -124,11 +124,11 @@ class NoPlanNearbyError(ServiceError):
 
 
 class UploadTooLargeError(ServiceError):
-    """The body has more bytes than allowed."""
+    """The body exceeds its size limit."""
 
     def __init__(self, name: str, limit: int, stated: int | None = None) -> None:
-        size = f"{stated} bytes" if stated is not None else "too large"
-        super().__init__(f"the body is {size}, at most {limit} bytes are allowed ({name})")
+        size = "is too large" if stated is None else f"has {stated} bytes"
+        super().__init__(f"the body {size}; the limit is {limit} bytes ({name})")
 
 
 class UploadTimeoutError(ServiceError):
@@ -152,12 +152,12 @@ class UnsupportedEncodingError(UnsupportedMediaError):
 
 
 class PlanTooLargeError(ServiceError):
-    """The plan's pose grid would have more poses than allowed."""
+    """The plan's pose grid would exceed the limit of poses."""
 
     def __init__(self, estimate: int, limit: int, step_m: float) -> None:
         super().__init__(
-            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m, at most {limit} are allowed "
-            "(max_grid_poses); are the coordinates in metres?"
+            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m; the limit is {limit} "
+            "(max_grid_poses). Check that the coordinates are in metres"
         )
 
 
@@ -165,7 +165,7 @@ class PlanFailedError(ServiceError):
     """The plan's pose grid could not be computed.
 
     Attributes:
-        reason: as in the plan's `reason` field.
+        reason: value of the plan's `reason` field.
     """
 
     def __init__(self, plan_id: str, reason: str) -> None:
@@ -188,14 +188,14 @@ class TooManyFloorPlansError(ServiceError):
     """The tenant's quota of floor plans is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} floor plans are stored; the limit is {limit} (max_floorplans). Delete some first")
+        super().__init__(f"the limit of {limit} stored floor plans is reached (max_floorplans); delete some first")
 
 
 class TooManyVenuesError(ServiceError):
     """The tenant's quota of venues is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} venues are stored; the limit is {limit} (max_venues). Delete some first")
+        super().__init__(f"the limit of {limit} stored venues is reached (max_venues); delete some first")
 
 
 class VenueUnsearchableError(ServiceError):
@@ -292,10 +292,10 @@ class InsufficientScopeError(ServiceError):
 class ExposedWithoutKeysError(ServiceError):
     """A request from another machine, or from a page of another site, while API keys are off."""
 
-    def __init__(self, wanted: str) -> None:
+    def __init__(self, accepted: str) -> None:
         super().__init__(
-            f"API keys are off, so only requests {wanted} are answered; set LALALOC_API_KEYS, LALALOC_ALLOW_ANONYMOUS "
-            "or LALALOC_ALLOWED_HOSTS"
+            f"API keys are off, so only requests {accepted} are answered; set LALALOC_API_KEYS, "
+            "LALALOC_ALLOW_ANONYMOUS or LALALOC_ALLOWED_HOSTS"
         )
 
 
@@ -313,7 +313,7 @@ class TooManyRefusedKeysError(ServiceError):
     def __init__(self, limit: int, retry_after_s: int) -> None:
         self.retry_after_s = retry_after_s
         super().__init__(
-            f"Too many invalid API keys from this address: {limit} per minute are allowed. Retry after "
+            f"Too many invalid API keys from this address: the limit is {limit} per minute. Retry after "
             f"{retry_after_s} s."
         )
 
@@ -327,7 +327,7 @@ class OverloadedError(ServiceError):
 
 
 class ShareExceededError(OverloadedError):
-    """One tenant, or without keys one client address, uses its whole share of the slots."""
+    """One tenant (without API keys: one client address) uses its whole share of the slots."""
 
     def __init__(self, held: int, limit: int, retry_after_s: int = 1) -> None:
         ServiceError.__init__(

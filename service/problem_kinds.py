@@ -1,4 +1,4 @@
-"""Table of errors and the HTTP problems that they become."""
+"""HTTP problem of every error: status, type and title (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ URN = "urn:lalaloc:problem:"
 
 @dataclass(frozen=True)
 class ProblemKind:
-    """HTTP status, stable type and title of an error; `public` tells if clients see its message."""
+    """HTTP status, stable type and title of an error; clients see its message if `public` is set."""
 
     status: int
     slug: str
@@ -88,7 +88,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     SeveralLevelsError: ProblemKind(422, "several-levels", "Several levels: choose one"),
     MissingExtraError: ProblemKind(501, "missing-extra", "Package for this format not installed"),
     InvalidPanoramaError: ProblemKind(422, "invalid-panorama", "Invalid panorama"),
-    InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between two panoramas"),
+    InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between panoramas"),
     InvalidHintError: ProblemKind(422, "invalid-hint", "Invalid hint"),
     InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
     InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),

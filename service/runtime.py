@@ -41,19 +41,19 @@ from service.threads import BoundedReads, Threads
 
 # Queries read little: a plan, and a pose grid that is not in memory.
 _READ_THREADS = 4
-# They compute small pose grids, so more threads would take cores from queries.
+# Uploads compute small pose grids, so more threads would take cores from queries.
 _UPLOAD_THREADS = with_headroom(2)
-# Poses of all plans of a venue that are searched together; they are copied for each query. One larger plan is allowed.
+# Limit of the poses that a venue query searches, because it copies them. A single plan can have more.
 _VENUE_POSES = 40_000
-# Memory for drawings, and number of revisions that can wait to be drawn.
-_DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
+# Memory limit of drawings, and limit of the revisions that wait to be drawn.
+_DRAWINGS_BYTES, _MAX_WAITING_DRAWINGS = 32 * 2**20, 16
 # Age up to which a plan in memory is used while the database is away.
 _PLAN_CACHE_AGE_S = 600.0
-# Timeout of an event stream; the client then asks again.
+# Timeout of an event stream; the client then reconnects.
 STREAM_DEADLINE_S = 900.0
-# Shortest interval at which streams check their key.
+# Minimum interval at which a stream checks its API key.
 _MIN_HEARTBEAT_S = 1.0
-# Fraction of the stop deadline for running LPO jobs.
+# Share of the stop timeout in which running LPO jobs can finish.
 _LPO_DRAIN = 0.1
 
 
@@ -104,8 +104,8 @@ class Backends:
     """Builders of the components that can run in other processes.
 
     Attributes:
-        optimiser: builds the pose refinement.
-        encoders: builds the networks, warmed up.
+        optimiser: builds the pool of LPO workers.
+        encoders: loads the networks and warms them up.
         localisers: builds the localisers; None: this process computes answers.
     """
 
@@ -117,7 +117,7 @@ class Backends:
 
 
 def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
-    """Return the networks after one run of each, because the first run allocates memory."""
+    """Load the networks and run each once, because the first run allocates memory."""
     encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     manifest = encoders.manifest
     image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
@@ -140,29 +140,29 @@ def start_runtime(
     Args:
         settings: settings of the service.
         telemetry: metrics and tracing.
-        cleanup: receives the components to close, also if the start fails.
+        cleanup: closes the components, also if the start fails.
         backends: builders of the components that can run in other processes.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
-        BundleError: no usable model.
+        BundleError: the model bundle is missing or damaged.
     """
     if settings.otlp_endpoint is not None:
         telemetry.tracing = _closing(cleanup, Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
     store = _closing(cleanup, open_store(settings))
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
-    searching = _Searching.start(settings, telemetry, cleanup, backends, bundle, store)
+    components = _QueryComponents.start(settings, telemetry, cleanup, backends, bundle, store)
     uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS))
-    # As many as the converter reads at a time. Closed after the converter, whose waiting jobs must end first.
+    # As many threads as converter processes. Closed after the converter, because its waiting jobs must end first.
     file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.imports.workers)))
     converter = _closing(cleanup, Converter(settings, telemetry))
-    grids, localiser = searching.grids, _closing(cleanup, searching.localiser())
+    grids, localiser = components.grids, _closing(cleanup, components.localiser())
     sweeper = Sweeper(store, grids, sweep_s=settings.grids.sweep_s, keep_answers_s=settings.storage.keep_answers_s)
     _closing(cleanup, sweeper).start()
-    # One read at a time, so that a silent database takes no thread from queries.
+    # A thread of its own: a database that does not answer blocks no reads of queries.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
-    venue_localiser = searching.venue_localiser(localiser, _closing(cleanup, searching.venue_plans()))
+    venue_localiser = components.venue_localiser(localiser, _closing(cleanup, components.venue_plans()))
     if backends.localisers is None:
         localisers = localiser, venue_localiser
     else:
@@ -174,23 +174,23 @@ def start_runtime(
         store=store,
         grids=grids,
         plan_lookup=PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S),
-        optimiser=searching.optimiser,
-        decoder=searching.decoder,
+        optimiser=components.optimiser,
+        decoder=components.decoder,
         converter=converter,
         localiser=localisers[0],
         venue_localiser=localisers[1],
-        admission=searching.admission,
+        admission=components.admission,
         access_control=access_control,
-        events=_plan_events(store, grids, searching.admission, event_reads, settings),
+        events=_plan_events(store, grids, components.admission, event_reads, settings),
         uploads=uploads,
         file_uploads=file_uploads,
-        reads=searching.reads,
-        drawings=_closing(cleanup, Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
+        reads=components.reads,
+        drawings=_closing(cleanup, Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_WAITING_DRAWINGS)),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Searching:
+class _QueryComponents:
     """Components of this process that compute answers."""
 
     settings: Settings
@@ -213,9 +213,9 @@ class _Searching:
         backends: Backends,
         bundle: Bundle,
         store: Store,
-    ) -> _Searching:
+    ) -> _QueryComponents:
         """Start the worker processes in the background and load the model."""
-        # Workers first, so that they load torch while the model loads here.
+        # Start the workers first: they load torch while this process loads the model.
         optimiser = backends.optimiser(bundle, settings, telemetry)
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry))
@@ -230,7 +230,7 @@ class _Searching:
             grids=_closing(cleanup, GridProvider(store, encoders, bundle.sha256, settings, telemetry)),
             optimiser=optimiser,
             decoder=decoder,
-            admission=Admission(AdmissionLimits.of(settings), telemetry),
+            admission=Admission(AdmissionLimits.from_settings(settings), telemetry),
             reads=_closing(cleanup, _reads(settings, threads=_READ_THREADS, max_pending=settings.pending_limit)),
         )
 
@@ -249,7 +249,7 @@ class _Searching:
         )
 
     def venue_plans(self) -> VenuePlans:
-        """Build the look-up of a venue's plans."""
+        """Build the lookup of a venue's plans."""
         return VenuePlans(
             self.store,
             self.grids,
@@ -274,7 +274,7 @@ class _Searching:
 
 
 def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
-    """Register a component for closing and return it."""
+    """Register a component to be closed, and return it."""
     cleanup.callback(part.close, *arguments)
     return part
 
@@ -283,7 +283,7 @@ def _reads(settings: Settings, *, threads: int, max_pending: int) -> BoundedRead
     return BoundedReads(threads=threads, max_pending=max_pending, wait_s=settings.database.wait_s)
 
 
-async def runtime_of(request: Request) -> Runtime:
+async def get_runtime(request: Request) -> Runtime:
     """Return the running service.
 
     A coroutine, because the framework would call a plain function on a thread pool that slow reads can fill.

@@ -1,7 +1,6 @@
 """Settings of the service, read once from environment variables that start with `LALALOC_`.
 
-They are grouped: `LALALOC_LPO_QUEUE` is `settings.lpo.queue`. Units stand in the names: `_s` seconds, `_m` metres,
-`_bytes` bytes.
+`setting_groups.py` defines them in groups: `LALALOC_LPO_QUEUE` is `settings.lpo.queue`.
 """
 
 from __future__ import annotations
@@ -10,27 +9,38 @@ import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.floorplan import PlanLimits
-from lalaloc_core.importers import ImportLimits
 from lalaloc_core.localise.bundle import default_bundle
-from lalaloc_core.panorama.images import PanoramaLimits
 from service.cores import CoreShares, share_cores, usable_cores
 from service.fair_share import with_headroom
-from service.setting_types import Area, Count, HostNames, Metres, Origins, PortMapping, Seconds
+from service.setting_groups import (
+    AccessSettings,
+    ComputeSettings,
+    DatabaseSettings,
+    DecodeSettings,
+    GridSettings,
+    ImportSettings,
+    LpoSettings,
+    PanoramaSettings,
+    PlanSettings,
+    RequestSettings,
+    SettingGroup,
+    StorageSettings,
+    UploadSettings,
+)
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
 
-# Requests that may be uploading, in addition to the queries in progress.
-_UPLOADS = 38
+# Uploads in addition to the queries in progress, unless LALALOC_MAX_PENDING_REQUESTS is set.
+_DEFAULT_UPLOADS = 38
 
-# Settings of earlier versions that are constants now. A variable that still sets one is ignored with a warning.
+# Settings of earlier versions. A variable that sets one is ignored with a warning.
 _REMOVED = frozenset(
     {
         "decode_queue",
@@ -46,384 +56,11 @@ _REMOVED = frozenset(
 )
 
 
-def _items(text: str) -> frozenset[str]:
-    return frozenset(item.strip().lower() for item in text.split(",")) - {""}
-
-
-class _Group(BaseModel):
-    """Settings of one kind; the first line of the docstring is their heading in the documentation.
-
-    Attributes:
-        prefix: start of the variables' names, after `LALALOC_`; the field's name follows.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    prefix: ClassVar[str] = ""
-
-
-class DatabaseSettings(_Group):
-    """Database."""
-
-    prefix = "database_"
-
-    url: str | None = Field(
-        default=None,
-        description="`postgresql://user:password@host/name` or `sqlite:///file`. Default: SQLite in the data folder.",
-    )
-    connections: int = Field(default=8, ge=1, le=1000, description="Size of the connection pool.")
-    wait_s: Seconds = Field(
-        default=2.0, description="Timeout for a database connection; the request then fails with 503."
-    )
-
-
-class ComputeSettings(_Group):
-    """Processor cores."""
-
-    workers: int | None = Field(
-        default=None,
-        ge=0,
-        le=64,
-        description="LPO worker processes. Default: a quarter of the usable cores (affinity and cgroup quota), at "
-        "least 1. 0 turns LPO off; answers then end at VDR.",
-    )
-    worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads per LPO worker. 0: one.")
-    onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network. 0: one.")
-    compute_threads: int = Field(
-        default=0,
-        ge=0,
-        le=256,
-        description="Queries that the main process computes at a time, without LPO. 0: the cores that the LPO workers "
-        "leave free.",
-    )
-
-
-class LpoSettings(_Group):
-    """Pose refinement (LPO)."""
-
-    prefix = "lpo_"
-
-    queue: Count = Field(
-        default=16, description="Maximum number of LPO jobs that wait for a worker; further queries keep the VDR pose."
-    )
-    deadline_s: Seconds = Field(
-        default=2.0, description="LPO timeout per query; the answer then falls back to the VDR pose."
-    )
-    stall_s: Seconds = Field(default=10.0, description="Timeout for one LPO job; its worker is then restarted.")
-
-
-class DecodeSettings(_Group):
-    """Decoding panoramas."""
-
-    prefix = "decode_"
-
-    workers: int = Field(
-        default=2,
-        ge=1,
-        le=64,
-        description="Processes that decode panoramas, one at a time each. One is reserved for idle tenants.",
-    )
-    stall_s: Seconds = Field(
-        default=4.0, description="Timeout for decoding one panorama; the process is then replaced and the query fails."
-    )
-    memory_bytes: int = Field(
-        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one panorama; enforced on Linux."
-    )
-
-
-class ImportSettings(_Group):
-    """Import of plan files."""
-
-    prefix = "import_"
-
-    workers: int = Field(
-        default=2,
-        ge=1,
-        le=64,
-        description="Processes that read and write plan files (not the native format); started on first use. One is "
-        "reserved for idle tenants.",
-    )
-    memory_bytes: int = Field(
-        default=2 * 2**30,
-        ge=256 * 2**20,
-        description="Memory limit for reading one plan file, libraries included; enforced on Linux.",
-    )
-
-
-class AccessSettings(_Group):
-    """Access."""
-
-    api_keys: bool = Field(
-        default=False,
-        description="Require an API key on every route except health and the pages; create keys with `lalaloc-service "
-        "keys create`.",
-    )
-    allow_anonymous: bool = Field(
-        default=False,
-        description="Without API keys, also listen on public addresses. Use it behind your own access control.",
-    )
-    allowed_hosts: HostNames = Field(
-        default="",
-        description="Without API keys: host names, separated by commas, that requests can use (`Host`, `Origin`) "
-        "besides this machine's; `*` for any.",
-    )
-    cors_origins: Origins = Field(
-        default="",
-        description="CORS: origins, separated by commas, whose pages can call the API from a browser, such as "
-        "`https://plans.example`; `*` for any, which needs `LALALOC_API_KEYS=on`.",
-    )
-    published_on: PortMapping = Field(
-        default="",
-        description="Address on which a container publishes the port, such as `127.0.0.1:8000`; `8000` alone means "
-        "every address. Without API keys it must be an address of this machine, unless `LALALOC_ALLOW_ANONYMOUS=on`.",
-    )
-    key_cache_s: float = Field(
-        default=5.0,
-        ge=0.0,
-        le=60.0,
-        description="Lifetime of an API key in memory: a revoked key is rejected after this delay.",
-    )
-    rate_per_minute: int = Field(
-        default=600,
-        ge=0,
-        le=10**6,
-        description="Rate limit per API key and replica, in requests per minute, for keys without a rate of their own. "
-        "0: no limit.",
-    )
-    rate_burst: int = Field(
-        default=60,
-        ge=0,
-        le=10**6,
-        description="Rate limit per API key and replica, in requests per second. 0: no limit.",
-    )
-
-    @model_validator(mode="after")
-    def _any_page_needs_keys(self) -> Self:
-        if "*" in self.cors_origin_set and not self.api_keys:
-            raise ValueError("LALALOC_CORS_ORIGINS=* needs LALALOC_API_KEYS=on: any page could change all plans")
-        return self
-
-    @property
-    def allowed_host_names(self) -> frozenset[str]:
-        """The names in `allowed_hosts`, in lower case."""
-        return _items(self.allowed_hosts)
-
-    @property
-    def cors_origin_set(self) -> frozenset[str]:
-        """The origins in `cors_origins`, in lower case."""
-        return _items(self.cors_origins)
-
-    @property
-    def published_host(self) -> str | None:
-        """The address in `published_on`, `0.0.0.0` if it is a port alone, None if it is empty."""
-        if not self.published_on:
-            return None
-        return self.published_on.rpartition(":")[0].strip("[]") or "0.0.0.0"
-
-
-class UploadSettings(_Group):
-    """Uploads."""
-
-    prefix = "upload_"
-
-    deadline_s: Seconds = Field(default=60.0, description="Timeout for an upload.")
-    idle_s: Seconds = Field(default=10.0, description="Timeout for the next bytes of an upload.")
-    bytes_per_s: float = Field(
-        default=8192.0,
-        gt=0.0,
-        allow_inf_nan=False,
-        description="Minimum upload rate; an upload can lag behind it by `LALALOC_UPLOAD_IDLE_S`.",
-    )
-
-
-class RequestSettings(_Group):
-    """Requests and connections."""
-
-    request_deadline_s: Seconds = Field(default=10.0, description="Timeout for a query after its upload.")
-    max_pending_requests: int = Field(
-        default=0,
-        ge=0,
-        description="Uploads and queries in progress, from the first byte; further ones get 503. 0: "
-        "`LALALOC_MAX_QUERIES` plus 38.",
-    )
-    max_queries: int = Field(
-        default=0,
-        ge=0,
-        description="Queries computed at a time; further ones wait (`LALALOC_MAX_WAITING_QUERIES`). 0: enough that one "
-        "tenant can run two queries per LPO worker and compute thread.",
-    )
-    max_waiting_queries: int = Field(
-        default=16, ge=0, description="Queries that wait for a slot; further ones get 503 before their upload is read."
-    )
-    max_reads: Count = Field(default=64, description="Read-only requests in progress; further ones get 503.")
-    max_streams: Count = Field(default=64, description="Open event streams; further ones get 503.")
-    max_connections: Count = Field(
-        default=1024, description="Open connections, including idle ones; further ones get 503."
-    )
-    keep_alive_s: Seconds = Field(default=15.0, description="Timeout for an idle connection between requests.")
-    stop_deadline_s: float = Field(
-        default=20.0,
-        ge=1.0,
-        le=3600.0,
-        description="Timeout for stopping: requests in progress finish, new ones are refused.",
-    )
-    stop_notice_s: float = Field(
-        default=0.0, ge=0.0, le=3600.0, description="Time for which `/readyz` reports 503 before the service stops."
-    )
-
-
-class GridSettings(_Group):
-    """Pose grids."""
-
-    grid_step_m: float = Field(
-        default=0.5, ge=0.1, le=5.0, description="Distance between neighbouring poses of a pose grid."
-    )
-    max_grid_poses: Count = Field(default=900_000, description="Maximum number of poses in the pose grid of one plan.")
-    inline_grid_poses: int = Field(
-        default=1000,
-        ge=0,
-        description="Pose grids up to this size are computed during the upload; larger ones in the background.",
-    )
-    grid_lease_s: float = Field(
-        default=15.0,
-        ge=0.1,
-        le=3600.0,
-        allow_inf_nan=False,
-        description="Lifetime of the lease on a pose grid: if the owner is silent for longer, another replica computes "
-        "the grid.",
-    )
-    sweep_s: float = Field(
-        default=5.0,
-        ge=0.1,
-        le=3600.0,
-        allow_inf_nan=False,
-        description="Interval at which deleted plans leave memory and abandoned pose grids are taken over.",
-    )
-
-
-class StorageSettings(_Group):
-    """Caches and kept answers."""
-
-    plan_cache_bytes: int = Field(
-        default=64 * 2**20,
-        ge=0,
-        description="Floor plans kept in memory, for speed and for queries while the database is down. 0: none.",
-    )
-    grid_cache_bytes: int = Field(default=2**30, ge=0, description="Pose grids kept in memory.")
-    venue_cache_bytes: int = Field(
-        default=128 * 2**20,
-        ge=0,
-        description="Search indices of large venues kept in memory: 45 bytes per prototype, about 7.5 kB per home.",
-    )
-    venue_file_bytes: int = Field(
-        default=2 * 2**30,
-        ge=0,
-        description="Prototype file of large venues in `LALALOC_DATA_DIR`: 82 bytes per prototype, 14 kB per home. "
-        "Delete it only while the service is stopped.",
-    )
-    keep_answers_s: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=366 * 86400.0,
-        description="Lifetime of kept answers, which a link reopens; panoramas are never kept. 0: no answers are kept.",
-    )
-    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is deleted first.")
-
-
-class PlanSettings(_Group):
-    """Limits of floor plans and venues."""
-
-    max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
-    max_revisions: int = Field(
-        default=10, ge=2, description="Revisions kept per floor plan; the oldest is deleted first."
-    )
-    max_plan_bytes: Count = Field(default=40 * 2**20, description="Size of a plan file, in any format.")
-    max_unpacked_bytes: Count = Field(
-        default=200_000_000, description="Unpacked size of an archive, or of a compressed part of a plan file."
-    )
-    max_entities: Count = Field(
-        default=300_000, description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
-    )
-    max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a floor plan picture.")
-    max_import_s: Seconds = Field(
-        default=30.0,
-        description="Timeout for reading a plan file. The process is replaced 10 s later. Including the wait for a "
-        "process, an upload can take twice this time.",
-    )
-    max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
-    max_vertices: int = Field(default=200, ge=3, description="Vertices per room.")
-    max_plan_vertices: int = Field(default=100_000, ge=3, description="Vertices of all rooms of a floor plan.")
-    max_extent_m: Metres = Field(default=1000.0, description="Width or height of a floor plan.")
-    max_area_m2: Area = Field(default=200_000.0, description="Floor area of all rooms of a floor plan.")
-    max_bounds_area_m2: Area = Field(
-        default=500_000.0,
-        description="Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.",
-    )
-    max_openings: int = Field(default=20_000, ge=0, description="Doors, windows and passages of a floor plan.")
-    max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
-    max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
-    max_venue_bytes: Count = Field(default=4 * 2**20, description="Size of a venue document.")
-
-    @property
-    def plan_limits(self) -> PlanLimits:
-        """Limits of floor plans, for the core."""
-        return PlanLimits(
-            max_rooms=self.max_rooms,
-            max_vertices_per_room=self.max_vertices,
-            max_plan_vertices=self.max_plan_vertices,
-            max_extent_m=self.max_extent_m,
-            max_area_m2=self.max_area_m2,
-            max_bounds_area_m2=self.max_bounds_area_m2,
-            max_openings=self.max_openings,
-        )
-
-    @property
-    def import_limits(self) -> ImportLimits:
-        """Limits of plan files, for the core."""
-        return ImportLimits(
-            max_plan_bytes=self.max_plan_bytes,
-            max_unpacked_bytes=self.max_unpacked_bytes,
-            max_entities=self.max_entities,
-            max_plan_pixels=self.max_plan_pixels,
-            max_import_s=self.max_import_s,
-            plan=self.plan_limits,
-        )
-
-    @property
-    def import_deadline_s(self) -> float:
-        """Timeout for reading or writing a plan file, waiting for a process included."""
-        return 2.0 * self.max_import_s
-
-
-class PanoramaSettings(_Group):
-    """Limits of panoramas and queries."""
-
-    max_panorama_bytes: Count = Field(default=40 * 2**20, description="Size of a panorama file.")
-    max_sequence_panoramas: int = Field(default=10, ge=2, le=20, description="Panoramas per sequence query.")
-    max_sequence_bytes: Count = Field(
-        default=100 * 2**20, description="Size of all panorama files of a sequence query."
-    )
-    max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
-    max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")
-    max_top_k: int = Field(default=10, ge=1, le=100, description="Candidates per answer.")
-    compass_tolerance_deg: float = Field(
-        default=20.0,
-        ge=0.0,
-        le=45.0,
-        description="Tolerance of the compass heading in a panorama's metadata: the search covers headings within it.",
-    )
-
-    @property
-    def panorama_limits(self) -> PanoramaLimits:
-        """Limits of panoramas, for the core."""
-        return PanoramaLimits(max_pixels=self.max_pixels, max_scans=self.max_scans)
-
-
 class Settings(BaseModel):
     """Service.
 
-    `Settings.load()` reads the environment; `Settings(lpo_queue=4)` takes values by variable name, without `LALALOC_`
-    and in lower case, and defaults for the rest.
+    `Settings.load()` reads the environment. `Settings(lpo_queue=4)` sets values by variable name, in lower case and
+    without `LALALOC_`; the others keep their defaults.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -458,21 +95,21 @@ class Settings(BaseModel):
         Raises:
             ConfigError: an unknown name, or a value outside its limits.
         """
-        places = {name: path for name, path, _ in _places()}
-        if unknown := sorted(values.keys() - places.keys()):
-            known = ", ".join(sorted(_variable(name) for name in places))
-            raise ConfigError(f"unknown setting {', '.join(map(_variable, unknown))}; known are {known}")
+        paths = {name: path for name, path, _ in _fields()}
+        if unknown := sorted(values.keys() - paths.keys()):
+            known = ", ".join(sorted(_variable(name) for name in paths))
+            raise ConfigError(f"unknown setting {', '.join(map(_variable, unknown))}; known: {known}")
         nested: dict[str, Any] = {}
         for name, value in values.items():
-            *group, field = places[name]
+            *group, field = paths[name]
             (nested.setdefault(group[0], {}) if group else nested)[field] = value
         try:
             super().__init__(**nested)
         except ValidationError as error:
-            names: dict[tuple[int | str, ...], str] = {path: name for name, path, _ in _places()}
+            names: dict[tuple[int | str, ...], str] = {path: name for name, path, _ in _fields()}
             faults = []
             for fault in error.errors():
-                # A fault of a whole group names the variables itself.
+                # The check of a whole group names the variables in its message.
                 message, name = fault["msg"].removeprefix("Value error, "), names.get(fault["loc"])
                 faults.append(message if name is None else f"{_variable(name)} is {fault['input']!r}: {message}")
             raise ConfigError("; ".join(faults)) from error
@@ -492,29 +129,29 @@ class Settings(BaseModel):
         return cls(**values)
 
     def values(self) -> dict[str, Any]:
-        """Return the value of every setting by variable name, without `LALALOC_` and in lower case."""
+        """Return the value of every setting by variable name, in lower case and without `LALALOC_`."""
         return {
             name: getattr(self, path[0]) if len(path) == 1 else getattr(getattr(self, path[0]), path[1])
-            for name, path, _ in _places()
+            for name, path, _ in _fields()
         }
 
     def with_values(self, **values: Any) -> Self:
-        """Return a copy with some values changed, by variable name as in the constructor."""
+        """Return a copy with some values changed; names as in the constructor."""
         return type(self)(**(self.values() | values))
 
     @property
     def cores(self) -> CoreShares:
-        """The division of the cores, with every open number resolved."""
+        """Cores of each component, with defaults resolved."""
         return share_cores(usable_cores(), **self.compute.model_dump())
 
     @property
     def pending_limit(self) -> int:
-        """Limit of uploads and queries in progress, resolved."""
-        return self.requests.max_pending_requests or self.query_limit + _UPLOADS
+        """Limit of uploads and queries in progress, with its default resolved."""
+        return self.requests.max_pending_requests or self.query_limit + _DEFAULT_UPLOADS
 
     @property
     def query_limit(self) -> int:
-        """Limit of queries in progress, resolved."""
+        """Limit of queries in progress, with its default resolved."""
         return self.requests.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
 
     @property
@@ -527,7 +164,7 @@ def settings_table() -> str:
     """Return all settings as Markdown: a heading and a table per group."""
     lines: list[str] = []
     heading = ""
-    for name, path, field in _places():
+    for name, path, field in _fields():
         group = Settings if len(path) == 1 else type(Settings.model_fields[path[0]].default)
         if heading != (heading := (group.__doc__ or "").split("\n")[0].rstrip(".")):
             lines += ["", f"## {heading}", "", "| variable | default | meaning |", "|---|---|---|"]
@@ -538,18 +175,18 @@ def settings_table() -> str:
     return "\n".join(lines[1:])
 
 
-def _places() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
+def _fields() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
     """Yield the name, the path of attributes and the field of every setting."""
     for name, field in Settings.model_fields.items():
-        if isinstance(field.default, _Group):
+        if isinstance(field.default, SettingGroup):
             for inner, inner_field in type(field.default).model_fields.items():
                 yield field.default.prefix + inner, (name, inner), inner_field
         else:
             yield name, (name,), field
 
 
-# Every setting by variable name, without `LALALOC_` and in lower case.
-SETTING_NAMES = frozenset(name for name, _, _ in _places())
+# Names of all settings, in lower case and without `LALALOC_`.
+SETTING_NAMES = frozenset(name for name, _, _ in _fields())
 
 
 def _variable(name: str) -> str:

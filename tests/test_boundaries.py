@@ -85,7 +85,7 @@ FORBIDDEN = {
 SERVICE_LAYERS = (
     "fair_share",
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
-    "cores settings setting_types errors problem_kinds schemas threads bounded_cache telemetry workers",
+    "cores settings setting_groups setting_types errors problem_kinds schemas threads bounded_cache telemetry workers",
     "pools storage",
     "grids preview security conversion",
     "http",

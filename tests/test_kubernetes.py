@@ -137,7 +137,7 @@ def test_autoscaler_uses_an_existing_metric() -> None:
     adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
     assert [one["seriesQuery"].partition("{")[0] for one in adapter["rules"]["custom"]] == [metric]
     telemetry = Telemetry()
-    Admission(AdmissionLimits.of(Settings()), telemetry)
+    Admission(AdmissionLimits.from_settings(Settings()), telemetry)
     assert f"\n{metric} " in telemetry.render().decode()
     # More are added before the pods there are begin to refuse.
     cores = int(CONTAINER["resources"]["limits"]["cpu"])

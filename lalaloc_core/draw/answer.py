@@ -32,11 +32,12 @@ _WIDTH, _PAD = 1600.0, 36.0
 # Size of the drawn photograph; a photograph of this size is not scaled.
 PHOTOGRAPH_SIZE = (1528, 764)
 _HEADER, _KEY, _LEGEND = 104.0, 52.0, 400.0
-# Range of the height of the plan's drawing.
+# Minimum and maximum height of the plan's drawing.
 _MIN_PLAN, _MAX_PLAN = 560.0, 1150.0
-# Less probable rivals are not drawn.
+# Candidates below this probability are not drawn.
 _MIN_PROBABILITY = 0.001
-_CHARACTERS = 52
+# Longer titles and names are shortened.
+_MAX_CHARACTERS = 52
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ class DrawnAnswer:
         plan: the plan.
         camera: the predicted pose, with its covariance if known.
         room_index: room of the pose.
-        camera_height_m: height of the camera over the floor.
-        heading_source: origin of the heading, in a word or two.
+        camera_height_m: height of the camera above the floor.
+        heading_source: origin of the heading, one or two words.
         confidence: probability that the position is correct; None if unknown.
         rivals: other candidates, best first.
         heat: map of the posterior; None leaves the floors white.
@@ -98,18 +99,18 @@ def drawn_answer(
         plan: the plan.
         grid: pose grid of the plan.
         found: result of the localisation.
-        model: converts the posterior to probabilities; None leaves them out.
-        heading_source: origin of the heading, in a word or two.
+        model: confidence model; None leaves out probabilities.
+        heading_source: origin of the heading, one or two words.
         truth: true pose, if known.
     """
     confidence = found.confidence(model)
-    best, *others = found.candidates
-    spread = None
+    best, *rival_candidates = found.candidates
+    uncertainty = None
     if model is not None and best.information is not None:
-        spread = pose_uncertainty(best.information, plan.rooms[best.room_index], model)
+        uncertainty = pose_uncertainty(best.information, plan.rooms[best.room_index], model)
     covariance = None
-    if spread is not None:
-        (xx, xy), (_, yy) = spread.position_m2.tolist()
+    if uncertainty is not None:
+        (xx, xy), (_, yy) = uncertainty.position_m2.tolist()
         covariance = (xx, xy, yy)
     rivals = [
         DrawnCandidate(
@@ -119,7 +120,7 @@ def drawn_answer(
             plan.rooms[candidate.room_index].name,
             None if confidence is None else confidence.candidates[index],
         )
-        for index, candidate in enumerate(others, start=1)
+        for index, candidate in enumerate(rival_candidates, start=1)
     ]
     return DrawnAnswer(
         plan=plan,
@@ -148,7 +149,7 @@ def draw_answer(
 
     Args:
         answer: contents of the picture.
-        photograph: full sphere, level, from `panorama.images.open_panorama`; required unless `picture` is "plan".
+        photograph: levelled full sphere from `panorama.images.open_panorama`; required unless `picture` is "plan".
         picture: parts to draw.
         title: heading of the picture; default: the room.
         rooms: cached result of `draw_rooms` for the plan.
@@ -158,7 +159,7 @@ def draw_answer(
     y = _HEADER
     if picture != "plan":
         if photograph is None:
-            raise ValueError(f"picture '{picture}' needs the argument photograph")
+            raise ValueError(f"photograph is None; picture='{picture}' needs it")
         (width, height), outline = PHOTOGRAPH_SIZE, answer.outline
         parts.append(photograph_part(jpeg(_sized(photograph)), "jpeg", outline, (_PAD, y, width, height)))
         y += height
@@ -179,8 +180,8 @@ def draw_answer(
 
 def confidence_words(confidence: float) -> str:
     """Describe a confidence in words."""
-    for least, text in ((0.95, "almost certain"), (0.8, "very likely"), (0.5, "likely"), (0.2, "doubtful")):
-        if confidence >= least:
+    for minimum, text in ((0.95, "almost certain"), (0.8, "very likely"), (0.5, "likely"), (0.2, "doubtful")):
+        if confidence >= minimum:
             return text
     return "very unlikely"
 
@@ -194,13 +195,13 @@ def ellipse_m(covariance_m2: tuple[float, float, float]) -> tuple[float, float]:
 
 def _header(answer: DrawnAnswer, title: str, room: str | None) -> str:
     heading_deg = answer.camera.heading_deg or 0.0
-    facts = [] if room is None else [shortened(room, _CHARACTERS)]
+    facts = [] if room is None else [shortened(room, _MAX_CHARACTERS)]
     facts += [
         f"x {answer.camera.x_m:.2f} m, y {answer.camera.y_m:.2f} m",
         f"heading {heading_deg:.1f}° ({answer.heading_source})",
         f"camera {answer.camera_height_m:.2f} m over the floor",
     ]
-    return words(_PAD, 54, shortened(title, _CHARACTERS), 36, more='font-weight="bold"') + words(
+    return words(_PAD, 54, shortened(title, _MAX_CHARACTERS), 36, more='font-weight="bold"') + words(
         _PAD, 86, "  ·  ".join(facts), 20, fill=MUTED
     )
 

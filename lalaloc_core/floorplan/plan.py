@@ -60,14 +60,14 @@ class FloorPlan:
     """A validated floor plan; build one with `FloorPlan.from_dict` or `FloorPlan.from_json`.
 
     Attributes:
-        name: name for users.
+        name: display name.
         rooms: at least one room.
         camera_height_m: height of the camera assumed for panoramas of this plan.
         warnings: problems that do not prevent use, such as overlapping rooms.
         north: azimuth of true north (radians), None if unknown.
         openings: doors, windows and passages.
         opening_kinds: kinds of openings that the plan shows completely.
-        opening_tolerance_m: largest distance between an opening's line and its wall.
+        opening_tolerance_m: maximum distance between an opening's line and its wall.
         opening_faces: the parts of walls that openings occupy.
         camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
         states_camera_height: True if the plan gives `camera_height_m`; otherwise the height is estimated per query.
@@ -101,7 +101,7 @@ class FloorPlan:
         """Validate a plan in the native format (docs/reference/plan-format.md); unknown keys are refused.
 
         Raises:
-            InvalidFloorPlanError: the plan is invalid; names the room and the problem.
+            InvalidFloorPlanError: the plan is invalid; the message names the room and the problem.
         """
         return cls._read(document, limits, None)
 
@@ -130,11 +130,11 @@ class FloorPlan:
         check_size(rooms, limits)
         openings = read_openings(document.get("openings"), rooms, limits)
         tolerance_m = read_tolerance(document.get("opening_tolerance_m"))
-        faces, lost = place_openings(openings, rooms, tolerance_m, limits)
+        faces, unplaced = place_openings(openings, rooms, tolerance_m, limits)
         if openings and not faces:
             raise InvalidFloorPlanError(
-                f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m); "
-                "are openings and rooms in the same units?"
+                f"all openings are more than {tolerance_m:g} m from every wall (opening_tolerance_m); check that "
+                "openings and rooms are in the same units"
             )
         north = read_north(document.get("north_deg"))
         # Rounding restores degrees that were converted to radians.
@@ -143,7 +143,7 @@ class FloorPlan:
         if anchor is not None:
             north = heading_from_degrees(anchor.north_deg)
         if warnings is None:
-            off_wall = [f"{label(openings[k], k)} lies on no wall" for k in lost]
+            off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
             warnings = (*overlap_warnings(rooms, limits), *off_wall)
         return cls(
             name=name,
@@ -161,7 +161,7 @@ class FloorPlan:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan in the native format; `from_dict` of it gives an equal plan."""
+        """Return the plan in the native format; `from_dict` reads an equal plan from it."""
         document: dict[str, Any] = {"name": self.name}
         if self.states_camera_height:
             document["camera_height_m"] = self.camera_height_m
@@ -206,12 +206,12 @@ class FloorPlan:
     def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:
         """Wall segments of every room, padded to one length by repeating each room's first wall.
 
-        `plan.walls_m[room_index]` are the walls of a pose's room, as `render.profile` expects them.
+        `render.profile` takes `plan.walls_m[room_index]`, the walls of each pose's room.
         """
         return self.geometry.walls_m
 
     def room_walls(self, room_index: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n 4"]:
-        """Return `walls_m[room_index]`, padded to the longest of these rooms only."""
+        """Return `walls_m[room_index]`, padded only to the largest number of walls in these rooms."""
         longest = max(len(self.rooms[index].walls_m) for index in room_index)
         return np.stack([pad_walls(self.rooms[index].walls_m, longest) for index in room_index])
 

@@ -20,7 +20,7 @@ from lalaloc_core.importers.common.options import ImportOptions
 # Formats with a function `write` in their module.
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
-# Bytes of a file that are searched for the pattern of a format.
+# Bytes at the start of a file that are matched with `Format.magic`.
 HEAD_BYTES = 65536
 # Byte order mark and white space at the start of a text file.
 _START = rb"(?:\xef\xbb\xbf)?\s*"
@@ -30,17 +30,17 @@ _START = rb"(?:\xef\xbb\xbf)?\s*"
 class Format:
     """Description of a file format.
 
-    Its module, `formats/<name>.py`, is loaded with the first file, because it may need a large library. The module
+    Its module, `formats/<name>.py`, is loaded with the first file, because some modules need a large library. It
     defines `read(source, options, budget)`, which returns one plan per storey, and for an export format
-    `write(document, anchor)`, which returns the bytes of a file. `source` is the parsed document of a JSON format, the
-    files by name of an archive, and the bytes of the file for other formats.
+    `write(document, anchor)`, which returns the bytes of a file. `source` is the parsed document for a JSON format, the
+    files by name for an archive, and the bytes of the file for other formats.
 
     Attributes:
         name: name in reports, requests and on the command line; also the module's name.
         title: name in messages.
         media_type: media type of its files.
         suffix: suffix of its files, without a dot.
-        options: import options that it uses, besides `name` and `ceiling_height_m`.
+        options: import options that the format uses, besides `name` and `ceiling_height_m`.
         magic: pattern that matches at the start of its files; None for JSON, which is recognised by its contents.
         extra: optional dependency of this package that installs its libraries.
     """

@@ -2,9 +2,9 @@
 
 Layout encoder and head are those of `ring`. The trunk's feature maps of four strides are flattened over height,
 interpolated to the ring's sectors, and mixed around the horizon. An image shows lengths only relative to the camera
-height, so profile, openings, ceiling and room type are predicted without it, and lengths are then multiplied by it: an
-error of the stated height is exactly one offset of the log profile. Only the ring, which is compared with layouts in
-metres, takes the height as an input.
+height, so profile, openings, ceiling and room type are predicted without it, and lengths are then multiplied by it. An
+error of the stated height therefore shifts the whole log profile by one offset. Only the ring, which is compared with
+layouts in metres, takes the height as an input.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _MIN_LOG_SCALE, _MAX_LOG_SCALE = -6.0, 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class TrunkEncoderConfig:
-    """Sizes of the image encoder; sectors, channels, profile columns and latent size are those of `RingConfig`.
+    """Sizes of the image encoder; `RingConfig` holds sectors, channels, profile columns and latent size.
 
     Attributes:
-        image_height, image_width: pixels; both multiples of the largest stride.
+        image_height, image_width: pixels; both must be multiples of the largest stride.
         trunk: sizes of the trunk.
-        squeezed: features per sector from each of the trunk's maps.
+        squeezed: features per sector from each feature map of the trunk.
         mixer_width, mixer_blocks, mixer_heads: sizes of the attention around the horizon.
     """
 
@@ -67,7 +67,7 @@ class TrunkImageEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.trunk = Trunk(config.trunk)
-        self.per_sector = ring.profile_columns // ring.sectors
+        self.columns_per_sector = ring.profile_columns // ring.sectors
         width = config.mixer_width
         maps = list(zip(TAP_STRIDES, config.trunk.tap_channels, config.squeezed, strict=True))
         self.squeezes = nn.ModuleList(
@@ -81,12 +81,12 @@ class TrunkImageEncoder(nn.Module):
             *(HorizonAttention(width, config.mixer_heads, ring.sectors) for _ in range(config.mixer_blocks))
         )
         self.norm = nn.LayerNorm(width)
-        self.to_profile = nn.Linear(width, 2 * self.per_sector)
-        self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * self.per_sector)
+        self.to_profile = nn.Linear(width, 2 * self.columns_per_sector)
+        self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * self.columns_per_sector)
         self.to_ceiling = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, 2))
         self.to_room_type = nn.Sequential(nn.Linear(2 * width, width), nn.GELU(), nn.Linear(width, len(ROOM_TYPES)))
         self.to_ring = nn.Sequential(nn.Linear(width + 1, width), nn.GELU(), nn.Linear(width, ring.channels))
-        # Class shares of the training data: the prior that predicted probabilities are divided by.
+        # Class shares of the training data: the prior by which predicted probabilities are divided.
         for name, classes in (("opening", OPENING_CLASSES), ("room_type", ROOM_TYPES)):
             self.register_buffer(f"{name}_share", torch.full((len(classes),), 1.0 / len(classes)))
         self.register_buffer("counted", torch.zeros((), dtype=torch.long))
@@ -101,12 +101,18 @@ class TrunkImageEncoder(nn.Module):
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ImageFeatures:
-        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type; `styles` is for training only."""
+        """Encode panoramas.
+
+        Args:
+            image: (b, h, w, 3) pixels, values 0 to 255 of any type.
+            camera_height_m: (b,) camera heights.
+            styles: style mixing; for training only.
+        """
         mixed = self._mixed(image, styles)
         log_height = torch.log(camera_height_m)
         height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
-        profile = self.to_profile(mixed).unflatten(2, (self.per_sector, 2)).flatten(1, 2)
-        openings = self.to_openings(mixed).unflatten(2, (self.per_sector, len(OPENING_CLASSES))).flatten(1, 2)
+        profile = self.to_profile(mixed).unflatten(2, (self.columns_per_sector, 2)).flatten(1, 2)
+        openings = self.to_openings(mixed).unflatten(2, (self.columns_per_sector, len(OPENING_CLASSES))).flatten(1, 2)
         ceiling = self.to_ceiling(mixed).mean(dim=1)
         overall = torch.cat([mixed.mean(dim=1), mixed.amax(dim=1)], dim=1)
         return ImageFeatures(
@@ -122,7 +128,7 @@ class TrunkImageEncoder(nn.Module):
         )
 
     @torch.no_grad()
-    def count(self, opening_kind: Int[Tensor, "b w"], room_type: Int[Tensor, "b"]) -> None:
+    def update_class_shares(self, opening_kind: Int[Tensor, "b w"], room_type: Int[Tensor, "b"]) -> None:
         """Update the class shares with the labels of a batch; codes below 0 are unknown."""
         self.counted += 1
         rate = max(1.0 / int(self.counted), _SHARE_RATE)
@@ -132,7 +138,7 @@ class TrunkImageEncoder(nn.Module):
                 share.lerp_(torch.bincount(known.long(), minlength=len(share)).to(share) / len(known), rate)
 
     def _mixed(self, image: Tensor, styles: StyleMixing | None) -> Float[Tensor, "b s c"]:
-        """Return the features of the sectors, which are independent of the camera height."""
+        """Return the sectors' features, which do not depend on the camera height."""
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
         squeezed = []
         for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels, styles), self.squeezes, strict=True)):
@@ -151,8 +157,8 @@ def _interpolation(width: int, stride: int, sectors: int) -> Float[Tensor, "s v"
     weights = torch.zeros(sectors, columns)
     for sector in range(sectors):
         pixel = (sector + 0.5) * width / sectors - 0.5
-        place = (pixel + 1.0) / stride - 1.0
-        left = math.floor(place)
-        weights[sector, left % columns] += 1.0 - (place - left)
-        weights[sector, (left + 1) % columns] += place - left
+        column = (pixel + 1.0) / stride - 1.0
+        left = math.floor(column)
+        weights[sector, left % columns] += 1.0 - (column - left)
+        weights[sector, (left + 1) % columns] += column - left
     return weights

@@ -68,8 +68,8 @@ class RingImageEncoder(nn.Module):
         self.mixer = nn.Sequential(*mixers)
         self.norm = nn.LayerNorm(config.mixer_width)
         self.to_ring = nn.Linear(config.mixer_width, config.channels)
-        self.per_sector = config.profile_columns // config.sectors
-        self.to_profile = nn.Linear(config.mixer_width, 2 * self.per_sector)
+        self.columns_per_sector = config.profile_columns // config.sectors
+        self.to_profile = nn.Linear(config.mixer_width, 2 * self.columns_per_sector)
         elevation = 1.0 - (torch.arange(config.image_height) + 0.5) / (0.5 * config.image_height)
         self.register_buffer("elevation", elevation[None, None, :, None], persistent=False)
         self.register_buffer("mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)
@@ -88,7 +88,7 @@ class RingImageEncoder(nn.Module):
         scale = torch.log(camera_height_m)[:, None, None]
         columns = torch.cat([columns, scale.expand(-1, columns.shape[1], -1)], dim=2)
         mixed = self.norm(self.mixer(self.squeeze(columns)))
-        profile = self.to_profile(mixed).reshape(batch, -1, self.per_sector, 2).flatten(1, 2)
+        profile = self.to_profile(mixed).reshape(batch, -1, self.columns_per_sector, 2).flatten(1, 2)
         return ImageFeatures(
             ring=self.to_ring(mixed).transpose(1, 2),
             # The network predicts distances in units of the camera height.

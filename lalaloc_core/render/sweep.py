@@ -1,8 +1,8 @@
-"""Layout views of many poses of a plan at once: each wall fills only the columns between the azimuths of its ends.
+"""Layout views of many poses at once: each wall fills only the columns between the azimuths of its ends.
 
 `render.layout` casts every ray at every wall, and in large rooms most of these pairs miss. Here the azimuths of a
 wall's ends give the columns it can fill, and the nearest wall of each column wins. The cost grows with the number of
-columns, plus two arctangents per wall. The result equals that of `render.layout`, for numpy only, without gradients.
+columns, plus two arctangents per wall. The result equals that of `render.layout`, but in numpy, without gradients.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import WallTable
 from lalaloc_core.render.profile import BEYOND_M, CORNER_TOLERANCE, EDGE_ON
 
-# Pose-wall or ray-wall pairs processed at once, to bound memory.
+# Pairs of pose or ray and wall that are processed at once, to bound memory.
 _PAIRS = 1 << 16
 
 
@@ -123,14 +123,14 @@ class _Rays:
         return cls(heading, columns, np.sin(azimuth), np.cos(azimuth))
 
     def along(self, row: Int[np.ndarray, "m"], column: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
-        """Return the unit vectors of m rays."""
+        """Return the (m, 2) unit vectors of rays."""
         index = column if len(self.x) == 1 else row * self.columns + column
         return np.stack([self.x.ravel()[index], self.y.ravel()[index]], axis=1)
 
 
 def _parts(room_index: Int[np.ndarray, "n"], walls: WallTable, columns: int) -> Iterator[slice]:
-    """Yield slices of poses that fit into memory and into a processor's cache."""
-    # Rays that several walls fill are counted roughly.
+    """Yield slices of poses of about `_PAIRS` pairs each."""
+    # A rough count of pairs: the walls of the room, or the columns if they are more.
     work = np.cumsum(np.maximum(np.diff(walls.first)[room_index], columns))
     begin = 0
     while begin < len(room_index):
@@ -143,9 +143,9 @@ def _parts(room_index: Int[np.ndarray, "n"], walls: WallTable, columns: int) -> 
 def _nearest(
     position_m: Float[np.ndarray, "b 2"], rays: _Rays, room_index: Int[np.ndarray, "b"], walls: WallTable
 ) -> tuple[Float[np.ndarray, "b w"], Int[np.ndarray, "b w"]]:
-    """Return the distance (m) along every ray to the nearest wall, and that wall's index in the table, -1 for none."""
+    """Return each ray's distance (m) to the nearest wall, and the wall's index in the table, -1 for none."""
     columns = rays.columns
-    pose, wall = _each_with(walls, room_index)
+    pose, wall = _room_wall_pairs(walls, room_index)
     start, end = walls.start_m[wall] - position_m[pose], walls.end_m[wall] - position_m[pose]
     edge = end - start
     area = start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]
@@ -160,7 +160,7 @@ def _nearest(
         np.ceil(_column_towards(point, rays.heading[pose], columns)).astype(np.intp) for point in (low, high)
     )
     filled = (last - first) % columns
-    # A wall fills fewer than half of all columns; a larger number is zero, wrapped by rounding.
+    # A wall fills fewer than half of all columns; a larger number is a zero that rounding wrapped.
     filled[filled > columns // 2 + 1] = 0
     entry = np.repeat(np.arange(len(pose)), filled)
     column = (np.arange(len(entry)) - (np.cumsum(filled) - filled - first)[entry]) % columns
@@ -181,8 +181,8 @@ def _column_towards(point_m: Float[np.ndarray, "k 2"], heading: Float[np.ndarray
     return (np.arctan2(point_m[:, 0], point_m[:, 1]) - heading) * (columns / TWO_PI) + 0.5 * (columns - 1)
 
 
-def _each_with(walls: WallTable, room_index: Int[np.ndarray, "b"]) -> tuple[np.ndarray, np.ndarray]:
-    """Pair each given room with its walls: index into `room_index`, and the wall's index in the table."""
+def _room_wall_pairs(walls: WallTable, room_index: Int[np.ndarray, "b"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs of a given room and a wall of it: index into `room_index`, and wall index in the table."""
     count = np.diff(walls.first)[room_index]
     entry = np.repeat(np.arange(len(room_index)), count)
     return entry, np.arange(len(entry)) - np.repeat(np.cumsum(count) - count - walls.first[room_index], count)
@@ -201,8 +201,8 @@ def _openings(
     `at_eye` holds the indices of the openings at eye height.
     """
     if not len(at_eye):
-        none = np.empty(0, np.intp)
-        return none, none, none
+        empty = np.empty(0, np.intp)
+        return empty, empty, empty
     has_opening = np.zeros(len(walls.start_m) + 1, bool)
     has_opening[walls.opening_begin[at_eye].astype(np.intp)] = True
     row, column = np.nonzero(has_opening[wall])
@@ -225,9 +225,12 @@ def _behind(
     number: Int[np.ndarray, "m"],
     walls: WallTable,
 ) -> Float[np.ndarray, "m"]:
-    """Return the distances (m) through openings; that of the wall for rays that hit the reveal or no room behind."""
+    """Return the distance (m) of each ray to the wall behind an opening.
+
+    Rays that hit the reveal or meet no wall behind the opening keep `distance_m`.
+    """
     exit_m = walls.exit_m[number]
-    # Distance at which the ray leaves the wall's thickness; 0 for a ray that hits the reveal.
+    # Inverse distance at which a ray leaves the wall's thickness; 0 if it hits the reveal.
     inverse_m = _inverse_crossings(exit_m[:, :2] - eye_m, exit_m[:, 2:] - eye_m, direction)
     through = np.flatnonzero(inverse_m > 0.0)
     seen_m = distance_m.copy()
@@ -235,7 +238,7 @@ def _behind(
         rays = through[begin : begin + _PAIRS // 16]
         leave_m = np.maximum(1.0 / inverse_m[rays], distance_m[rays]) + BEYOND_M
         origin_m = eye_m[rays] + leave_m[:, None] * direction[rays]
-        ray, wall = _each_with(walls, walls.behind[number[rays]])
+        ray, wall = _room_wall_pairs(walls, walls.behind[number[rays]])
         from_m, to_m = walls.start_m[wall] - origin_m[ray], walls.end_m[wall] - origin_m[ray]
         crossed = _inverse_crossings(from_m, to_m, direction[rays][ray])
         further = np.maximum.reduceat(crossed, np.searchsorted(ray, np.arange(len(rays)))) if len(ray) else crossed
@@ -247,9 +250,9 @@ def _behind(
 def _inverse_crossings(
     start_m: Float[np.ndarray, "k 2"], end_m: Float[np.ndarray, "k 2"], direction: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k"]:
-    """Return the inverse distance (1/m) from each ray's origin to its one wall, 0 for a miss.
+    """Return the inverse distance (1/m) from each ray's origin to its wall, 0 for a miss.
 
-    The formula of `profile.inverse_crossings`, for k pairs instead of all rays with all walls.
+    `profile.inverse_crossings` has the same formula for all pairs of rays and walls; this one is for k given pairs.
     """
     edge = end_m - start_m
     area = start_m[:, 0] * edge[:, 1] - start_m[:, 1] * edge[:, 0]

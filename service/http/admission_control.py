@@ -1,7 +1,7 @@
 """Admission control: slots for each kind of request, and immediate refusal when all are in use.
 
-Every request, except those for health and metrics, holds a slot from its first byte to its last. An uploaded query also
-waits in a short queue for a slot to be computed. No other request waits, so the queues behind the slots stay bounded.
+Every request, except for health and metrics, holds a slot from its first byte to its last. An uploaded query needs a
+second slot to be computed, and waits for it in a short queue. No other request waits, so all queues stay bounded.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from service.settings import Settings
 from service.telemetry import Telemetry
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
-# Errors that every other request can end with.
+# Errors of every request whose path is not exempt.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose"})
 _STREAMS = "/events"
 _READS_AT_A_TIME = 4
-# Weight of the last request in the running mean behind Retry-After.
+# Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
 _MAX_RETRY_AFTER_S = 30
 
 
 def is_read(method: str, path: str) -> bool:
-    """Return True for a read-only request whose answer ends by itself."""
+    """Return True for a read-only request other than an event stream."""
     return method in _READING and not path.endswith(_STREAMS)
 
 
@@ -94,12 +94,12 @@ class Slots:
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
-        """Give up the held slot while the block waits, and take it again afterwards."""
+        """Release the held slot during the block, and take it again afterwards."""
         self._give_back(client)
         try:
             yield
         finally:
-            # Taken without asking, so for a while more slots than the limit can be in use.
+            # Taken without a check, so for a while more slots than the limit can be in use.
             self._shares.take(client)
 
     def check(self, client: str) -> None:
@@ -121,7 +121,7 @@ class Slots:
             self._give_back(client)
 
     async def _take_turn(self, client: str, deadline: float) -> None:
-        # Clients that are waiting already cannot take a slot.
+        # A client with waiting requests never passes this check, because a free slot goes to them first.
         if self._shares.may_take(client):
             self._shares.take(client)
             return
@@ -136,7 +136,7 @@ class Slots:
         except (TimeoutError, asyncio.CancelledError) as error:
             self._waiting.drop(lambda waiting: waiting is turn)
             if turn.done() and not turn.cancelled():
-                # The slot came at the moment when the wait ended.
+                # The slot was granted as the wait ended.
                 self._give_back(client)
             if isinstance(error, TimeoutError):
                 raise self._refusal(client) from error
@@ -170,7 +170,7 @@ class AdmissionLimits:
         waiting_queries: queries that wait for a slot.
         reads: read-only requests.
         streams: event streams.
-        deadline_s: timeout of any request except streams, as a last resort.
+        deadline_s: timeout of every request except streams; other timeouts normally end a request earlier.
     """
 
     requests: int
@@ -181,7 +181,7 @@ class AdmissionLimits:
     deadline_s: float
 
     @classmethod
-    def of(cls, settings: Settings) -> AdmissionLimits:
+    def from_settings(cls, settings: Settings) -> AdmissionLimits:
         """Return the limits in the settings."""
         return cls(
             requests=settings.pending_limit,
@@ -189,7 +189,7 @@ class AdmissionLimits:
             waiting_queries=settings.requests.max_waiting_queries,
             reads=settings.requests.max_reads,
             streams=settings.requests.max_streams,
-            # Upload, query or conversion, and sending the answer to a slow reader.
+            # Time for the upload, the query or conversion, and sending the answer to a slow client.
             deadline_s=settings.uploads.deadline_s
             + max(settings.requests.request_deadline_s, settings.plans.import_deadline_s)
             + settings.requests.request_deadline_s,
@@ -205,7 +205,7 @@ class Admission:
         self.queries = Slots(limits.queries, limits.waiting_queries)
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
-        # More threads for reads would only take the interpreter from queries.
+        # More reads at a time would only delay queries, because they share one interpreter.
         self.reading = FairSemaphore(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
@@ -220,11 +220,11 @@ class Admission:
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
 
     def drain(self) -> None:
-        """Report that the service is about to stop. Safe to call in a signal handler."""
+        """Announce that the service is about to stop. Safe to call in a signal handler."""
         self.draining = True
 
     def stop(self) -> None:
-        """Refuse new requests; those in progress go on. Safe to call in a signal handler."""
+        """Refuse new requests; running requests continue. Safe to call in a signal handler."""
         self.draining = self.stopping = True
 
     @property

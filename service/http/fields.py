@@ -118,4 +118,4 @@ def _parameters_of(route: object) -> dict[str, bool]:
 def _unknown(known: dict[str, bool]) -> str:
     if not known:
         return "unknown query parameter; this route has none"
-    return f"unknown query parameter; known are {', '.join(sorted(known))}"
+    return f"unknown query parameter; known: {', '.join(sorted(known))}"

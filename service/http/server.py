@@ -45,7 +45,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     Raises:
         ConfigError: the system allows too few file descriptors.
     """
-    limits = AdmissionLimits.of(settings)
+    limits = AdmissionLimits.from_settings(settings)
     # More than all slots, so that this service's refusals come before the server's own.
     least = limits.requests + limits.reads + limits.streams + 1
     max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)

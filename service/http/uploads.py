@@ -210,7 +210,7 @@ async def _sort(
         label, name = part[:50], part
         if part not in files | fields:
             known = ", ".join(sorted(files | fields))
-            faults.append((label, f"unknown part; known are {known}"))
+            faults.append((label, f"unknown part; known: {known}"))
             continue
         if part in repeated:
             name = f"{part}[{counts[part]}]"

@@ -54,7 +54,7 @@ def app(arguments: dict[str, str]) -> serve.Application:
         faults = [
             f"{'.'.join(map(str, fault['loc']))} is {fault['input']!r}: {fault['msg']}" for fault in error.errors()
         ]
-        raise ConfigError(f"{'; '.join(faults)}; known are {', '.join(RayOptions.model_fields)}") from error
+        raise ConfigError(f"{'; '.join(faults)}; known: {', '.join(RayOptions.model_fields)}") from error
     return application(Settings.load(), options)
 
 

@@ -183,11 +183,11 @@ class RemoteLocaliser(_SearchCaller):
         return found
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
+        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         found, drawn = await self._call(
-            "localise_and_draw", record.id, query.context, record.tenant, record.id, query, wanted
+            "localise_and_draw", record.id, query.context, record.tenant, record.id, query, request
         )
         self._observe(found)
         return found, drawn

@@ -85,10 +85,10 @@ class SearchReplica:
 
     @returning_failures
     async def localise_and_draw(
-        self, tenant: str, plan_id: str, query: PanoramaQuery, wanted: PictureRequest
+        self, tenant: str, plan_id: str, query: PanoramaQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
-        return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, wanted)
+        return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, request)
 
     @returning_failures
     async def localise_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:

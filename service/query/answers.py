@@ -58,12 +58,12 @@ class Place:
     level: float | None = None
 
 
-# Function from a candidate of the search to its place.
+# Maps a candidate of the search to its place.
 Locate = Callable[[Candidate], Place]
 
 
 def locate_in(record: PlanRecord) -> Locate:
-    """Return the function that places the candidates of a search in a single plan."""
+    """Return a function that maps the candidates of a search in one plan to their places."""
     return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate, record.plan.anchor)
 
 
@@ -81,18 +81,18 @@ def compose_answer(
 
     Args:
         found: result of the search.
-        locate: places the candidates.
+        locate: maps each candidate to its place.
         known: the heading that was known before the search.
         timings_ms: durations (ms) by stage.
         bundle: the model.
         warnings: warnings besides the one about the heading.
-        share: probability that the place is in the searched plans.
+        share: probability that the camera is in one of the searched plans.
     """
     model = bundle.manifest.confidence
-    answer, spread = found.best[found.stage], None
-    if model is not None and answer.information is not None:
-        placed = locate(answer)
-        spread = pose_uncertainty(answer.information, placed.plan.rooms[placed.candidate.room_index], model)
+    final, uncertainty = found.best[found.stage], None
+    if model is not None and final.information is not None:
+        placed = locate(final)
+        uncertainty = pose_uncertainty(final.information, placed.plan.rooms[placed.candidate.room_index], model)
     confidence = found.confidence(model, share)
     candidates = [
         _candidate(locate(candidate), found.query, None if confidence is None else confidence.candidates[index])
@@ -111,8 +111,10 @@ def compose_answer(
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
         warnings=[*heading_warnings(found, known), *warnings],
-        covariance_m2=None if spread is None else spread.position_m2.tolist(),
-        heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
+        covariance_m2=None if uncertainty is None else uncertainty.position_m2.tolist(),
+        heading_std_deg=None
+        if uncertainty is None or uncertainty.heading_std is None
+        else math.degrees(uncertainty.heading_std),
         stage=found.stage,
         cost=best.cost,
         latent_distance=best.latent_distance,
@@ -149,7 +151,7 @@ def model_answer(bundle: Bundle) -> ModelAnswer:
 
 
 def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:
-    """Return the places of the pose grid with a probability above zero."""
+    """Return the positions of the pose grid whose rounded probability is above zero."""
     places = probability_map(plan, grid.poses, posterior)
     kept = places.probability >= _MIN_PROBABILITY
     position_m = places.position_m[kept]
@@ -200,4 +202,4 @@ def _motion_warning(index: int, motion: Motion) -> str:
         measured.append(f"turn_deg {math.degrees(motion.turn):.4g}")
     if motion.direction is not None:
         measured.append(f"direction_deg {math.degrees(motion.direction):.4g}")
-    return f"motions[{index}] has {', '.join(measured)}, which the panoramas contradict: it was not followed"
+    return f"motions[{index}] ({', '.join(measured)}) contradicts the panoramas and was ignored"

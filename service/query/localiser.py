@@ -34,10 +34,10 @@ from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
 from service.threads import BoundedReads, Threads
 
-# Time (s) before the request's deadline that LPO leaves for ranking and sending the answer.
-_ANSWER_S = 0.25
+# LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
+_RESERVED_S = 0.25
 
-# Sources of the heading as pictures name them.
+# Names of the heading's sources in pictures.
 _SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
 T = TypeVar("T")
@@ -89,19 +89,19 @@ class Localiser:
 
         Raises:
             InvalidPanoramaError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
-            InvalidPoseError: a camera height above the ceiling.
-            InvalidHintError: hints that do not match the plan, or exclude all of it.
+            InvalidPoseError: the camera height is above the ceiling.
+            InvalidHintError: the hints do not match the plan, or exclude all of it.
             PlanFailedError: the plan's pose grid could not be computed.
-            PlanNotReadyError: the pose grid was not finished by the deadline.
-            DeadlineExceededError: another step was not finished by the deadline.
-            StoreUnavailableError: the pose grid is not in memory, and the database does not answer.
-            OverloadedError: too many queries, or too many pose grids computed on demand.
+            PlanNotReadyError: the pose grid was not ready by the deadline.
+            DeadlineExceededError: another step missed the deadline.
+            StoreUnavailableError: the pose grid is not in memory, and the database cannot be reached.
+            OverloadedError: too many queries are in work, or too many pose grids are computed on demand.
         """
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return (await self._localise(record, query)).answer
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
+        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """Localise as `localise` does, and return the answer with its picture, a PNG or SVG file.
 
@@ -113,7 +113,7 @@ class Localiser:
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             outcome = await self._localise(record, query)
             with clock.stage("draw"):
-                picture = await self._draw(record, outcome, query, wanted)
+                picture = await self._draw(record, outcome, query, request)
             self._telemetry.stage_seconds.labels("draw").observe(clock.timings_ms["draw"] / 1e3)
             return outcome.answer, picture
 
@@ -129,12 +129,12 @@ class Localiser:
     async def _localise(self, record: PlanRecord, query: PanoramaQuery) -> _Outcome:
         form, context, clock = query.form, query.context, query.context.clock
         height, hints = stated_height(form, record), stated_hints(form, record.plan)
-        # Decoding comes first: an unreadable picture is refused without waiting for the plan.
+        # Decode first, so that an unreadable picture is refused without waiting for the plan.
         with clock.stage("decode"):
             panorama = await self._decoder.decode(query.content, context.deadline, context.client)
         known = known_heading(form, record.plan.north, panorama, self._settings.panoramas.compass_tolerance_deg)
         if not hints.are_none:
-            # On a thread, because many rooms take a while.
+            # On a compute thread, because checking many rooms is slow.
             await self.compute(context, partial(hints.check, record.plan))
         encoded = await self.compute(context, lambda: self.encode([panorama], [known], height, clock))
         grid = await self._grid(record, height, context)
@@ -165,7 +165,7 @@ class Localiser:
         form, context, clock = query.form, query.context, query.context.clock
         height, plan = stated_height(form, record), record.plan
         compass_deg = self._settings.panoramas.compass_tolerance_deg
-        # One after another, so that a query keeps at most one decoder busy.
+        # Decode one panorama at a time, so that a query occupies one decoder.
         with clock.stage("decode"):
             panoramas = [
                 await self._decoder.decode(content, context.deadline, context.client) for content in query.contents
@@ -195,7 +195,7 @@ class Localiser:
             key = self._grids.key(record.revision_id, height_m)
             grid = self._grids.cached(key)
             if grid is None:
-                # Not on the compute threads, which a silent database would block.
+                # Not on the compute threads: a database that does not answer would block them.
                 grid = await self._reads.run(self._grids.find, key)
             if grid is not None:
                 return grid
@@ -211,10 +211,12 @@ class Localiser:
             except TimeoutError as error:
                 raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
 
-    async def _draw(self, record: PlanRecord, outcome: _Outcome, query: PanoramaQuery, wanted: PictureRequest) -> bytes:
+    async def _draw(
+        self, record: PlanRecord, outcome: _Outcome, query: PanoramaQuery, request: PictureRequest
+    ) -> bytes:
         context, photograph = query.context, None
-        if wanted.picture != "plan":
-            # Decoded again, because the encoder's size is too small to look at.
+        if request.picture != "plan":
+            # Decode again, because the encoder's input is too small for a picture.
             width, height = PHOTOGRAPH_SIZE
             size = height, width
             photograph = (await self._decoder.decode(query.content, context.deadline, context.client, size=size)).pixels
@@ -222,17 +224,19 @@ class Localiser:
         def draw() -> str:
             model, source = self._bundle.manifest.confidence, _SOURCES[outcome.answer.heading_source]
             drawn = drawn_answer(record.plan, outcome.grid, outcome.found, model, source)
-            return draw_answer(drawn, photograph, wanted.picture, rooms=wanted.rooms)
+            return draw_answer(drawn, photograph, request.picture, rooms=request.rooms)
 
         svg = await self.compute(context, draw)
-        if wanted.as_png:
+        if request.as_png:
             return await self._decoder.rasterise(svg, context.deadline, context.client)
         return svg.encode()
 
     # `VenueLocaliser` uses the following methods as well.
 
     async def compute(self, context: QueryContext, work: Callable[[], T]) -> T:
-        """Run CPU work on a thread; past the deadline it is not started, or its result is dropped.
+        """Run CPU work on a compute thread.
+
+        After the query's deadline, waiting work is not started, and the result of running work is dropped.
 
         Raises:
             DeadlineExceededError: the deadline passed.
@@ -259,16 +263,16 @@ class Localiser:
             ]
 
     async def run_search(self, steps: Generator[RefinementJob | SequenceJob, Any, T], context: QueryContext) -> T:
-        """Run a search on the compute threads, which are free while LPO refines poses."""
+        """Run a search on the compute threads; it holds none while LPO refines poses."""
         step = await self.compute(context, partial(next_step, steps, None))
         while isinstance(step, RefinementJob | SequenceJob):
-            timeout_s = min(self._settings.lpo.deadline_s, context.left_s - _ANSWER_S)
+            timeout_s = min(self._settings.lpo.deadline_s, context.left_s - _RESERVED_S)
             result = await self._optimiser.refine(step, timeout_s, context.client)
             step = await self.compute(context, partial(next_step, steps, result))
         return step
 
     def observe(self, context: QueryContext, stage: str) -> dict[str, float]:
-        """Record an answer in the metrics, and return the durations (ms) of its stages with their `total`."""
+        """Record an answer in the metrics; return the duration (ms) of each stage, and their `total`."""
         timings_ms = context.clock.timings_ms | {"total": context.spent_s * 1e3}
         for name, duration_ms in timings_ms.items():
             self._telemetry.stage_seconds.labels(name).observe(duration_ms / 1e3)

@@ -130,7 +130,7 @@ class LocaliserBackend(Protocol):
         ...
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
+        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         ...

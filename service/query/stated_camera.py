@@ -104,5 +104,5 @@ def near_missed(hints: Hints, found: Localisation) -> tuple[str, str]:
 
 def contradiction(stated: str, instead: str, strict: bool) -> str:
     """Return the warning that the panorama contradicts a statement, which only a strict hint overrides."""
-    followed = "it was followed, being strict" if strict else instead
+    followed = "the answer follows it because strict is set" if strict else instead
     return f"{stated}, which the panorama contradicts: {followed}"

@@ -39,9 +39,9 @@ from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbab
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 
-# Among many plans the right one is often not first by its grid, so more candidates are refined than in a single plan.
+# Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
-# Interval (s) of polling a venue without a plan that is ready.
+# Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
 # Function that reads the current rows of the plans to search.
 ReadPlans = Callable[[], Awaitable[Sequence[Row[Any]]]]
@@ -49,14 +49,14 @@ ReadPlans = Callable[[], Awaitable[Sequence[Row[Any]]]]
 
 @dataclass(frozen=True, eq=False)
 class _Searched:
-    """Plans that are searched in full, and the prior masses of all plans.
+    """Plans to search in full, and the prior masses of all plans that are ready.
 
     Attributes:
         rows: rows of the searched plans, see `Venues.searchable_plans`.
         records: the searched plans.
         merged: the searched plans side by side.
-        log_mass: (p,) log masses of all plans that are ready; None where all of them are searched.
-        index: numbers of the searched plans among these.
+        log_mass: (p,) log masses of all plans that are ready; None if all of them are searched.
+        index: indices of the searched plans among the plans that are ready.
         warnings: warnings about plans that are not searched.
         anchor: anchor of the venue.
         hints: hints about the merged plans.
@@ -73,13 +73,13 @@ class _Searched:
 
     def place(self, candidate: Candidate) -> Place:
         """Return the plan of a candidate, and the candidate in that plan's frame."""
-        number, own = self.merged.in_own_plan(candidate)
-        record = self.records[number]
-        anchor, level = plan_anchor(record.plan, self.anchor), self.rows[number].level
-        return Place(record.id, record.revision_id, record.plan, own, anchor, level)
+        index, own_candidate = self.merged.in_own_plan(candidate)
+        record = self.records[index]
+        anchor, level = plan_anchor(record.plan, self.anchor), self.rows[index].level
+        return Place(record.id, record.revision_id, record.plan, own_candidate, anchor, level)
 
     def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
-        """Return the probability that the plan is among the searched ones, and that of each, given that it is."""
+        """Return the probability that the camera is in a searched plan, and (m,) each plan's share of it."""
         probability = self.merged.by_plan(found.posterior.pose)
         if self.log_mass is None:
             return 1.0, probability
@@ -112,7 +112,7 @@ class VenueLocaliser:
         """Localise a panorama in the plans of a venue.
 
         Raises:
-            VenueUnsearchableError: no plan of the venue is ready or will be.
+            VenueUnsearchableError: the venue has no plans, or all of them failed.
             VenueNotReadyError: no plan of the venue was ready by the deadline.
             LaLaLocError: see `Localiser.localise`.
         """
@@ -204,7 +204,7 @@ class VenueLocaliser:
     async def _ready(
         self, venue: VenueRecord, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
     ) -> tuple[Sequence[Row[Any]], list[str]]:
-        """Return the plans that are ready, waiting for the first one, and warnings about the other plans."""
+        """Wait for a plan to be ready; return the plans that are ready, and warnings about the others."""
         begin = monotonic()
         while True:
             members = await read_plans()
@@ -239,7 +239,7 @@ class VenueLocaliser:
         warnings: list[str],
         compute: Callable[..., Any],
     ) -> _Searched:
-        """Return the plans that are searched in full: all if they are few, else the most probable ones."""
+        """Choose the plans to search in full: all of them if they are few, otherwise the most probable ones."""
         rows, log_mass, index = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
@@ -250,7 +250,7 @@ class VenueLocaliser:
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
                 warnings.append(
-                    f"rooms was looked for in the {len(rows)} most probable ones of {len(ready)} floor plans"
+                    f"the hint rooms was applied to the {len(rows)} most probable of {len(ready)} floor plans"
                 )
         loaded = await self._plans.load(venue.tenant, rows)
         kept = [entry for entry in loaded if _height_is_possible(entry[1], form)]
@@ -261,7 +261,7 @@ class VenueLocaliser:
             if loaded:
                 check_height_m(loaded[0][1], query.camera_height.height_m)
             raise VenueNotReadyError(venue.id, venue.plans, 0.0)
-        number = {row.plan_id: position for row, position in zip(rows, index, strict=True)}
+        index_of = {row.plan_id: position for row, position in zip(rows, index, strict=True)}
         searched_rows, records = [row for row, _, _ in kept], [record for _, record, _ in kept]
         plans, grids = [record.plan for record in records], [grid for _, _, grid in kept]
         merged = await compute(partial(MergedPlans.of, plans, grids, query.camera_height.height_m))
@@ -270,7 +270,7 @@ class VenueLocaliser:
             records=records,
             merged=merged,
             log_mass=log_mass,
-            index=[number[row.plan_id] for row in searched_rows],
+            index=[index_of[row.plan_id] for row in searched_rows],
             warnings=warnings,
             anchor=venue.anchor,
             hints=await compute(
@@ -281,7 +281,7 @@ class VenueLocaliser:
     def _plan_probabilities(
         self, rows: Sequence[Row[Any]], found: Localisation, share: float, probability: Float[np.ndarray, "m"]
     ) -> list[PlanProbability]:
-        """Return the searched plans, most probable first; `share` and `probability` as in `_Searched.shares`."""
+        """Return the searched plans, most probable first; `_Searched.shares` gives `share` and `probability`."""
         confidence = found.confidence(self._bundle.manifest.confidence, share)
         ranked = sorted(zip(probability.tolist(), rows, strict=True), key=lambda entry: -entry[0])
         return [

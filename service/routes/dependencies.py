@@ -9,7 +9,7 @@ from fastapi import Depends, Request
 
 from service.errors import UnknownFloorPlanError, UnknownRevisionError, UnknownVenueError
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
-from service.runtime import Runtime, runtime_of
+from service.runtime import Runtime, get_runtime
 from service.security import caller_of
 from service.storage.plans import Plans
 from service.storage.records import PlanRecord, PlanSummary, VenueRecord
@@ -25,7 +25,7 @@ async def _client_of(request: Request) -> str:
     return caller_of(request.scope).client
 
 
-Running = Annotated[Runtime, Depends(runtime_of)]
+Running = Annotated[Runtime, Depends(get_runtime)]
 Tenant = Annotated[str, Depends(_tenant_of)]
 # Tenant or client address that the request's share of slots counts for; see `service.fair_share`.
 Client = Annotated[str, Depends(_client_of)]

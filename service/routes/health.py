@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Response, status
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.pools import PoolState
-from service.runtime import Runtime, runtime_of
+from service.runtime import Runtime, get_runtime
 from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
 
 router = APIRouter(tags=["operations"])
@@ -30,7 +30,7 @@ async def healthz() -> HealthAnswer:
         }
     },
 )
-async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Response) -> ReadyAnswer:
+async def readyz(runtime: Annotated[Runtime, Depends(get_runtime)], response: Response) -> ReadyAnswer:
     """Return 200 once the model and all workers are ready, and 503 before that and while the service stops.
 
     Replacing a worker later does not make the service unready: queries wait, or keep the VDR pose.
@@ -54,7 +54,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-async def metrics(runtime: Annotated[Runtime, Depends(runtime_of)]) -> Response:
+async def metrics(runtime: Annotated[Runtime, Depends(get_runtime)]) -> Response:
     """Return all metrics in Prometheus' text format."""
     # A coroutine, because it takes milliseconds and must work when every thread is busy.
     return Response(runtime.telemetry.render(), media_type=CONTENT_TYPE_LATEST)

@@ -7,14 +7,14 @@ from typing import Annotated
 from fastapi import APIRouter, Depends
 
 from service.fair_share import max_per_client
-from service.runtime import Runtime, runtime_of
+from service.runtime import Runtime, get_runtime
 from service.schemas import LimitsAnswer
 
 router = APIRouter(tags=["operations"])
 
 
 @router.get("/limits", summary="Get the limits")
-async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnswer:
+async def limits(runtime: Annotated[Runtime, Depends(get_runtime)]) -> LimitsAnswer:
     """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
     # Resolved, because 0 leaves these numbers to the service.

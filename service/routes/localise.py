@@ -32,7 +32,7 @@ from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 _PNG, _SVG = "image/png", "image/svg+xml"
-# The photograph in an SVG is a data URL; nothing else can load or run.
+# An SVG embeds its photograph as a data URL; nothing else can load or run.
 _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
 _VARY = {"Vary": "Accept"}
 
@@ -40,8 +40,8 @@ _VARY = {"Vary": "Accept"}
 _PANORAMA_SCHEMA = {
     "type": "string",
     "format": "binary",
-    "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or the "
-    "part of it that its photo sphere metadata (GPano in XMP) describe.",
+    "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or a "
+    "part of it, described by its photo sphere metadata (GPano in XMP).",
 }
 
 
@@ -101,7 +101,7 @@ async def localise(
     )
     if form.venue_id is not None and media in (_PNG, _SVG):
         raise InvalidRequestError(
-            [("venue_id", f"cannot be answered in {media}: pictures show one plan; give floorplan_id")]
+            [("venue_id", f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id")]
         )
 
     async def respond() -> Response:
@@ -109,29 +109,29 @@ async def localise(
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
-            found = await runtime.venue_localiser.localise(venue, query)
-            add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
-            return await _response(found, media, tenant, runtime)
+            answer = await runtime.venue_localiser.localise(venue, query)
+            add_log_fields(request, plan=answer.floorplan_id, revision=answer.floorplan_revision, stage=answer.stage)
+            return await _response(answer, media, tenant, runtime)
         assert form.floorplan_id is not None
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         add_log_fields(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         if media in (JSON, GEOJSON):
-            found = await runtime.localiser.localise(record, query)
-            add_log_fields(request, stage=found.stage)
-            return await _response(found, media, tenant, runtime)
+            answer = await runtime.localiser.localise(record, query)
+            add_log_fields(request, stage=answer.stage)
+            return await _response(answer, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
-        wanted = PictureRequest(picture=picture or "both", as_png=media == _PNG, rooms=rooms)
-        found, drawn = await runtime.localiser.localise_and_draw(record, query, wanted)
-        add_log_fields(request, stage=found.stage)
-        return Response(drawn, headers=_VARY | _POLICY, media_type=media)
+        picture_request = PictureRequest(picture=picture or "both", as_png=media == _PNG, rooms=rooms)
+        answer, drawing = await runtime.localiser.localise_and_draw(record, query, picture_request)
+        add_log_fields(request, stage=answer.stage)
+        return Response(drawing, headers=_VARY | _POLICY, media_type=media)
 
     return await idempotent.run_async(parts, respond, runtime.reads)
 
 
 def _check_picture(media: str, picture: Picture | None) -> None:
-    """Refuse the parameter `picture` for an answer that is no picture.
+    """Refuse the parameter `picture` unless the answer is a picture.
 
     Raises:
         InvalidRequestError: the answer is JSON or GeoJSON.
@@ -144,7 +144,7 @@ async def _response(answer: LocaliseAnswer, media: str, tenant: str, runtime: Ru
     """Return an answer as JSON or GeoJSON.
 
     Raises:
-        UnanchoredPlanError: GeoJSON is requested, and the answer has no place on Earth.
+        UnanchoredPlanError: GeoJSON is requested, and neither the plan nor the venue has an anchor.
     """
     if media != GEOJSON:
         return Response(await _text(answer, tenant, runtime), headers=_VARY, media_type=JSON)
@@ -155,7 +155,7 @@ async def _response(answer: LocaliseAnswer, media: str, tenant: str, runtime: Ru
 
 
 async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
-    """Return an answer as JSON, and keep it if the settings say so."""
+    """Return an answer as JSON; store it under an id first if `keep_answers_s` is set."""
     if runtime.settings.storage.keep_answers_s == 0.0:
         return answer.model_dump_json()
     texts = {"": answer.model_dump_json()}

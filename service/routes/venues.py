@@ -265,14 +265,14 @@ def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[Venue
     limit = runtime.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise InvalidRequestError(
-            [("plans", f"has {len(documents)} floor plans, at most {limit} are allowed (max_venue_plans)")]
+            [("plans", f"has {len(documents)} floor plans; the limit is {limit} (max_venue_plans)")]
         )
     counted = Counter(document.floorplan_id for document in documents)
     twice = [plan_id for plan_id, count in counted.items() if count > 1]
     if twice:
         raise InvalidRequestError([("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once")])
     if wrong := [plan_id for plan_id in counted if not is_id(plan_id)]:
-        raise InvalidRequestError([("plans", f"there is no floor plan '{wrong[0]}'")])
+        raise InvalidRequestError([("plans", f"floor plan '{wrong[0]}' does not exist")])
     return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
 
 

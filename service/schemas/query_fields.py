@@ -52,7 +52,7 @@ class CameraFields(BaseModel):
     def _check_limit(cls, value: int, info: ValidationInfo) -> int:
         limit = (info.context or {}).get("max_top_k", math.inf)
         if value > limit:
-            raise ValueError(f"at most {limit} are allowed (max_top_k)")
+            raise ValueError(f"the limit is {limit} (max_top_k)")
         return value
 
 

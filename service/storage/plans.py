@@ -1,4 +1,4 @@
-"""Floor plans with their revisions and originals. Every call names the tenant, except where noted."""
+"""Stored floor plans, with their revisions and uploaded files. Calls are per tenant unless noted otherwise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, RE
 from service.storage.venues import remove_from_venues
 from service.telemetry import LOGGER_NAME
 
-# Advisory lock on PostgreSQL for exact numbers of plans; differs from the other locks.
+# Advisory lock on PostgreSQL that keeps the count of plans exact; differs from the other locks.
 _COUNT_LOCK = 5_210_002
 
 
@@ -38,8 +38,8 @@ class PlanDocument:
 
     Attributes:
         document: the plan in the native format.
-        document_sha256: its digest; None in a database of an earlier version of the service.
-        warnings: warnings of the validation as a JSON list; None likewise.
+        document_sha256: its digest; None for plans stored by an earlier version of the service.
+        warnings: warnings of the validation as a JSON list; None as for the digest.
     """
 
     document: str
@@ -64,7 +64,7 @@ class PlanDocument:
 
 @dataclass(frozen=True)
 class _Content:
-    """Stored content of a revision besides its columns, prepared before the transaction."""
+    """Documents, file and grid of a new revision, prepared before the transaction."""
 
     document: PlanDocument
     original: Original
@@ -72,24 +72,24 @@ class _Content:
     grid: tuple[GridKey, PackedGrid] | None
 
     @classmethod
-    def of(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
+    def prepare(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
         packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
         return cls(PlanDocument.from_plan(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Row of a plan, with the plan itself if it is in memory, else with its document."""
+class _StoredPlan:
+    """Row of a plan with the plan itself if it is in memory, otherwise with its document."""
 
     row: Row[Any]
     plan: FloorPlan | PlanDocument
 
 
 class Plans:
-    """Plans of all tenants; a plan of another tenant counts as missing."""
+    """Plans of all tenants; calls treat plans of other tenants as missing."""
 
     def __init__(self, database: Database, cache: PlanCache) -> None:
-        """Create the access to the tables.
+        """Use a database.
 
         Args:
             database: the database.
@@ -108,13 +108,13 @@ class Plans:
         limit: int,
         grid: ComputedGrid | None = None,
     ) -> PlanRecord:
-        """Store a plan, its uploaded file, and its grid if it is computed already.
+        """Store a plan, its uploaded file, and its grid if it is already computed.
 
-        If the id exists already, a previous attempt of the upload was stored and its answer was lost.
+        An existing id is a repeated upload whose first answer was lost; the stored plan is returned.
 
         Args:
             tenant: owner of the plan.
-            plan_id: a new id, or that of a repeated upload; never chosen by a caller.
+            plan_id: a new id, or the id of a repeated upload; callers never choose it.
             plan: the plan.
             original: the uploaded file.
             limit: maximum number of the tenant's plans.
@@ -125,14 +125,14 @@ class Plans:
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
-        content = _Content.of(record, original, grid)
+        content = _Content.prepare(record, original, grid)
         with self._database.writing() as connection:
             if self._database.is_postgresql:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
-                own = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
-                if (connection.scalar(own) or 0) >= limit:
+                count = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
+                if (connection.scalar(count) or 0) >= limit:
                     raise TooManyFloorPlansError(limit)
                 values = {"id": plan_id, "tenant": tenant, "created_at": now, **_revision_values(record)}
                 connection.execute(FLOORPLANS.insert(), values)
@@ -168,11 +168,11 @@ class Plans:
 
         Raises:
             UnknownFloorPlanError: the tenant has no such plan.
-            RevisionMismatchError: the plan has another revision.
+            RevisionMismatchError: the plan is not at revision `expected`.
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
-        content = _Content.of(record, original, grid)
+        content = _Content.prepare(record, original, grid)
         with self._database.writing() as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -215,7 +215,7 @@ class Plans:
             return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
 
     def summary(self, tenant: str, plan_id: str) -> PlanSummary | None:
-        """Return a plan at its current revision without its document, which may be damaged."""
+        """Return a plan at its current revision without its document, even if that is damaged."""
         query = select_summaries().where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         return next(iter(self._summaries(query)), None)
 
@@ -258,15 +258,18 @@ class Plans:
         return self._summaries(select_summaries().where(FLOORPLANS.c.id.in_(plan_ids)))
 
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
-        """Delete a plan with its revisions, originals and grids, and remove it from its venues; False without one.
+        """Delete a plan with its revisions, files and grids, and remove it from its venues.
 
         Args:
             tenant: owner of the plan.
             plan_id: id of the plan.
             expected: id of the revision that the plan must have; None for any.
 
+        Returns:
+            True if the plan existed.
+
         Raises:
-            RevisionMismatchError: the plan has another revision.
+            RevisionMismatchError: the plan is not at revision `expected`.
         """
         own = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         with self._database.writing() as connection:
@@ -286,7 +289,7 @@ class Plans:
             connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
 
     def clear_failures(self) -> None:
-        """Delete all errors, so that these grids are tried again."""
+        """Delete all stored errors, so that these grids are computed again."""
         with self._database.writing() as connection:
             connection.execute(update(REVISIONS).where(REVISIONS.c.failure.is_not(None)).values(failure=None))
 
@@ -305,19 +308,19 @@ class Plans:
             found = self._find(connection, query)
         return None if found is None else self._record(found)
 
-    def _find(self, connection: Connection, query: Any) -> _Found | None:
-        """Return a plan's row, with its document, which is long, only if the plan is not in memory."""
+    def _find(self, connection: Connection, query: Any) -> _StoredPlan | None:
+        """Return a plan's row; read its document only if the plan is not in memory."""
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
         if (plan := self._cache.plan(row.tenant, row.id, row.revision_id)) is not None:
-            return _Found(row, plan)
+            return _StoredPlan(row, plan)
         columns = REVISIONS.c
         query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == row.revision_id)
-        return _Found(row, PlanDocument(**connection.execute(query).one()._mapping))
+        return _StoredPlan(row, PlanDocument(**connection.execute(query).one()._mapping))
 
-    def _record(self, found: _Found) -> PlanRecord:
-        """Parse a plan; outside of transactions, because it takes a while.
+    def _record(self, found: _StoredPlan) -> PlanRecord:
+        """Parse a plan; call it outside of transactions, because it is slow.
 
         Raises:
             DamagedDataError: the document is damaged.
@@ -409,7 +412,7 @@ def _select_current(tenant: str, plan_id: str) -> Any:
 
 
 def _select_heads(*, current: bool) -> Any:
-    """Return a query for the columns of `PlanRecord`, without the plan itself."""
+    """Return a query for the columns of `PlanRecord` except `plan`, at the current or at every revision."""
     link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
     return select(
         FLOORPLANS.c.id,

@@ -1,4 +1,4 @@
-"""Store: one object per group of tables over one database, and the migrations that run when it opens."""
+"""The store: one object per group of tables of the database. Opening it migrates the schema."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from service.storage.plans import Plans
 from service.storage.stored_grids import GridLeases, StoredGrids
 from service.storage.venues import Venues
 
+# Margin (s) of the lease of an idempotency key over the query timeout.
 _CLAIM_MARGIN_S = 5.0
 _MIGRATIONS = Path(__file__).parent / "migrations"
-# Advisory lock on PostgreSQL; any number that differs from the other locks, see `plans` and `venues`.
+# Advisory lock on PostgreSQL; differs from the locks in `plans` and `venues`.
 _MIGRATION_LOCK = 5_210_001
 
 
 class Store:
     """All stored data; safe to share between threads and between processes.
 
-    Every call of its parts can raise `StoreUnavailableError`; the next call reconnects.
+    Every call can raise `StoreUnavailableError`; the next call reconnects.
 
     Attributes:
         plans: floor plans with revisions and originals.
@@ -59,9 +60,9 @@ class Store:
         Args:
             url: URL of the database.
             connections: maximum number of open connections.
-            wait_s: time limit (s) of waiting for a free connection.
-            claim_s: time limit (s) of a request with an idempotency key.
-            plan_cache_bytes: approximate memory limit of parsed plans; 0 keeps none.
+            wait_s: timeout (s) for a free connection.
+            claim_s: lease (s) of an idempotency key while its request runs.
+            plan_cache_bytes: approximate memory limit of parsed plans; 0 caches none.
 
         Raises:
             ConfigError: the URL is invalid, or the database cannot be opened.
@@ -91,7 +92,7 @@ class Store:
 
 
 def open_store(settings: Settings) -> Store:
-    """Open the database of the settings; the data folder of SQLite is created if it is missing.
+    """Open the configured database; the data folder of SQLite is created if it is missing.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
@@ -105,7 +106,7 @@ def open_store(settings: Settings) -> Store:
         settings.database_url,
         connections=settings.database.connections,
         wait_s=settings.database.wait_s,
-        # Longer than a query, so that a running query is not started again.
+        # The lease outlasts a query, so that a running query is not started again.
         claim_s=max(MIN_LEASE_S, settings.requests.request_deadline_s + _CLAIM_MARGIN_S),
         plan_cache_bytes=settings.storage.plan_cache_bytes,
     )
@@ -115,7 +116,7 @@ def _migrate(database: Database) -> None:
     """Run the missing migrations in one transaction; replicas that start together take turns.
 
     Raises:
-        CommandError, RevisionError: the database was last used by a newer version of the service.
+        CommandError, RevisionError: a newer version of the service has migrated the database.
         SQLAlchemyError: a migration failed; the database is unchanged.
     """
     script = ScriptDirectory(str(_MIGRATIONS))

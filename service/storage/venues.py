@@ -347,7 +347,7 @@ def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -
         query = select(FLOORPLANS.c.id).where(own, FLOORPLANS.c.id.in_(part)).order_by(FLOORPLANS.c.id)
         found |= set(connection.scalars(query.with_for_update(read=True, key_share=True)))
     if missing := [plan_id for plan_id in plan_ids if plan_id not in found]:
-        raise InvalidRequestError([("plans", f"there is no floor plan {_named(missing)}")])
+        raise InvalidRequestError([("plans", f"floor plan {_named(missing)} does not exist")])
 
 
 def _insert(connection: Connection, venue_id: str, members: Sequence[VenueMember]) -> None:

@@ -219,7 +219,7 @@ def test_answer_picture_has_all_parts(picture: Picture) -> None:
 
 
 def test_photograph_picture_needs_a_photograph() -> None:
-    with pytest.raises(ValueError, match="'both' needs the argument photograph"):
+    with pytest.raises(ValueError, match="photograph is None; picture='both'"):
         draw_answer(answer())
     assert "<image" not in draw_answer(answer(), picture="plan")
 

@@ -255,10 +255,10 @@ class TestEncoder:
     def test_class_shares_ignore_unknown_labels(self) -> None:
         encoder = TrunkImageEncoder(WIDE, TINY.ring)
         kind = torch.tensor([[0, 0, 0, 1], [2, -1, -1, -1]])
-        encoder.count(kind, torch.tensor([3, -1]))
+        encoder.update_class_shares(kind, torch.tensor([3, -1]))
         torch.testing.assert_close(encoder.opening_share, torch.tensor([0.6, 0.2, 0.2, 0.0]))
         assert encoder.room_type_share.argmax() == 3
-        encoder.count(torch.full((1, 4), 3), torch.tensor([-1]))
+        encoder.update_class_shares(torch.full((1, 4), 3), torch.tensor([-1]))
         torch.testing.assert_close(encoder.opening_share, torch.tensor([0.3, 0.1, 0.1, 0.5]))
         assert encoder.room_type_share.argmax() == 3
 

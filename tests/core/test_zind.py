@@ -187,7 +187,7 @@ class TestDataset:
 
     @pytest.mark.parametrize("name", ["../0002/floor_01", "/0002", "0002/floor_01/x", ""])
     def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
-        with pytest.raises(DatasetError, match="names are like '0000/floor_01'"):
+        with pytest.raises(DatasetError, match="names have the form '0000/floor_01'"):
             Zind(root).load(name)
 
     def test_unknown_floor_is_refused(self, root: Path) -> None:

@@ -108,7 +108,7 @@ def test_german_wall_lines_become_rooms():
 
 def test_unknown_layers_are_rejected_with_the_known_ones():
     with pytest.raises(
-        InvalidFloorPlanError, match=r"layers is walls, but the drawing has nothing on them; .*'Fenster', .*'WAND'"
+        InvalidFloorPlanError, match=r"layers is walls, but these layers are empty; .*'Fenster', .*'WAND'"
     ):
         import_plan(dxf_file(_german_walls()), ImportOptions(layers=("walls",)))
 

@@ -128,4 +128,6 @@ def test_contradicted_hints_are_warned_about() -> None:
         "rooms is 'bedroom', 'bedroom-2', which the panorama contradicts: the answer lies in room 'hall'",
     ]
     strict = hint_warnings(replace(hints, strict=True), replace(found, hints_missed=("near",)), plan)
-    assert strict == ["near is within 3 m of (6, 4.5), which the panorama contradicts: it was followed, being strict"]
+    assert strict == [
+        "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer follows it because strict is set"
+    ]

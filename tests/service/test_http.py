@@ -16,7 +16,7 @@ from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.http.admission_control import EXEMPT
 from service.openapi import openapi_text
-from service.runtime import Runtime, runtime_of
+from service.runtime import Runtime, get_runtime
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
@@ -34,7 +34,7 @@ def test_unknown_routes_and_methods_are_problems(client: httpx.Client) -> None:
 @pytest.mark.parametrize(
     ("method", "path", "faults"),
     [
-        ("GET", "/floorplans?offset=2&page=1", {"offset": "known are cursor, limit, name", "page": "unknown"}),
+        ("GET", "/floorplans?offset=2&page=1", {"offset": "known: cursor, limit, name", "page": "unknown"}),
         ("GET", "/floorplans?limit=1&limit=2", {"limit": "given more than once"}),
         pytest.param("GET", f"/floorplans?limit={'9' * 5000}", {"limit": "too many digits"}, id="digits"),
         ("POST", "/floorplans?name=x", {"name": "unknown query parameter; this route has none"}),
@@ -133,7 +133,7 @@ def test_unexpected_error_reveals_only_the_request_id() -> None:
         raise RuntimeError("secret detail")
 
     # The app is never started: nothing is there to answer with, as after a programming error.
-    app.dependency_overrides[runtime_of] = broken
+    app.dependency_overrides[get_runtime] = broken
     app.router.lifespan_context = _no_lifespan
     with serve(app) as base_url:
         response = httpx.get(f"{base_url}/floorplans", headers={"x-request-id": "r-1"})

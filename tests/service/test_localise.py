@@ -120,7 +120,7 @@ BAD_FIELDS = {
     "heading with underscore": ({"heading_deg": "1_0"}, "heading_deg", "1_0"),
     "no candidates": ({"top_k": "0"}, "top_k", "1"),
     "too many candidates": ({"top_k": "11"}, "top_k", "10"),
-    "far too many candidates": ({"top_k": "1000"}, "top_k", "is '1000': at most 10 are allowed (max_top_k)"),
+    "far too many candidates": ({"top_k": "1000"}, "top_k", "is '1000': the limit is 10 (max_top_k)"),
     "half a candidate": ({"top_k": "2.5"}, "top_k", "is '2.5': not a whole number"),
     "unknown stage": ({"refine": "magic"}, "refine", "'lpo'"),
     "tolerance without heading": ({"heading_tolerance_deg": "5"}, "heading_tolerance_deg", "heading_deg"),

@@ -117,7 +117,7 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panora
     ("arguments", "told"),
     [
         ({"search_max": "0"}, "search_max is '0': .*greater than or equal to 1"),
-        ({"searchers": "2"}, "searchers is '2': .*known are ingress_min, ingress_max"),
+        ({"searchers": "2"}, "searchers is '2': .*known: ingress_min, ingress_max"),
         ({"lpo_min": "3", "lpo_max": "2"}, "lpo_max is 2, less than lpo_min, which is 3"),
     ],
 )

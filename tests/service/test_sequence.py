@@ -78,7 +78,7 @@ def test_exact_motion_is_followed(client: httpx.Client, plan_id: str, pictures: 
         assert away_m == pytest.approx(2.0, abs=1.1)
         assert turned_deg == pytest.approx(90.0, abs=25.0)
     else:
-        assert "motions[0] has distance_m 2, turn_deg 90" in answer["warnings"][0]
+        assert "motions[0] (distance_m 2, turn_deg 90" in answer["warnings"][0]
 
 
 def test_sequence_without_motions_equals_single_answers(
@@ -130,7 +130,7 @@ def test_given_headings_are_followed(client: httpx.Client, plan_id: str, picture
         (2, {"headings_deg": [400, None]}, "headings_deg.0", "must be at most 360"),
         (2, {"heading_tolerance_deg": 5}, "heading_tolerance_deg", "needs headings_deg"),
         (2, {"refine": "vdr"}, "refine", "must be 'none' or 'lpo'"),
-        (2, {"top_k": 99}, "top_k", "at most 10 are allowed (max_top_k)"),
+        (2, {"top_k": 99}, "top_k", "the limit is 10 (max_top_k)"),
         (2, {"heading_deg": 5}, "heading_deg", "unknown part"),
     ],
 )

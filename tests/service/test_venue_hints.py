@@ -123,9 +123,9 @@ def test_room_search_in_some_plans_is_warned_about(
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
     answer = answer_to(client, venue_id, panorama, rooms='["kitchen", "studio", "living room"]', level=0)
-    assert "rooms was looked for in the 2 most probable ones of 4 floor plans" in answer["warnings"]
+    assert "the hint rooms was applied to the 2 most probable of 4 floor plans" in answer["warnings"]
     elsewhere = answer_to(client, venue_id, panorama, rooms="attic")
-    assert "rooms was looked for in the 2 most probable ones of 4 floor plans" in elsewhere["warnings"]
+    assert "the hint rooms was applied to the 2 most probable of 4 floor plans" in elsewhere["warnings"]
 
 
 @pytest.mark.parametrize(

@@ -150,8 +150,8 @@ BAD_VENUES: dict[str, tuple[Any, str, str]] = {
     "half an anchor": ({"anchor": {"latitude": 1.0}}, "anchor.longitude", "missing"),
     "text for a number": ({"anchor": ANCHOR | {"latitude": "51"}}, "anchor.latitude", "not a number"),
     "unknown key": ({"floors": []}, "floors", ""),
-    "no plan": ({"plans": [member("0" * 32)]}, "plans", "there is no floor plan '" + "0" * 32),
-    "no id": ({"plans": [member("flat 3")]}, "plans", "there is no floor plan 'flat 3'"),
+    "no plan": ({"plans": [member("0" * 32)]}, "plans", "floor plan '" + "0" * 32 + "' does not exist"),
+    "no id": ({"plans": [member("flat 3")]}, "plans", "floor plan 'flat 3' does not exist"),
     "level": ({"plans": [member("0" * 32, 1001)]}, "plans.0.level", "at most 1000"),
     "twice": ({"plans": [member("0" * 32), member("0" * 32, 1)]}, "plans", "2 times"),
     "empty name": ({"name": " "}, "name", "empty"),
@@ -184,7 +184,7 @@ def test_invalid_change_changes_nothing(client: httpx.Client, plans: list[str]) 
         ({"name": None}, "name"),
         ({"remove": [plans[1]]}, "does not have"),
         ({"plans": [member(plans[0])], "remove": [plans[0]]}, "which is also in plans"),
-        ({"name": "x", "plans": [member("0" * 32)]}, "there is no floor plan"),
+        ({"name": "x", "plans": [member("0" * 32)]}, "does not exist"),
     ):
         problem = assert_problem(client.patch(path, json=change), 422, "invalid-request")
         assert message in problem["detail"]
@@ -225,7 +225,7 @@ def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, dat
         )
         plan_id = client.post("/floorplans", json=FLAT, headers=mine).json()["id"]
         stolen = client.post("/venues", json={"plans": [member(plan_id)]}, headers=theirs)
-        assert "there is no floor plan" in assert_problem(stolen, 422, "invalid-request")["detail"]
+        assert "does not exist" in assert_problem(stolen, 422, "invalid-request")["detail"]
         venue = client.post("/venues", json={"plans": [member(plan_id)]}, headers=mine).json()
         path = f"/venues/{venue['id']}"
         for method, body in (("GET", None), ("PUT", {}), ("PATCH", {"name": "x"}), ("DELETE", None)):

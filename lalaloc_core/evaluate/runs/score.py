@@ -67,7 +67,7 @@ class ReliabilityBin:
 
 @dataclass(frozen=True, kw_only=True)
 class SliceScores:
-    """Accuracy on the `n` queries for which one fact holds; a query counts in the slice of each of its facts."""
+    """Accuracy on the `n` queries with one fact; a query counts for each of its facts."""
 
     n: int
     within_1m: Estimate
@@ -87,7 +87,7 @@ class Scores:
         final: accuracy of the final poses.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         reliability: bins of the reliability diagram.
-        median_ms, mean_ms: duration by stage, over the queries that passed it.
+        median_ms, mean_ms: duration by stage, over the queries that reached it.
         slices: accuracy by fact (`Prediction.facts`), the smallest share within 1 m first.
     """
 
@@ -108,7 +108,7 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
     """Score the predictions of one run.
 
     Args:
-        predictions: at least one.
+        predictions: predictions of the run, at least one.
         seed: seed of the bootstrap.
 
     Raises:
@@ -123,9 +123,9 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
     reliability, calibration_error = (), None
     if confident:
         confidence = np.array([prediction.confidence for prediction in confident], dtype=float)
-        right = position_errors_m(confident) < 1.0
-        reliability = reliability_bins(confidence, right)
-        calibration_error = expected_calibration_error(confidence, right)
+        is_correct = position_errors_m(confident) < 1.0
+        reliability = reliability_bins(confidence, is_correct)
+        calibration_error = expected_calibration_error(confidence, is_correct)
     return Scores(
         n=len(predictions),
         unanswered=int(np.isnan(final).sum()),
@@ -156,7 +156,7 @@ def score_run(folder: RunFolder) -> dict[str, Any]:
 
 
 def position_errors_m(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
-    """Return the position errors (m) of the final poses, or of the poses after a stage; NaN without a pose."""
+    """Return the position errors (m) of the poses after a stage (None: the final poses); NaN without a pose."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
         pose = prediction.pose_after(stage)
@@ -166,7 +166,7 @@ def position_errors_m(predictions: Sequence[Prediction], stage: str | None = Non
 
 
 def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
-    """Return the absolute heading errors (degrees) of the final poses or after a stage; NaN without a pose."""
+    """Return the absolute heading errors (degrees) of the poses after a stage, as `position_errors_m`."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
         pose = prediction.pose_after(stage)
@@ -203,7 +203,7 @@ def expected_calibration_error(
 
 
 class _Bootstrap:
-    """Resamples of scenes as weights of queries, the same for every score of a run."""
+    """Resamples of scenes as weights of queries; all scores of a run use the same resamples."""
 
     def __init__(self, scenes: Sequence[str], rng: np.random.Generator) -> None:
         names, member = np.unique(np.array(scenes), return_inverse=True)
@@ -213,7 +213,7 @@ class _Bootstrap:
         )
 
     def among(self, chosen: Bool[np.ndarray, "n"]) -> _Bootstrap:
-        """Restrict the resamples to some queries, without resamples that hold none of them."""
+        """Restrict the resamples to some queries; resamples without any of them are dropped."""
         part = copy.copy(self)
         weights = self._weights[:, chosen]
         part._weights = weights[weights.any(axis=1)]
@@ -230,7 +230,7 @@ class _Bootstrap:
         order = np.argsort(values, kind="stable")
         cumulated = np.cumsum(self._weights[:, order], axis=1)
         half = 0.5 * cumulated[:, -1:]
-        # The lower and upper middle of an even number of queries, as np.median takes them.
+        # The lower and upper median of an even number of queries, which np.median averages.
         lower = values[order][(cumulated >= half).argmax(axis=1)]
         upper = values[order][(cumulated > half).argmax(axis=1)]
         return self._estimate(float(np.median(values)), 0.5 * (lower + upper))
@@ -284,7 +284,7 @@ def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
-    """Return the recall, None if no query passed retrieval; otherwise, a query without retrieval is a miss."""
+    """Return the recall; a query without retrieval is a miss. None if no query passed retrieval."""
     if all(hit is None for hit in hits):
         return None
     return bootstrap.mean(np.array([bool(hit) for hit in hits]))

@@ -1,8 +1,8 @@
 """DXF drawings.
 
-Rooms are closed polylines and hatches on layers named after rooms; without them, the areas that walls enclose. Doors
-and windows are recognised by the names of layers and blocks, or by the arcs of door leaves. ezdxf reads the file and
-repairs damaged ones. Block contents are counted before they are expanded.
+Rooms are closed polylines and hatches on layers named after rooms, otherwise the areas that walls enclose. Doors and
+windows are recognised by the names of layers and blocks, or by the arcs of door leaves. ezdxf reads the file and
+repairs it if it is damaged. Block contents are counted before they are expanded.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.drawing.sketching import sketch_drawing
 
-# (metres, option `units`) by $INSUNITS, from the DXF reference.
+# (metres, value of the option `units`) by $INSUNITS; DXF reference.
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
 _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
-# Largest distance of a curve from its polyline, as a share of the drawing's size.
+# Maximum distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
 _USUAL_EXTENT_M = (4.0, 120.0)
-# Ends of a polyline this near are the same point, as a share of its length. It must not depend on the distance to the
-# origin: surveyed coordinates are large.
+# A polyline is closed if its ends are nearer than this share of its length. The distance to the origin must not matter,
+# because surveyed coordinates are large.
 _CLOSED = 1e-5
 # Layers of exported drawings, with their colours.
 _LAYERS = {"ROOM": 7, "COLUMN": 8, "WALL": 1, "DOOR": 3, "WINDOW": 5, "PASSAGE": 30, "ROOM-TEXT": 2}
@@ -83,7 +83,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
-    """Return a DXF drawing in metres. It has no place for heights, ids and the anchor."""
+    """Return a plan as a DXF drawing in metres; heights, ids and the anchor are lost."""
     drawing = new_dxf("R2010")
     drawing.header["$INSUNITS"] = _INSUNITS_METRES
     for layer, colour in _LAYERS.items():
@@ -131,13 +131,17 @@ def _from_tags(tags: Iterable[Any]) -> DxfDocument:
 
 
 def _check_blocks(document: DxfDocument, budget: Budget) -> None:
-    """Count the entities after expansion: nested blocks in rows and columns can multiply to billions."""
+    """Check the number of entities after expansion; nested arrays of blocks can multiply to billions.
+
+    Raises:
+        InvalidFloorPlanError: blocks are nested too deeply, or `max_entities` is exceeded.
+    """
     sizes: dict[str, int] = {}
 
     def size(name: str, depth: int) -> int:
         if depth > _MAX_BLOCK_DEPTH:
             raise InvalidFloorPlanError(
-                f"blocks are nested more than {_MAX_BLOCK_DEPTH} deep, or contain themselves; explode the blocks"
+                f"blocks are nested more than {_MAX_BLOCK_DEPTH} deep or contain themselves; explode them"
             )
         if name not in sizes:
             block = document.blocks.get(name)
@@ -159,7 +163,7 @@ def _check_blocks(document: DxfDocument, budget: Budget) -> None:
 
 
 def _weight(entity: DXFEntity) -> int:
-    """Return the weight of an entity in the budget: one, plus its vertices."""
+    """Return the weight of an entity in the budget, which grows with its vertices."""
     kind = entity.dxftype()
     if kind in ("LWPOLYLINE", "POLYLINE"):
         return 1 + len(entity) // 2  # type: ignore[arg-type]
@@ -183,8 +187,8 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     if options.layers and not drawing.areas and not drawing.strokes:
         available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
-            f"layers is {', '.join(options.layers)[:200]}, but the drawing has nothing on them; "
-            f"its layers are {', '.join(repr(layer) for layer in available) or 'empty'}"
+            f"layers is {', '.join(options.layers)[:200]}, but these layers are empty; "
+            f"layers of the drawing: {', '.join(repr(layer) for layer in available) or 'none'}"
         )
     return drawing
 
@@ -201,7 +205,7 @@ def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterat
         if not isinstance(entity, DXFGraphic) or depth > _MAX_BLOCK_DEPTH:
             continue
         layer = entity.dxf.get("layer", "0")
-        # Layer 0 in a block stands for the layer of the insert.
+        # Layer 0 in a block means the layer of the insert.
         if block is not None and layer == "0":
             layer = block.layer
         role = role_from_name(layer)
@@ -249,7 +253,7 @@ def _add(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: Repor
 
 
 def _add_block(entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
-    """Add a window, passage or column that is a block, as the smallest rectangle around its entities."""
+    """Add a window, passage or obstacle drawn as a block: the smallest rectangle around its entities."""
     inner = Drawing()
     for part, _ in _walk(entity.virtual_entities(), context, 1):
         if part.dxftype() in _LINES | _FILLED:
@@ -307,7 +311,7 @@ def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
     try:
         is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
         paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [np.array([(v.x, v.y) for v in path.flattening(sag, segments=8)]) for path in paths]
+        rings = [np.array([(vertex.x, vertex.y) for vertex in path.flattening(sag, segments=8)]) for path in paths]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
     usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]
@@ -315,13 +319,18 @@ def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
 
 
 def _sag(document: DxfDocument) -> float:
+    """Return the maximum distance of a curve from its polyline, in drawing units."""
     low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
     size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
     return _SAG * size if 0.0 < size < 1e9 else 0.01
 
 
 def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder) -> tuple[float, str]:
-    """Return metres per unit and its source: the options or $INSUNITS; the error names the likely unit."""
+    """Return the metres per unit and their source, the options or $INSUNITS.
+
+    Raises:
+        InvalidFloorPlanError: neither gives a unit; the message names the likely one.
+    """
     code = document.header.get("$INSUNITS", 0)
     own_unit = _INSUNITS.get(code)
     extent = _extent(drawing)

@@ -40,7 +40,7 @@ _PARTITION_KEYS: dict[Split, str] = {"train": "train", "validation": "val", "tes
 
 @dataclass(frozen=True)
 class Zind:
-    """Copy of ZInD or a part of it.
+    """Copy of ZInD, or of a part of it.
 
     Attributes:
         root: folder of the homes.
@@ -66,7 +66,7 @@ class Zind:
         home, _, floor = name.partition("/")
         folder = path_below(self.root, home)
         if folder is None or "/" in floor:
-            raise DatasetError("no such floor; names are like '0000/floor_01'", scene=name, path=self.root)
+            raise DatasetError("unknown floor; names have the form '0000/floor_01'", scene=name, path=self.root)
         reader = _FloorReader(name, floor, folder, read_json(folder / DATA_FILE, scene=name))
         return reader.scene(problems)
 
@@ -76,9 +76,11 @@ class Zind:
         document = read_json(path)
         for key, homes in document.items():
             if key not in _PARTITION_KEYS.values():
-                raise DatasetError(f"unknown split '{key}'; known are {', '.join(_PARTITION_KEYS.values())}", path=path)
-            if not isinstance(homes, list) or not all(isinstance(h, str) and path_below(self.root, h) for h in homes):
-                raise DatasetError(f"'{key}' must be a list of the homes' names", path=path)
+                raise DatasetError(f"unknown split '{key}'; known: {', '.join(_PARTITION_KEYS.values())}", path=path)
+            if not isinstance(homes, list) or not all(
+                isinstance(home, str) and path_below(self.root, home) for home in homes
+            ):
+                raise DatasetError(f"'{key}' must be a list of names of homes", path=path)
         return document
 
     def _floors_of(self, home: str) -> list[str]:
@@ -91,7 +93,7 @@ class Zind:
 
 @dataclass(frozen=True, kw_only=True)
 class _Panorama:
-    """Panorama of a floor: its room and name in the file, and its data."""
+    """Panorama of a floor: its room and name in the file, and its record."""
 
     complete_room: str
     name: str
@@ -124,7 +126,7 @@ class _FloorReader:
         for panorama in self._panoramas:
             if panorama.complete_room not in outlines and panorama.data.get("is_primary") is True:
                 layout = panorama.data.get("layout_complete")
-                # Small rooms photographed from outside may have no layout.
+                # A small room that was photographed from outside can lack a layout.
                 if layout is not None:
                     outlines[panorama.complete_room] = self._outline(panorama, layout)
                     openings += self._openings(panorama, layout, faults)
@@ -172,7 +174,10 @@ class _FloorReader:
         )
 
     def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
-        """Yield doors, passages and windows of a layout: triples of both ends and the heights from the camera."""
+        """Yield the doors, passages and windows of a layout.
+
+        Each is a triple: start, end, and the heights of sill and head above the camera.
+        """
         transform = self._transform(panorama)
         camera = self._number(panorama.data, "camera_height", panorama)
         for key, kind in _OPENING_LISTS.items():
@@ -198,7 +203,7 @@ class _FloorReader:
     def _camera(self, panorama: _Panorama, plan: FloorPlan, room_index: int | None) -> Camera:
         if room_index is None:
             raise self._error(
-                f"its room '{panorama.complete_room}' has no usable layout_complete in a primary panorama",
+                f"the room '{panorama.complete_room}' has no usable layout_complete in a primary panorama",
                 panorama.name,
             )
         transform = self._transform(panorama)
@@ -212,9 +217,7 @@ class _FloorReader:
         image_path = panorama.data.get("image_path")
         path = path_below(self._folder, image_path) if isinstance(image_path, str) else None
         if path is None:
-            raise self._error(
-                f"image_path is {image_path!r}; a path below the home's folder is required", panorama.name
-            )
+            raise self._error(f"image_path is {image_path!r}; it must be a path below the home's folder", panorama.name)
         photograph = FilePhotograph(path=path, scene=self._scene, room=panorama.name)
         return Camera(
             name=panorama.name,
@@ -259,11 +262,11 @@ class _FloorReader:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Transform:
-    """Transform of a panorama's frame, in camera heights, to the floor's frame and the plan's.
+    """Transform from a panorama's frame, in camera heights, to the floor's frame and the plan frame.
 
     Attributes:
-        translation: of the camera in floor coordinates.
-        rotation_deg: counter-clockwise in the floor's mirrored frame.
+        translation: position of the camera in floor coordinates.
+        rotation_deg: rotation, counter-clockwise in the floor's mirrored frame.
         scale: floor coordinates per camera height.
         scale_m: metres per floor coordinate.
     """

@@ -25,7 +25,7 @@ from lalaloc_core.nets.trunk import StyleMixing
 
 
 class ImageStage(TrainingStage):
-    """Stage 2: the image encoder learns to map a panorama to the latent of its bare layout; the teacher is frozen."""
+    """Stage 2: train the image encoder to map a panorama to the latent of its bare layout; the teacher is frozen."""
 
     name = "image"
 
@@ -77,7 +77,7 @@ class ImageStage(TrainingStage):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name."""
         layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
-        stage, terms = self.settings, {}
+        settings, terms = self.settings, {}
         if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
@@ -87,76 +87,78 @@ class ImageStage(TrainingStage):
             if features.structure is not None:
                 terms |= self._structure_losses(features.structure, batch)
             terms |= photograph_terms
-            if stage.ring_weight:
-                terms["ring"] = stage.ring_weight * losses.ring_distillation(features.ring, ring)
-            if stage.profile_weight:
+            if settings.ring_weight:
+                terms["ring"] = settings.ring_weight * losses.ring_distillation(features.ring, ring)
+            if settings.profile_weight:
                 likelihood = losses.laplace(features.log_profile, features.log_scale, batch["profile_m"])
-                terms["profile"] = stage.profile_weight * likelihood
+                terms["profile"] = settings.profile_weight * likelihood
         else:
             with torch.no_grad():
                 target = self.teacher(*layout)
             latent = self.encoder(self._augment(batch["image"]))
-        if stage.l2_weight:
-            terms["l2"] = stage.l2_weight * losses.l2(latent, target)
-        if stage.log_ratio_weight or stage.kd_weight:
+        if settings.l2_weight:
+            terms["l2"] = settings.l2_weight * losses.l2(latent, target)
+        if settings.log_ratio_weight or settings.kd_weight:
             terms |= self._distance_losses(latent.float(), target.float(), batch)
         return terms
 
     def _encode(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
-        """Return the features of a batch's panoramas, and the loss on photographs encoded along with them."""
-        stage, image, height = self.settings, batch["image"], batch["camera_height_m"]
-        if self.photographs is None or not (stage.photograph_weight or stage.photograph_profile_weight):
+        """Return the features of a batch's panoramas, and the loss of the photographs encoded with them."""
+        settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
+        if self.photographs is None or not (settings.photograph_weight or settings.photograph_profile_weight):
             return self.encoder(self._augment(image), height), {}
-        count, columns = stage.photographs_per_batch, self.config.profile_columns
+        count, columns = settings.photographs_per_batch, self.config.profile_columns
         photographs = self.photographs.draw(count, columns, self._generator(torch.device("cpu")))
         images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
-        # The camera height of photographs is unknown, so their targets are in camera heights.
+        # The camera height of photographs is unknown, so their unit of length is the camera height.
         heights = torch.cat([height, height.new_ones(count)])
         features = self.encoder(images, heights, self._styles(len(image), count, image.device))
         assert features.structure is not None
         openings, log_distance = (
             target.to(image.device) for target in (photographs.openings, photographs.log_distance)
         )
-        real = slice(len(image), None)
-        logits = features.structure.opening_logits[real]
+        photograph_rows = slice(len(image), None)
+        logits = features.structure.opening_logits[photograph_rows]
         openings_loss = losses.teacher_openings(logits, openings)
-        walls_loss = losses.teacher_walls(features.log_profile[real], features.log_scale[real], log_distance, logits)
-        total = stage.photograph_weight * openings_loss + stage.photograph_profile_weight * walls_loss
+        walls_loss = losses.teacher_walls(
+            features.log_profile[photograph_rows], features.log_scale[photograph_rows], log_distance, logits
+        )
+        total = settings.photograph_weight * openings_loss + settings.photograph_profile_weight * walls_loss
         return first_rows(features, len(image)), {"photographs": total}
 
     def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
-        """Draw style partners; every other partner is a photograph, because queries look like photographs."""
+        """Draw style partners, with extra weight on photographs, because queries look like photographs."""
         if not self.settings.style_mixing:
             return None
         generator = self._generator(torch.device("cpu"))
         count = rendered + photographs
         partner = torch.randint(count, (count,), generator=generator)
-        real = rendered + torch.randint(photographs, (count,), generator=generator)
-        partner = torch.where(torch.rand(count, generator=generator) < 0.5, real, partner)
+        photograph = rendered + torch.randint(photographs, (count,), generator=generator)
+        partner = torch.where(torch.rand(count, generator=generator) < 0.5, photograph, partner)
         share = torch.rand(count, generator=generator)
         share[torch.rand(count, generator=generator) >= self.settings.style_mixing] = 0.0
         return StyleMixing(partner.to(device), share.to(device))
 
     def _structure_losses(self, features: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
         """Return the losses on openings, ceiling height and room type."""
-        stage, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
+        settings, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
         assert isinstance(self.encoder, TrunkImageEncoder)
-        self.encoder.count(kind, room_type)
+        self.encoder.update_class_shares(kind, room_type)
         terms = {}
-        if stage.opening_weight:
+        if settings.opening_weight:
             share = self.encoder.opening_share
-            loss = losses.opening(features.opening_logits, kind, share, stage.opening_balance)
-            terms["opening"] = stage.opening_weight * loss
-        if stage.ceiling_weight:
+            loss = losses.opening(features.opening_logits, kind, share, settings.opening_balance)
+            terms["opening"] = settings.opening_weight * loss
+        if settings.ceiling_weight:
             above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
             loss = losses.ceiling(features.log_ceiling, features.log_ceiling_scale, above_m)
-            terms["ceiling"] = stage.ceiling_weight * loss
-        if stage.room_type_weight:
-            terms["room_type"] = stage.room_type_weight * losses.room_type(features.room_type_logits, room_type)
+            terms["ceiling"] = settings.ceiling_weight * loss
+        if settings.room_type_weight:
+            terms["room_type"] = settings.room_type_weight * losses.room_type(features.room_type_logits, room_type)
         return terms
 
     def _augment(self, image: Tensor) -> Tensor:
-        """Apply the configured photometric changes; the random draws depend on the seed and the first step."""
+        """Apply the configured photometric augmentation; its random numbers depend on the seed and the first step."""
         # Single precision, because bfloat16 cannot represent 256 grey levels.
         with torch.autocast(image.device.type, enabled=False):
             if self.settings.photometric:
@@ -173,17 +175,19 @@ class ImageStage(TrainingStage):
 
     def _distance_losses(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
         """Return the losses on the latent distances between a panorama and its neighbours' layouts."""
-        stage, layout = self.settings, self.config.layout
+        settings, layout = self.settings, self.config.layout
         groups = anchors_with_neighbours(batch)
         with torch.no_grad():
             neighbours = embed(self.teacher, {key: value[:, 1:] for key, value in groups.items()})
             teacher_distance = torch.linalg.vector_norm(neighbours - target[:, None], dim=2)
         distance = torch.linalg.vector_norm(neighbours - latent[:, None], dim=2)
         positives, all_pairs, terms = layout.triplets.positives, layout.all_pairs, {}
-        if stage.log_ratio_weight:
+        if settings.log_ratio_weight:
             chamfer = chamfer_to_anchors(groups, layout)
             ratio = losses.log_ratio(distance, chamfer, positives, all_pairs=all_pairs)
-            terms["log_ratio"] = stage.log_ratio_weight * ratio
-        if stage.kd_weight:
-            terms["kd"] = stage.kd_weight * losses.log_ratio(distance, teacher_distance, positives, all_pairs=all_pairs)
+            terms["log_ratio"] = settings.log_ratio_weight * ratio
+        if settings.kd_weight:
+            terms["kd"] = settings.kd_weight * losses.log_ratio(
+                distance, teacher_distance, positives, all_pairs=all_pairs
+            )
         return terms

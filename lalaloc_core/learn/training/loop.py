@@ -45,16 +45,16 @@ def run_stage(
 
     Args:
         stage: networks, data and losses.
-        folder: of the run.
-        device: to train on.
-        workers: processes that make batches.
+        folder: folder of the run.
+        device: training device.
+        workers: number of processes that make batches.
         resume: continue from `<stage>.pt`.
-        checkpoint_minutes: interval between checkpoints.
-        validate: called with the modules (averaged if averaging is on) before each checkpoint is written.
+        checkpoint_minutes: minutes between checkpoints.
+        validate: function of the modules (averaged if averaging is on) that returns metrics; called per checkpoint.
         begun_from: origin of the initial weights, stored in checkpoints; a resumed run keeps its checkpoint's value.
 
     Raises:
-        CheckpointError: `resume` without a checkpoint, or with one of another configuration or other data.
+        CheckpointError: `resume` is set, and the checkpoint is missing or has another configuration or other data.
     """
     path = folder / f"{stage.name}.pt"
     trainer = _Trainer(stage, device)
@@ -143,7 +143,7 @@ class _Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         if self.settings.optimiser.clip_norm:
-            parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+            parameters = [parameter for group in self.optimiser.param_groups for parameter in group["params"]]
             nn.utils.clip_grad_norm_(parameters, self.settings.optimiser.clip_norm)
         self.optimiser.step()
         self.step += 1
@@ -152,7 +152,7 @@ class _Trainer:
         return {name: term.item() for name, term in terms.items()}
 
     def checkpoint(self) -> Checkpoint:
-        """Return the present state."""
+        """Return the current state."""
         return Checkpoint(
             stage=self.stage.name,
             config=self.stage.config,
@@ -167,14 +167,16 @@ class _Trainer:
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint of the same configuration; only budgets and rays per pixel may differ."""
+        """Continue from a checkpoint; its configuration can differ only in budgets and rays per pixel."""
         if _without_budgets(checkpoint.config) != _without_budgets(self.stage.config):
             raise CheckpointError(
                 f"the checkpoint of stage '{checkpoint.stage}' has another configuration; resume with the preset, seed "
                 "and settings of the run"
             )
         if checkpoint.data and checkpoint.data != self.stage.data:
-            raise CheckpointError(f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}")
+            raise CheckpointError(
+                f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}; resume with the same data"
+            )
         for name, module in self.stage.modules.items():
             module.load_state_dict(checkpoint.weights[name])
         if self._averaged is not None:
@@ -200,7 +202,7 @@ def _progress_bar(trainer: _Trainer) -> tqdm[Any]:
 
 
 def _multiplies_bfloat16() -> bool:
-    """Return whether the processor multiplies bfloat16 matrices natively; otherwise autocast only costs time."""
+    """Return True if the processor multiplies bfloat16 matrices natively; without that, autocast is slower."""
     return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
@@ -209,7 +211,7 @@ def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:
 
 
 def _without_budgets(config: TrainConfig) -> TrainConfig:
-    """Reset the settings that may change when a run resumes."""
+    """Reset the settings that can change when a run resumes."""
     return dataclasses.replace(
         config,
         layout=dataclasses.replace(config.layout, steps=0, minutes=None),
@@ -232,12 +234,12 @@ def learning_rate(config: OptimiserConfig, progress: float) -> float:
 def moving_average(module: nn.Module, decay: float) -> AveragedModel:
     """Create an exponential moving average of a module's weights and statistics, in evaluation mode.
 
-    The average starts with the module's present weights; call `update_parameters` after every step. `decay` is per
+    The average starts with the module's current weights; call `update_parameters` after every step. `decay` is per
     step; early steps use a smaller decay.
     """
 
     def update(averaged: Iterable[Tensor], current: Iterable[Tensor], count: Tensor | int) -> None:
-        # At full decay, early steps would keep their weight for too long.
+        # At full decay, the initial weights would dominate for too long.
         share = 1.0 - min(decay, (1.0 + int(count)) / (10.0 + int(count)))
         for average, value in zip(averaged, current, strict=True):
             if average.is_floating_point():
@@ -251,12 +253,12 @@ def moving_average(module: nn.Module, decay: float) -> AveragedModel:
 
 
 def _set_average_steps(average: AveragedModel, step: int) -> None:
-    """Set the number of steps in an average; the initial weights count as one."""
+    """Set the number of steps of an average; the initial weights count as one step."""
     average.n_averaged.fill_(1 + step)
 
 
 class _CsvLog:
-    """Long-format log: one row per step and value, which any tool can plot."""
+    """Log in long format: one row per step and value."""
 
     def __init__(self, path: Path, *, append: bool) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

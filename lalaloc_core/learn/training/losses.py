@@ -23,8 +23,8 @@ def log_ratio(
     """Return the log-ratio loss (equation 1), averaged over anchors and pairs of neighbours.
 
     `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is the
-    distance of latents and R the Chamfer distance. The panorama's variants (section A.1.5) measure D from the
-    panorama's latent; R is again the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
+    distance of latents and R the Chamfer distance. The variants for panoramas (section A.1.5) measure D from the
+    panorama's latent; R is the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
     distillation).
 
     Args:
@@ -58,7 +58,7 @@ def l2(image_latent: Float[Tensor, "b d"], layout_latent: Float[Tensor, "b d"]) 
 
 
 def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b c s"]) -> Tensor:
-    """Return the mean |difference| of ring features, in units of each channel's spread over the batch."""
+    """Return the mean |difference| of ring features, in standard deviations of each channel over the batch."""
     spread = teacher.std(dim=(0, 2), keepdim=True).clamp_min(1e-3)
     return ((student - teacher) / spread).abs().mean()
 
@@ -77,7 +77,7 @@ def teacher_walls(
     log_distance: Float[Tensor, "b w"],
     opening_logits: Float[Tensor, "b w c"],
 ) -> Tensor:
-    """Return the `laplace` loss of a teacher's walls, whose log distances are NaN where it sees none.
+    """Return the `laplace` loss of the walls that a teacher sees; its log distance is NaN elsewhere.
 
     Azimuths where the student predicts a passage are left out: the teacher sees the wall of the next room, but a room
     ends in the plane of its own wall.
@@ -85,8 +85,8 @@ def teacher_walls(
     passage = torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")]
     known = torch.isfinite(log_distance) & (passage < 0.5)
     error = (log_profile - log_distance.nan_to_num()).abs()
-    each = error * torch.exp(-log_scale) + log_scale
-    return (each * known).sum() / known.sum().clamp_min(1)
+    loss = error * torch.exp(-log_scale) + log_scale
+    return (loss * known).sum() / known.sum().clamp_min(1)
 
 
 def opening(
@@ -94,8 +94,7 @@ def opening(
 ) -> Tensor:
     """Return the cross entropy of the opening class at each azimuth; negative kinds are unknown and ignored.
 
-    Classes are weighted by `share ** -balance`, so the network learns distributions whose class shares are
-    `opening_prior`.
+    Classes are weighted by `share ** -balance`. The network therefore learns class shares of `opening_prior`.
     """
     weight = share.clamp_min(_MIN_SHARE) ** -balance
     return _cross_entropy(logits.flatten(0, 1), kind.flatten(), weight)
@@ -127,15 +126,15 @@ def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], abov
 def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 2"]) -> Tensor:
     """Return the cross entropy to a teacher's shares of (door, window) in each column.
 
-    The teacher knows no passages, so the remaining share is free to be wall or passage.
+    The teacher does not detect passages, so the remaining share can be wall or passage.
     """
     log_probability = torch.log_softmax(logits, dim=2)
     door, window = (OPENING_CLASSES.index(kind) for kind in ("door", "window"))
-    others = [code for code in range(len(OPENING_CLASSES)) if code not in (door, window)]
-    rest = torch.logsumexp(log_probability[..., others], dim=2)
-    left = (1.0 - shares.sum(dim=2)).clamp_min(0.0)
+    other_codes = [code for code in range(len(OPENING_CLASSES)) if code not in (door, window)]
+    log_other = torch.logsumexp(log_probability[..., other_codes], dim=2)
+    other_share = (1.0 - shares.sum(dim=2)).clamp_min(0.0)
     agreement = shares[..., 0] * log_probability[..., door] + shares[..., 1] * log_probability[..., window]
-    return -(agreement + left * rest).mean()
+    return -(agreement + other_share * log_other).mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:
