@@ -157,7 +157,7 @@ class PlanTooLargeError(ServiceError):
     def __init__(self, estimate: int, limit: int, step_m: float) -> None:
         super().__init__(
             f"the plan needs about {estimate} grid poses at a step of {step_m:g} m; the limit is {limit} "
-            "(max_grid_poses). Check that the coordinates are in metres"
+            "(max_grid_poses); check that the coordinates are in metres"
         )
 
 

@@ -105,7 +105,7 @@ def _from_control_points(raw: Any, altitude_m: float | None) -> Anchor:
     if not abs(drawn_m / earth_m - 1.0) <= _MAX_STRETCH:
         raise InvalidFloorPlanError(
             f"the control points are {drawn_m:.2f} m apart in the plan and {earth_m:.2f} m on Earth; the limit is "
-            f"{_MAX_STRETCH:.0%} difference; is the scale right?"
+            f"{_MAX_STRETCH:.0%} difference; check the scale"
         )
     # Azimuth of the line in the plan, minus its azimuth from north.
     north_deg = math.degrees(math.atan2(dx, dy) - math.atan2(east, north)) % 360.0

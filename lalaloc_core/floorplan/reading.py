@@ -95,7 +95,7 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     if shape.area < limits.min_room_area_m2:
         raise InvalidFloorPlanError(
             f"the area is {shape.area:.3g} m²; the minimum is {limits.min_room_area_m2:g} m² "
-            "(PlanLimits.min_room_area_m2); are the coordinates in metres?",
+            "(PlanLimits.min_room_area_m2); check that the coordinates are in metres",
             room=name,
         )
     return Room(

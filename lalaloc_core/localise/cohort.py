@@ -78,7 +78,7 @@ class Cohort:
             with np.load(io.BytesIO(bundle.read(COHORT)), allow_pickle=False) as arrays:
                 found = cls(arrays["log_profile"], arrays["kind"])
         except (ValueError, KeyError, OSError) as error:
-            raise BundleError(f"bundle '{bundle.folder}': '{COHORT}' is no cohort: {error}") from error
+            raise BundleError(f"bundle '{bundle.folder}': '{COHORT}' is not a valid cohort: {error}") from error
         columns = bundle.manifest.profile_columns
         if found.log_profile.shape[1:] != (columns,) or found.kind.shape != found.log_profile.shape:
             raise BundleError(

@@ -84,8 +84,7 @@ class VenueHints:
         if np.isnan(distance_m).all():
             raise InvalidHintError(
                 "near",
-                f"{self.place} cannot be placed, because neither the venue nor any of its floor plans has an "
-                "anchor: add one",
+                f"{self.place} cannot be placed: neither the venue nor any of its floor plans has an anchor; add one",
             )
         if (nearest_m := float(np.nanmin(distance_m))) > self.radius_m:
             raise InvalidHintError(

@@ -68,9 +68,9 @@ class LocaliseForm(CameraFields, HintFields):
         if value is None and venue_id is None and "venue_id" in given.data:
             raise PydanticCustomError("missing", "missing")
         if venue_id is not None and value is not None:
-            raise ValueError("venue_id is given as well; give one of the two")
+            raise ValueError("set floorplan_id or venue_id, not both")
         if value is not None and given.data.get("level") is not None:
-            raise ValueError("level is given as well; it needs venue_id instead")
+            raise ValueError("level needs venue_id instead of floorplan_id")
         return value
 
     @field_validator("heading_tolerance_deg")

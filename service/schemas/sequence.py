@@ -175,10 +175,12 @@ class SequenceAnswer(ResponseModel):
     floorplan_revision: str = Field(description="Revision of the plan that was searched.")
     poses: list[SequencePoseAnswer] = Field(description="Poses, one per panorama, in the order sent.")
     confidence: Share | None = Field(
-        description="Probability that all positions are right within 1 m: that of the path among all paths, times the "
-        "lowest probability that a panorama is of this plan. Null for a model without confidence."
+        description="Probability that all positions are right within 1 m: the probability of the path among all paths, "
+        "times the lowest probability that a panorama shows this plan. Null for a model without confidence."
     )
-    warnings: list[str] = Field(description="Motions in the request that were not followed.")
+    warnings: list[str] = Field(
+        description="Motions in the request that were ignored, because the panoramas contradict them."
+    )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
     camera_height_m: Metres = Field(description="Camera height that fits all panoramas best.")
     timings_ms: TimingsAnswer

@@ -146,5 +146,5 @@ class TestTraining:
         assert resumed.manifest.layout_config["layout_predictor"] == "mlp"
 
     def test_unknown_variant_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="there is no variant 'layout-resnet34'"):
+        with pytest.raises(ConfigError, match="unknown variant 'layout-resnet34'"):
             train("layout-resnet34", tmp_path)

@@ -561,7 +561,7 @@ class TestDataset:
 
     @pytest.mark.parametrize("name", ["scene_1", "../scene_03250", "scene_03250/..", "kitchen", ""])
     def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
-        refused(root, "names are like 'scene_03250'", name=name)
+        refused(root, "names have the form 'scene_03250'", name=name)
 
     def test_synthetic_scenes_have_their_own_description(self, root: Path) -> None:
         dataset = Structured3D(root)

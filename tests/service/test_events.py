@@ -87,7 +87,7 @@ def test_failed_plan_states_the_reason(start_app: StartApp, tmp_path: Path) -> N
     with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
         name, event = _follow(client, plan_id)[-1]
         assert name == event["status"] == "failed"
-        assert "at most 146" in event["reason"]
+        assert "the limit is 146" in event["reason"]
 
 
 def test_deleting_a_plan_ends_its_streams(start_app: StartApp, tmp_path: Path) -> None:

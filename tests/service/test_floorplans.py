@@ -192,7 +192,7 @@ def test_upload_is_cut_off_at_its_limit(start_app: StartApp, tmp_path: Path) -> 
     with start_app(tmp_path, max_plan_bytes=2000) as client:
         headers = {"content-type": "application/json"}
         stated = client.post("/floorplans", content=b" " * 2001, headers=headers)
-        assert "at most 2000 bytes" in assert_problem(stated, 413, "upload-too-large")["detail"]
+        assert "the limit is 2000 bytes" in assert_problem(stated, 413, "upload-too-large")["detail"]
         streamed = client.post("/floorplans", content=(b" " * 500 for _ in range(5)), headers=headers)
         assert_problem(streamed, 413, "upload-too-large")
         as_file = client.post("/floorplans", files={"file": ("plan.json", b" " * 2001)})
@@ -230,7 +230,7 @@ def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_p
     # With a finer grid the stored plan exceeds the limit, so its grid cannot be computed.
     with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
-        assert "at most 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
+        assert "the limit is 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
         response = client.post(
             "/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p.jpg", _panorama(), "image/jpeg")}
         )

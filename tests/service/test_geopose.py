@@ -85,7 +85,7 @@ def test_two_control_points_make_an_anchor() -> None:
     assert converted is not None
     assert converted.latitude == pytest.approx(known.latitude, abs=1e-9)
     stretched = [points[0], points[1] | {"x": 20.0}]
-    with pytest.raises(InvalidFloorPlanError, match="is the scale right"):
+    with pytest.raises(InvalidFloorPlanError, match="check the scale"):
         anchored(control_points=stretched)
 
 

@@ -1,4 +1,4 @@
-"""A bundle of architecture `paper` is served through all stages: latent grid, retrieval, VDR and LPO on latents."""
+"""A bundle of architecture `paper` is served through all stages: pose grid, retrieval, VDR and LPO on latents."""
 
 from __future__ import annotations
 

@@ -210,7 +210,11 @@ def plan(client: httpx.Client) -> str:
 
 BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
     "neither": ({}, "floorplan_id", "is missing"),
-    "both": ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "floorplan_id", "venue_id is given as well"),
+    "both": (
+        {"venue_id": "0" * 32, "floorplan_id": "0" * 32},
+        "floorplan_id",
+        "set floorplan_id or venue_id, not both",
+    ),
     "level": ({"floorplan_id": "0" * 32, "level": "1"}, "floorplan_id", "one plan is on one level"),
     "level of none": ({"venue_id": "0" * 32, "level": "1001"}, "level", "at most 1000"),
     "posterior": ({"venue_id": "0" * 32, "include": "posterior"}, "include", "one plan"),

@@ -148,13 +148,13 @@ def train_ablation(
         skip_bad: skip unusable files, naming each once.
 
     Raises:
-        ConfigError: there is no such variant.
+        ConfigError: the variant is unknown.
         CheckpointError: `out` holds variants of another budget, configuration or data set.
         DatasetError: a file of the data set cannot be used.
     """
     ablation = ABLATIONS.get(name)
     if ablation is None:
-        raise ConfigError(f"there is no variant '{name}'; choose one of: {', '.join(ABLATIONS)}")
+        raise ConfigError(f"unknown variant '{name}'; choose one of: {', '.join(ABLATIONS)}")
     config, folder = ablation.config[budget], out / name
     data = TrainingData(dataset=dataset, skip_bad=skip_bad, validation_scenes=_VALIDATION_SCENES)
     common: dict[str, Any] = {"data": data, "device": device, "workers": workers}

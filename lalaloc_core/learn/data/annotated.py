@@ -71,7 +71,7 @@ class AnnotatedPhotographs:
         """
         photographs = tuple(read_annotation(path) for path in annotation_files(self.root))
         if not photographs:
-            raise DatasetError("there are no annotated photographs", path=self.root)
+            raise DatasetError("the folder has no annotated photographs", path=self.root)
         return photographs
 
     def keys(self, galleries: int = GALLERIES) -> list[GalleryKey]:

@@ -22,7 +22,7 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
             several and no format is given.
     """
     if not root.exists():
-        raise DatasetError("there is no such folder", path=root)
+        raise DatasetError("the folder does not exist", path=root)
     if not root.is_dir():
         raise DatasetError("a data set must be a folder; this is a file", path=root)
     found: dict[str, Dataset] = {}

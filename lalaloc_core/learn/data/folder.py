@@ -67,7 +67,7 @@ class OwnData:
         """Read a scene; see `Dataset.load`."""
         folder = path_below(self.root, name)
         if folder is None or not (folder / PLAN_FILE).is_file():
-            raise DatasetError(f"no such scene: {PLAN_FILE} is missing", scene=name, path=self.root / PLAN_FILE)
+            raise DatasetError(f"unknown scene: {PLAN_FILE} is missing", scene=name, path=self.root / PLAN_FILE)
         plan = _read_plan(folder / PLAN_FILE, name)
         cameras: dict[str, Camera] = {}
         for row in _read_table(folder / POSES_FILE, _REQUIRED, _OPTIONAL, scene=name):
@@ -95,7 +95,7 @@ class OwnData:
             if split not in get_args(Split):
                 raise row.error("split", f"it must be one of {', '.join(get_args(Split))}")
             if scene not in names:
-                raise row.error("scene", f"there is no folder of this name with a {PLAN_FILE}")
+                raise row.error("scene", f"no folder of this name has a {PLAN_FILE}")
             if scene in found:
                 raise row.error("scene", "it is a duplicate of an earlier line")
             found[scene] = split  # type: ignore[assignment]
@@ -136,7 +136,7 @@ def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
     if path is None:
         raise row.error("panorama", "it must be a path below the scene's folder")
     if not path.is_file():
-        raise row.error("panorama", "there is no such file")
+        raise row.error("panorama", "the file does not exist")
     x_m = row.number("x_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
     y_m = row.number("y_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
     heading_deg = row.number("heading_deg", -360.0, 360.0)

@@ -117,7 +117,7 @@ class Structured3D:
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Read a scene; see `Dataset.load`."""
         if not _SCENE_NAME.fullmatch(name):
-            raise DatasetError("no such scene; names are like 'scene_03250'", scene=name, path=self.root)
+            raise DatasetError("unknown scene; names have the form 'scene_03250'", scene=name, path=self.root)
         annotation = read_annotation(self.root / name / ANNOTATION_FILE, name)
         cameras = []
         for folder in sorted(_folders(self.root / name / RENDERING_FOLDER), key=_by_number):

@@ -241,7 +241,7 @@ class SceneSource:
     def __post_init__(self) -> None:
         self._names = tuple(self.dataset.scenes("train"))
         if not self._names:
-            raise DatasetError(f"{self.dataset.description}: there are no training scenes")
+            raise DatasetError(f"{self.dataset.description}: the data set has no training scenes")
         self._scenes: LRUCache[str, Scene | None] = LRUCache(_SCENES_CACHED)
         self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, _bytes_of)
         self._orders: LRUCache[int, np.ndarray] = LRUCache(1)

@@ -64,7 +64,7 @@ class GeneratedScenes:
         split, _, index = name.partition("-")
         number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
         if number is None or not index.isdecimal():
-            raise DatasetError("no such generated scene; names are like 'test-00042'", scene=name)
+            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
         home, rng = home_of(number, self.seed, int(index))
         renderers = split_renderer_cache(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)

@@ -62,7 +62,7 @@ class HeldoutScenes:
         split, _, index = name.partition("-")
         number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
         if number is None or not index.isdecimal():
-            raise DatasetError("no such out-of-distribution scene; names are like 'test-00042'", scene=name)
+            raise DatasetError("unknown out-of-distribution scene; names have the form 'test-00042'", scene=name)
         key = HomeKey(number, self.seed, int(index))
         levels = key.rng(5).choice(len(LEVELS), self.shots_per_home, p=_LEVEL_SHARES)
         cameras = tuple(
