@@ -215,7 +215,7 @@ BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
         "floorplan_id",
         "set floorplan_id or venue_id, not both",
     ),
-    "level": ({"floorplan_id": "0" * 32, "level": "1"}, "floorplan_id", "one plan is on one level"),
+    "level": ({"floorplan_id": "0" * 32, "level": "1"}, "floorplan_id", "level needs venue_id"),
     "level of none": ({"venue_id": "0" * 32, "level": "1001"}, "level", "at most 1000"),
     "posterior": ({"venue_id": "0" * 32, "include": "posterior"}, "include", "one plan"),
 }
