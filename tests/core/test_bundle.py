@@ -1,4 +1,4 @@
-"""Bundles: what is exported answers as torch does, and nothing altered or unknown is read."""
+"""Tests of model bundles: export, integrity, identity and confidence."""
 
 from __future__ import annotations
 
@@ -50,16 +50,16 @@ LOGISTIC = LogisticModel(bias=1.0, log_odds=2.0, cost=-4.0, uncertainty=-0.5, la
 TINY = PRESETS["tiny"]
 
 
-def exported(folder: Path, config: TrainConfig) -> Bundle:
-    """A bundle of untrained networks."""
+def exported_bundle(folder: Path, config: TrainConfig) -> Bundle:
+    """Export a bundle of untrained networks."""
     return export_bundle(
         folder, config, build_layout_encoder(config), build_image_encoder(config), name="small", version="7"
     )
 
 
 @pytest.fixture
-def copied(tiny_bundle: Path, tmp_path: Path) -> Path:
-    """A copy of the tiny bundle that a test may damage."""
+def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
+    """Copy of the tiny bundle that a test may damage."""
     return Path(shutil.copytree(tiny_bundle, tmp_path / "copy"))
 
 
@@ -69,7 +69,7 @@ def edit_manifest(folder: Path, **changes: Any) -> None:
 
 
 class TestExport:
-    def test_a_bundle_says_what_it_is_and_holds_what_it_says(self, opened_bundle: Bundle) -> None:
+    def test_manifest_describes_the_exported_files(self, opened_bundle: Bundle) -> None:
         manifest = opened_bundle.manifest
         assert (manifest.name, manifest.version, manifest.architecture) == ("tiny", "test", "ring")
         assert (manifest.image_height, manifest.image_width, manifest.profile_columns) == (32, 64, 32)
@@ -81,10 +81,10 @@ class TestExport:
         assert TrainConfig.from_dict(manifest.training["config"]) == TINY
         assert manifest.training["layout"]["steps"] == TINY.layout.steps
 
-    def test_onnx_and_torch_agree_on_the_latents_of_layouts(
+    def test_onnx_and_torch_agree_on_layout_latents(
         self, opened_bundle: Bundle, encoders: Encoders, optimiser: PoseRefiner
     ) -> None:
-        # More than one batch of the session, so that no dimension is baked in.
+        # More than one batch shows that no batch size is fixed.
         scene = scene_of(crooked_flat(), 300, 0)
         latents, profile_m = encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)
         assert profile_m.shape == (300, opened_bundle.manifest.profile_columns)
@@ -96,10 +96,10 @@ class TestExport:
         actual = encoders.layouts(profile.numpy(), *(height.numpy() for height in heights))
         np.testing.assert_allclose(actual, expected, atol=1e-4)
 
-    def test_no_layouts_give_no_latents(self, encoders: Encoders) -> None:
+    def test_empty_batch_gives_no_latents(self, encoders: Encoders) -> None:
         assert encoders.layouts(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
 
-    def test_the_exported_files_do_not_name_the_machine_they_were_made_on(self, tiny_bundle: Path) -> None:
+    def test_exported_files_name_no_local_paths(self, tiny_bundle: Path) -> None:
         for path in tiny_bundle.iterdir():
             content = path.read_bytes()
             assert b"site-packages" not in content, path.name
@@ -111,24 +111,24 @@ class TestExport:
         assert large
         assert {t.data_type for t in large} == {onnx.TensorProto.FLOAT16}
 
-    def test_the_decoder_of_training_comes_back_from_the_bundle(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
+    def test_decoder_round_trip(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
         weights = Checkpoint.load(tiny_bundle.parent / "layout.pt", stage="layout").inference_weights["decoder"]
         expected = LayoutDecoder(opened_bundle.manifest.latent_size).eval()
         expected.load_state_dict(weights)
         latent = torch.nn.functional.normalize(torch.randn(3, opened_bundle.manifest.latent_size), dim=1)
-        # Half precision is about three digits.
+        # Half precision has about three digits.
         torch.testing.assert_close(load_decoder(opened_bundle)(latent), expected(latent), rtol=2e-2, atol=2e-2)
         stored = safetensors.torch.load(opened_bundle.read(DECODER_WEIGHTS))
         assert stored["expand.weight"].dtype == torch.float16
 
-    def test_a_bundle_without_a_decoder_is_valid_and_says_so(self, tmp_path: Path) -> None:
-        bundle = exported(tmp_path, TINY)
+    def test_bundle_without_decoder_is_valid(self, tmp_path: Path) -> None:
+        bundle = exported_bundle(tmp_path, TINY)
         assert DECODER_WEIGHTS not in bundle.manifest.files
         Encoders(bundle, threads=1)
         with pytest.raises(BundleError, match=DECODER_WEIGHTS):
             load_decoder(bundle)
 
-    def test_a_layout_encoder_alone_is_a_bundle_that_answers_layout_queries(self, tmp_path: Path) -> None:
+    def test_bundle_without_image_encoder_encodes_layouts(self, tmp_path: Path) -> None:
         bundle = export_bundle(tmp_path, TINY, build_layout_encoder(TINY), None, name="half", version="1")
         assert not {IMAGE_ONNX, IMAGE_WEIGHTS} & set(bundle.manifest.files)
         encoders = Encoders(bundle, threads=1)
@@ -136,24 +136,26 @@ class TestExport:
         with pytest.raises(BundleError, match="layout queries only"):
             encoders.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
 
-    def test_a_network_that_disagrees_is_not_exported(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_network_that_differs_from_torch_is_not_exported(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(export, "PARITY_TOLERANCE", 0.0)
         with pytest.raises(ExportError, match="differs from torch"):
-            exported(tmp_path / "bundle", TINY)
+            exported_bundle(tmp_path / "bundle", TINY)
         assert not (tmp_path / "bundle").exists()
 
-    def test_the_paper_s_architecture_exports_and_answers(self, tmp_path: Path) -> None:
+    def test_paper_architecture_is_exported(self, tmp_path: Path) -> None:
         config = small_paper()
-        # What a bundle of the other architecture left behind is not taken over.
+        # A file that a bundle of another architecture left behind is not listed.
         (tmp_path / HEAD_ONNX).write_bytes(b"of another architecture")
-        bundle = exported(tmp_path, config)
+        bundle = exported_bundle(tmp_path, config)
         assert (bundle.manifest.architecture, bundle.manifest.ring_sectors) == ("paper", 0)
         assert HEAD_ONNX not in bundle.manifest.files
         encoders, optimiser = Encoders(bundle, threads=1), PoseRefiner.from_bundle(bundle)
         image = np.random.default_rng(0).integers(0, 256, (64, 128, 3), dtype=np.uint8)
         known = encoders.query(image, 0.0, CameraHeight(1.5))
         assert known.latents.shape == (1, 128)
-        # Turned by an eighth, the hypothesis of an eighth sees the picture it was.
+        # The hypothesis of an eighth turn undoes the turn of the photograph.
         unknown = encoders.query(np.roll(image, -16, axis=1), None, CameraHeight(1.5))
         eighth = int(np.abs(unknown.roll - np.pi / 4).argmin())
         np.testing.assert_allclose(unknown.latents[eighth], known.latents[0], atol=1e-5)
@@ -170,29 +172,29 @@ class TestExport:
 
 class TestReading:
     @pytest.mark.parametrize("name", [LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX])
-    def test_an_altered_network_is_not_loaded(self, copied: Path, name: str) -> None:
-        content = bytearray((copied / name).read_bytes())
+    def test_altered_network_is_refused(self, bundle_copy: Path, name: str) -> None:
+        content = bytearray((bundle_copy / name).read_bytes())
         content[len(content) // 2] ^= 1
-        (copied / name).write_bytes(content)
+        (bundle_copy / name).write_bytes(content)
         with pytest.raises(BundleError, match=f"{name}.*SHA-256"):
-            Encoders(Bundle.open(copied))
+            Encoders(Bundle.open(bundle_copy))
 
-    def test_altered_weights_are_not_loaded(self, copied: Path) -> None:
-        (copied / LAYOUT_WEIGHTS).write_bytes(b"")
+    def test_altered_weights_are_refused(self, bundle_copy: Path) -> None:
+        (bundle_copy / LAYOUT_WEIGHTS).write_bytes(b"")
         with pytest.raises(BundleError, match="SHA-256"):
-            PoseRefiner.from_bundle(Bundle.open(copied))
+            PoseRefiner.from_bundle(Bundle.open(bundle_copy))
 
-    def test_a_missing_file_is_named(self, copied: Path) -> None:
-        (copied / IMAGE_ONNX).unlink()
+    def test_missing_file_is_named(self, bundle_copy: Path) -> None:
+        (bundle_copy / IMAGE_ONNX).unlink()
         with pytest.raises(BundleError, match=IMAGE_ONNX):
-            Encoders(Bundle.open(copied))
+            Encoders(Bundle.open(bundle_copy))
 
     @pytest.mark.parametrize("name", ["other.onnx", "../manifest.json", MANIFEST_NAME])
     def test_only_listed_files_are_read(self, opened_bundle: Bundle, name: str) -> None:
         with pytest.raises(BundleError, match="has no file"):
             opened_bundle.read(name)
 
-    def test_a_folder_without_a_bundle_is_named(self, tmp_path: Path) -> None:
+    def test_folder_without_bundle_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(BundleError, match="no model bundle at"):
             Bundle.open(tmp_path / "nothing")
 
@@ -216,10 +218,10 @@ class TestReading:
             {"name": 3},
         ],
     )
-    def test_a_manifest_with_anything_unknown_or_missing_is_refused(self, copied: Path, changes: dict) -> None:
-        edit_manifest(copied, **changes)
+    def test_manifest_with_invalid_entries_is_refused(self, bundle_copy: Path, changes: dict) -> None:
+        edit_manifest(bundle_copy, **changes)
         with pytest.raises(BundleError):
-            Bundle.open(copied)
+            Bundle.open(bundle_copy)
 
     @pytest.mark.parametrize(
         ("text", "message"),
@@ -231,24 +233,24 @@ class TestReading:
             ("3", "manifest.json must be a JSON object, not int"),
         ],
     )
-    def test_a_manifest_that_is_no_object_is_refused(self, text: str, message: str) -> None:
+    def test_manifest_that_is_no_object_is_refused(self, text: str, message: str) -> None:
         with pytest.raises(BundleError, match=message):
             Manifest.from_json(text)
 
     @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity"])
-    def test_numbers_of_a_manifest_are_finite(self, opened_bundle: Bundle, number: str) -> None:
+    def test_manifest_numbers_are_finite(self, opened_bundle: Bundle, number: str) -> None:
         raw = json.loads(opened_bundle.manifest.to_json())
         raw["image_mean"] = [0.5, float(number), 0.5]
         with pytest.raises(BundleError, match=r"manifest\.image_mean\[1\] is -?(nan|inf)"):
             Manifest.from_json(json.dumps(raw))
 
-    def test_a_manifest_without_a_required_key_is_refused(self, opened_bundle: Bundle) -> None:
+    def test_manifest_without_a_required_key_is_refused(self, opened_bundle: Bundle) -> None:
         raw = json.loads(opened_bundle.manifest.to_json())
         del raw["latent_size"]
         with pytest.raises(BundleError, match="latent_size"):
             Manifest.from_json(json.dumps(raw))
 
-    def test_a_manifest_survives_its_own_text(self, opened_bundle: Bundle) -> None:
+    def test_manifest_round_trip(self, opened_bundle: Bundle) -> None:
         stages = {"retrieval": LOGISTIC, "lpo": dataclasses.replace(LOGISTIC, bias=2.0)}
         confidence = ConfidenceModel(known_heading=stages, searched_heading={"lpo": LOGISTIC}, heading_factor=0.4)
         manifest = dataclasses.replace(opened_bundle.manifest, confidence=confidence)
@@ -256,35 +258,30 @@ class TestReading:
 
 
 class TestIdentity:
-    def test_scores_and_names_do_not_change_the_identity_of_a_model(self, copied: Path) -> None:
-        before = Bundle.open(copied)
+    def test_metrics_and_name_do_not_change_the_digest(self, bundle_copy: Path) -> None:
+        before = Bundle.open(bundle_copy)
         scored = dataclasses.replace(before.manifest, name="other", metrics={"within_1m": 0.5})
-        after = write_manifest(copied, scored)
-        assert after.sha256 == before.sha256 == Bundle.open(copied).sha256
+        after = write_manifest(bundle_copy, scored)
+        assert after.sha256 == before.sha256 == Bundle.open(bundle_copy).sha256
 
-    def test_other_weights_are_another_model(self, copied: Path) -> None:
-        before = Bundle.open(copied)
-        (copied / HEAD_ONNX).write_bytes(b"other")
-        assert write_manifest(copied, before.manifest).sha256 != before.sha256
+    def test_other_weights_change_the_digest(self, bundle_copy: Path) -> None:
+        before = Bundle.open(bundle_copy)
+        (bundle_copy / HEAD_ONNX).write_bytes(b"other")
+        assert write_manifest(bundle_copy, before.manifest).sha256 != before.sha256
 
-    def test_exporting_over_a_bundle_replaces_it(self, copied: Path, opened_bundle: Bundle) -> None:
-        replaced = exported(copied, TINY)
+    def test_export_replaces_an_existing_bundle(self, bundle_copy: Path, opened_bundle: Bundle) -> None:
+        replaced = exported_bundle(bundle_copy, TINY)
         assert replaced.sha256 != opened_bundle.sha256
-        assert Bundle.open(copied).sha256 == replaced.sha256
+        assert Bundle.open(bundle_copy).sha256 == replaced.sha256
         Encoders(replaced)
 
     @pytest.mark.parametrize("architecture", ["ring", "trunk"])
-    def test_networks_are_written_anew_of_the_weights_that_a_bundle_has(
-        self, tmp_path: Path, architecture: str
-    ) -> None:
-        before = exported(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])
-        manifest, image = (
-            Bundle.open(tmp_path).manifest,
-            np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8),
-        )
-        told = Encoders(before, threads=1).query(image, None, CameraHeight(1.5))
+    def test_reexport_rebuilds_networks_from_weights(self, tmp_path: Path, architecture: str) -> None:
+        before = exported_bundle(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])
+        manifest = Bundle.open(tmp_path).manifest
+        image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
+        first = Encoders(before, threads=1).query(image, None, CameraHeight(1.5))
         for name in (IMAGE_ONNX, LAYOUT_ONNX, HEAD_ONNX):
-            # As an exporter of before would have written it.
             model = onnx.load_from_string(before.read(name))
             model.producer_name = "older"
             (tmp_path / name).write_bytes(model.SerializeToString())
@@ -292,16 +289,16 @@ class TestIdentity:
         after = reexport_bundle(tmp_path)
         assert after.sha256 == Bundle.open(tmp_path).sha256 != older.sha256
         again = Encoders(after, threads=1).query(image, None, CameraHeight(1.5))
-        np.testing.assert_allclose(again.latents, told.latents, atol=1e-6)
+        np.testing.assert_allclose(again.latents, first.latents, atol=1e-6)
         assert after.manifest.image_config == manifest.image_config
         assert after.manifest.opening_prior == manifest.opening_prior
         for name in set(manifest.files) - {IMAGE_ONNX, LAYOUT_ONNX, HEAD_ONNX}:
             assert after.manifest.files[name] == manifest.files[name]
 
-    def test_networks_are_not_written_anew_of_damaged_weights(self, copied: Path) -> None:
-        (copied / LAYOUT_WEIGHTS).write_bytes(b"damaged")
+    def test_reexport_refuses_damaged_weights(self, bundle_copy: Path) -> None:
+        (bundle_copy / LAYOUT_WEIGHTS).write_bytes(b"damaged")
         with pytest.raises(BundleError, match=LAYOUT_WEIGHTS):
-            reexport_bundle(copied)
+            reexport_bundle(bundle_copy)
 
 
 class TestConfidence:
@@ -312,16 +309,16 @@ class TestConfidence:
     signals: ClassVar = {"log_odds": 1.5, "cost": 0.2, "uncertainty": -3.0, "latent_distance": 0.1}
 
     @pytest.mark.parametrize(("stage", "known", "bias"), [("lpo", True, 1.0), ("vdr", True, 0.0), ("lpo", False, -1.0)])
-    def test_it_is_the_documented_formula_of_the_stage(self, stage: str, known: bool, bias: float) -> None:
+    def test_probability_is_the_documented_formula(self, stage: str, known: bool, bias: float) -> None:
         logit = bias + 2.0 * 1.5 - 4.0 * 0.2 - 0.5 * -3.0 - 6.0 * 0.1
         found = self.model.fit_probability(stage, self.signals, heading_known=known)
         assert found == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
 
-    def test_a_stage_that_was_never_seen_has_none(self) -> None:
+    def test_uncalibrated_stage_has_no_probability(self) -> None:
         assert self.model.fit_probability("vdr", self.signals, heading_known=False) is None
 
     @pytest.mark.parametrize("cost", [0.0, 1e9, -1e9])
-    def test_it_stays_a_probability(self, cost: float) -> None:
+    def test_probability_is_bounded(self, cost: float) -> None:
         found = self.model.fit_probability("lpo", {**self.signals, "cost": cost}, heading_known=True)
         assert found is not None
         assert 0.0 <= found <= 1.0

@@ -1,4 +1,4 @@
-"""The covariance of an answer: a covariance whatever the curvature, and the inverse where that exists."""
+"""Tests of the covariance of a pose from the information matrix of its refinement."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.strategies import plan_of, rectangle, seeds
 MODEL = ConfidenceModel(
     known_heading={}, searched_heading={}, position_factor=0.5, position_factor_searched=0.7, heading_factor=0.3
 )
-WIDE_M = math.hypot(5.0, 4.0) / math.sqrt(12.0)
+ROOM_STD_M = math.hypot(5.0, 4.0) / math.sqrt(12.0)
 unknowns = st.sampled_from([2, 3])
 
 
@@ -28,24 +28,24 @@ def room() -> Room:
 
 
 def information(seed: int, size: int, rank: int | None = None) -> np.ndarray:
-    """A curvature of at least 1 per m² along `rank` directions, all unless told, in single precision."""
+    """Return a float32 information matrix of the given rank (full by default, at least 10 per m²)."""
     rows = np.random.default_rng(seed).normal(size=(size if rank is None else rank, size))
-    full = rows.T @ rows + (np.eye(size) if rank is None else 0.0)
-    return (10.0 * full).astype(np.float32)
+    matrix = rows.T @ rows + (np.eye(size) if rank is None else 0.0)
+    return (10.0 * matrix).astype(np.float32)
 
 
-def spread(given: np.ndarray, room: Room, model: ConfidenceModel = MODEL) -> PoseUncertainty:
+def uncertainty_of(given: np.ndarray, room: Room, model: ConfidenceModel = MODEL) -> PoseUncertainty:
     found = pose_uncertainty(given, room, model)
     assert found is not None
     return found
 
 
-class TestSpread:
+class TestCovariance:
     @given(seed=seeds(), size=unknowns)
-    def test_it_is_the_scaled_inverse_where_that_exists(self, room: Room, seed: int, size: int) -> None:
+    def test_covariance_is_the_scaled_inverse(self, room: Room, seed: int, size: int) -> None:
         given = information(seed, size)
         inverse = np.linalg.inv(given.astype(float))
-        found = spread(given, room)
+        found = uncertainty_of(given, room)
         factor = MODEL.position_factor if size == 2 else MODEL.position_factor_searched
         assert factor is not None
         np.testing.assert_allclose(found.position_m2, factor * inverse[:2, :2], rtol=1e-3, atol=1e-6)
@@ -55,47 +55,46 @@ class TestSpread:
             assert found.heading_std is None
 
     @given(seed=seeds(), size=unknowns, rank=st.integers(0, 3), scale=st.floats(1e-12, 1e12))
-    def test_it_is_symmetric_positive_and_bounded_whatever_the_curvature(
+    def test_covariance_is_symmetric_positive_and_bounded(
         self, room: Room, seed: int, size: int, rank: int, scale: float
     ) -> None:
-        found = spread((scale * information(seed, size, min(rank, size))).astype(np.float32), room)
+        found = uncertainty_of((scale * information(seed, size, min(rank, size))).astype(np.float32), room)
         np.testing.assert_array_equal(found.position_m2, found.position_m2.T)
         variance = np.linalg.eigvalsh(found.position_m2)
         assert variance.min() >= -1e-12 * variance.max()
-        assert variance.max() <= WIDE_M**2 * (1.0 + 1e-9)
+        assert variance.max() <= ROOM_STD_M**2 * (1.0 + 1e-9)
         assert found.heading_std is None or 0.0 <= found.heading_std <= math.pi / math.sqrt(3.0)
 
     @given(seed=seeds(), size=unknowns, scale=st.floats(1.0, 100.0))
-    def test_more_information_makes_it_narrower_in_proportion(
-        self, room: Room, seed: int, size: int, scale: float
-    ) -> None:
-        wide, narrow = spread(information(seed, size), room), spread(scale * information(seed, size), room)
+    def test_covariance_is_inverse_to_the_information(self, room: Room, seed: int, size: int, scale: float) -> None:
+        wide, narrow = (
+            uncertainty_of(information(seed, size), room),
+            uncertainty_of(scale * information(seed, size), room),
+        )
         np.testing.assert_allclose(narrow.position_m2 * scale, wide.position_m2, rtol=1e-3, atol=1e-6)
 
-    def test_along_a_corridor_it_is_as_wide_as_the_room_and_across_it_is_not(self, room: Room) -> None:
-        found = spread(np.diag([0.0, 400.0]), room)
-        np.testing.assert_allclose(found.position_m2, np.diag([WIDE_M**2, 0.5 / 400.0]), atol=1e-12)
+    def test_unobserved_direction_is_as_wide_as_the_room(self, room: Room) -> None:
+        found = uncertainty_of(np.diag([0.0, 400.0]), room)
+        np.testing.assert_allclose(found.position_m2, np.diag([ROOM_STD_M**2, 0.5 / 400.0]), atol=1e-12)
 
-    def test_a_round_room_tells_the_place_but_not_the_heading(self, room: Room) -> None:
-        found = spread(np.diag([100.0, 100.0, 0.0]), room)
+    def test_unobserved_heading_is_uniform(self, room: Room) -> None:
+        found = uncertainty_of(np.diag([100.0, 100.0, 0.0]), room)
         np.testing.assert_allclose(found.position_m2, 0.007 * np.eye(2), atol=1e-12)
         assert found.heading_std == math.pi / math.sqrt(3.0)
 
     @pytest.mark.parametrize(
         ("size", "missing"), [(2, "position_factor"), (3, "position_factor_searched"), (3, "heading_factor")]
     )
-    def test_a_model_without_the_factor_has_none(self, room: Room, size: int, missing: str) -> None:
+    def test_model_without_the_factor_has_no_covariance(self, room: Room, size: int, missing: str) -> None:
         model = dataclasses.replace(MODEL, **{missing: None})
         assert pose_uncertainty(information(0, size), room, model) is None
-        other = 5 - size
-        assert (pose_uncertainty(information(0, other), room, model) is None) == (
-            missing == "heading_factor" and other == 3
-        )
+        # The factor of the other size does not matter.
+        assert pose_uncertainty(information(0, 5 - size), room, model) is not None
 
 
 class TestMarginalInformation:
     @given(seed=seeds())
-    def test_it_inverts_the_blocks_of_the_inverse(self, seed: int) -> None:
+    def test_marginal_inverts_the_blocks_of_the_inverse(self, seed: int) -> None:
         given = information(seed, 3).astype(float)
         inverse = np.linalg.inv(given)
         by_position, by_heading = marginal_information(given)

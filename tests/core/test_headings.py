@@ -1,7 +1,7 @@
-"""Signs, end to end: what "turned by a heading" means to the renderer, the encoders and the whole search.
+"""End-to-end tests of heading signs in the renderer, the encoders and the search.
 
-The encoder here is perfect: it reads the layout's wall profile from the pixels of a painted panorama. Whatever is
-then wrong in an answer is a wrong sign or an off-by-one between renderer, roll and search.
+The image encoder is perfect: it reads the wall profile from the pixels of a painted panorama. An error in an answer
+is therefore a wrong sign or an off-by-one between renderer, roll and search.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ headings = st.floats(-math.pi, 2.0 * math.pi)
 
 
 def paint(profile_m: np.ndarray) -> np.ndarray:
-    """A panorama (4, columns, 3) whose pixels spell the wall profile, in tenths of a millimetre."""
+    """Return a panorama (4, columns, 3) whose pixels encode the wall profile in units of 0.1 mm."""
     value = np.round(profile_m / _UNIT_M).astype(np.int64)
     return np.repeat(np.stack([value >> 16, value >> 8 & 255, value & 255], axis=-1)[None], 4, axis=0).astype(np.uint8)
 
 
-def photograph(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
-    """The painted panorama of a pose."""
+def photograph_of(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
+    """Return the painted panorama of a pose."""
     walls = plan.walls_m[pose.room_index]
     return paint(wall_profile(pose.position_m, np.array([heading]), walls, COLUMNS)[0])
 
 
 class PaintedSession(onnxruntime.InferenceSession):
-    """Stands in for the image encoder's session: the painted profile, and the layout encoder's ring of it."""
+    """Fake session of the image encoder: decodes the painted profile and returns its layout ring."""
 
     def __init__(self, encoder: RingLayoutEncoder) -> None:
         self.encoder = encoder
@@ -86,15 +86,15 @@ POSE = PoseSet(np.array([[1.37, 1.12]]), np.array([0]))
 
 class TestRolls:
     @given(scenes(), st.integers(-COLUMNS, COLUMNS))
-    def test_rolling_a_profile_by_its_heading_gives_the_profile_at_heading_zero(self, scene: Scene, shift: int) -> None:
-        def at(heading: float) -> np.ndarray:
+    def test_rolled_profile_is_the_profile_at_heading_zero(self, scene: Scene, shift: int) -> None:
+        def profiles(heading: float) -> np.ndarray:
             headings = np.full(len(scene.poses), heading)
             return wall_profile(scene.poses.position_m, headings, scene.walls_m, COLUMNS)
 
-        rolled = np.roll(at(shift * TWO_PI / COLUMNS), shift, axis=1)
-        assert np.isclose(rolled, at(0.0), rtol=1e-6).mean() > 0.98
+        rolled = np.roll(profiles(shift * TWO_PI / COLUMNS), shift, axis=1)
+        assert np.isclose(rolled, profiles(0.0), rtol=1e-6).mean() > 0.98
 
-    def test_the_layout_ring_rolls_with_the_profile(self, smooth_encoder: RingLayoutEncoder) -> None:
+    def test_layout_ring_rolls_with_the_profile(self, smooth_encoder: RingLayoutEncoder) -> None:
         profile = torch.empty(3, 128).uniform_(0.5, 6.0, generator=torch.Generator().manual_seed(0))
         heights = (torch.full((3,), 1.5), torch.full((3,), 2.5))
         ring = smooth_encoder.ring(profile, *heights)
@@ -102,7 +102,7 @@ class TestRolls:
             rolled = smooth_encoder.ring(profile.roll(2 * sectors, dims=1), *heights)
             torch.testing.assert_close(rolled, ring.roll(sectors, dims=2), atol=1e-5, rtol=1e-4)
 
-    def test_the_image_ring_and_profile_roll_with_the_panorama(self) -> None:
+    def test_image_ring_and_profile_roll_with_the_panorama(self) -> None:
         torch.manual_seed(0)
         encoder = RingImageEncoder(RING).eval().requires_grad_(False)
         image = torch.randint(0, 256, (2, RING.image_height, RING.image_width, 3))
@@ -118,16 +118,14 @@ class TestRolls:
 
 
 class TestRealEncoders:
-    """The exported networks themselves: relations that hold whatever the networks have learnt."""
+    """Relations of the exported networks that hold for any weights."""
 
     @given(st.integers(0, SECTORS - 1))
     @settings(max_examples=SECTORS)
-    def test_the_hypothesis_of_the_true_heading_has_the_latent_of_heading_zero(
-        self, encoders: Encoders, sector: int
-    ) -> None:
+    def test_true_hypothesis_has_the_latent_of_heading_zero(self, encoders: Encoders, sector: int) -> None:
         rng = np.random.default_rng(sector)
         at_zero = rng.integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
-        # Looking along a heading h to the right brings what stood right of the centre into it: a roll to the left.
+        # Turning the camera to the right rolls the panorama to the left.
         turned = np.roll(at_zero, -sector * RING.image_width // SECTORS, axis=1)
         straight = encoders.query(at_zero, 0.0, CameraHeight(CAMERA_M))
         unknown = encoders.query(turned, None, CameraHeight(CAMERA_M))
@@ -140,7 +138,7 @@ class TestRealEncoders:
         assert abs(known.frame_heading) < 1e-9
 
     @given(headings)
-    def test_roll_and_frame_heading_of_a_known_heading_add_up_to_it(self, encoders: Encoders, heading: float) -> None:
+    def test_roll_and_frame_heading_add_up_to_a_known_heading(self, encoders: Encoders, heading: float) -> None:
         image = np.zeros((RING.image_height, RING.image_width, 3), np.uint8)
         query = encoders.query(image, heading, CameraHeight(CAMERA_M))
         assert query.heading_known
@@ -151,10 +149,10 @@ class TestRealEncoders:
 class TestPerfectEncoder:
     @given(headings)
     @settings(max_examples=30)
-    def test_a_known_heading_gives_the_latent_of_the_layout_at_the_frame_heading(
+    def test_known_heading_gives_the_latent_of_the_layout(
         self, perfect: Encoders, flat: FloorPlan, heading: float
     ) -> None:
-        query = perfect.query(photograph(flat, POSE, heading), heading, CameraHeight(CAMERA_M))
+        query = perfect.query(photograph_of(flat, POSE, heading), heading, CameraHeight(CAMERA_M))
         layout, profile_m = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
         np.testing.assert_allclose(query.latents, layout, atol=2e-3)
         assert query.profile is not None
@@ -162,10 +160,10 @@ class TestPerfectEncoder:
 
     @given(headings)
     @settings(max_examples=30)
-    def test_an_unknown_heading_has_a_hypothesis_with_the_latent_of_the_layout(
+    def test_unknown_heading_has_a_hypothesis_with_the_latent(
         self, perfect: Encoders, flat: FloorPlan, heading: float
     ) -> None:
-        query = perfect.query(photograph(flat, POSE, heading), None, CameraHeight(CAMERA_M))
+        query = perfect.query(photograph_of(flat, POSE, heading), None, CameraHeight(CAMERA_M))
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
@@ -174,21 +172,21 @@ class TestPerfectEncoder:
         assert query.profile is not None
         np.testing.assert_allclose(np.exp(query.profile.log_m[nearest]), profile_m[0], atol=2e-4)
 
-    @given(heading=headings, off=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
+    @given(heading=headings, share=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
     @settings(max_examples=30)
-    def test_an_inexact_heading_is_searched_within_its_tolerance_and_refined(
+    def test_inexact_heading_is_searched_within_its_tolerance(
         self,
         perfect: Encoders,
         optimiser: PoseRefiner,
         flat: FloorPlan,
         heading: float,
-        off: float,
+        share: float,
         tolerance: float,
     ) -> None:
-        image = photograph(flat, POSE, heading)
-        query = perfect.query(image, heading + off * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
+        image = photograph_of(flat, POSE, heading)
+        query = perfect.query(image, heading + share * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
         assert not query.heading_known
-        turned = wrap_angle(query.roll + query.frame_heading - (heading + off * tolerance))
+        turned = wrap_angle(query.roll + query.frame_heading - (heading + share * tolerance))
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
         assert np.abs(np.diff(np.sort(np.asarray(turned, dtype=float))) - SECTOR).max(initial=0.0) < 1e-9
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
@@ -198,7 +196,7 @@ class TestPerfectEncoder:
 
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)
-    def test_the_search_finds_the_pose_and_the_heading_it_was_photographed_with(
+    def test_search_finds_the_pose_and_the_heading(
         self,
         perfect: Encoders,
         optimiser: PoseRefiner,
@@ -209,7 +207,7 @@ class TestPerfectEncoder:
     ) -> None:
         position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
         pose = PoseSet(position[None], flat.room_index_at(position[None]))
-        query = perfect.query(photograph(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M))
+        query = perfect.query(photograph_of(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M))
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert best.room_index == pose.room_index[0]

@@ -1,9 +1,11 @@
-"""The path of a query through all stages, with real networks on layouts."""
+"""Tests of the pipeline: a query through all stages, with real networks on layouts."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,7 @@ from tests.strategies import crooked_flat, plan_of, rectangle, seeds
 
 CAMERA_M = 1.5
 EXACT = CameraHeight(CAMERA_M, 0.0)
+Search = Callable[..., Localisation]
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +43,23 @@ def flat() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
+def search(flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> Search:
+    return partial(localise, flat, grid, encoders)
+
+
+@pytest.fixture(scope="module")
 def grid(flat: FloorPlan, encoders: Encoders) -> PoseGrid:
     return build_grid(flat, encoders, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 def layout_query(encoders: Encoders, plan: FloorPlan, pose: PoseSet, *, by_profile: bool = False) -> Query:
-    """What a perfect image encoder would make of a panorama of this pose: its latent and, if asked, its profile."""
+    """Return the query of a perfect image encoder at a pose: its latent and, optionally, its profile."""
     latents, profile_m = encoders.poses(plan, pose, np.zeros(1), CAMERA_M)
     profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -5.0)) if by_profile else None
     return Query(latents, np.zeros(1), 0.0, heading_known=True, camera_height=EXACT, profile=profile)
 
 
-def some_pose(plan: FloorPlan, seed: int) -> PoseSet:
+def random_pose(plan: FloorPlan, seed: int) -> PoseSet:
     return random_poses(plan, 1, np.random.default_rng(seed))
 
 
@@ -61,42 +69,41 @@ def error_m(found: Localisation, pose: PoseSet) -> float:
 
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
-    def test_every_stage_comes_nearer_and_optimisation_finds_the_pose(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, by_profile: bool
+    def test_each_stage_is_more_accurate(
+        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
         for seed in range(20):
-            pose = some_pose(flat, seed)
+            pose = random_pose(flat, seed)
             query = layout_query(encoders, flat, pose, by_profile=by_profile)
-            for refine, found in errors.items():
-                answer = localise(flat, grid, encoders, query, refine=refine, refiner=optimiser.refine)
-                found.append(error_m(answer, pose))
-        median = {refine: float(np.median(found)) for refine, found in errors.items()}
+            for refine, distances in errors.items():
+                found = search(query, refine=refine, refiner=optimiser.refine)
+                distances.append(error_m(found, pose))
+        median = {refine: float(np.median(distances)) for refine, distances in errors.items()}
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8
 
-    def test_each_stage_lowers_the_latent_distance_where_that_is_the_cost(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
+    def test_each_stage_lowers_the_latent_distance(
+        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
     ) -> None:
         for seed in range(10):
-            query = layout_query(encoders, flat, some_pose(flat, seed))
+            query = layout_query(encoders, flat, random_pose(flat, seed))
             stages: tuple[Refine, ...] = ("lpo", "vdr", "none")
-            answers = [localise(flat, grid, encoders, query, refine=s, refiner=optimiser.refine) for s in stages]
-            costs = [answer.candidates[0].cost for answer in answers]
+            best = [search(query, refine=s, refiner=optimiser.refine).candidates[0] for s in stages]
+            costs = [candidate.cost for candidate in best]
             assert costs == sorted(costs)
-            distances = [answer.candidates[0].latent_distance for answer in answers]
-            # Nearly: what is computed in another batch is rounded differently.
-            assert costs == pytest.approx(distances, abs=2e-3)
+            # Batches of other sizes round differently.
+            assert costs == pytest.approx([candidate.latent_distance for candidate in best], abs=2e-3)
 
 
-class TestAnswer:
+class TestCandidates:
     @given(seed=seeds(), top_k=st.integers(1, 10), heading_known=st.booleans(), refine=st.sampled_from(["none", "lpo"]))
     @settings(max_examples=20)
-    def test_candidates_are_apart_best_first_inside_their_rooms_and_not_too_many(
+    def test_candidates_are_ranked_distinct_and_inside_rooms(
         self,
         flat: FloorPlan,
-        grid: PoseGrid,
         encoders: Encoders,
+        search: Search,
         optimiser: PoseRefiner,
         seed: int,
         top_k: int,
@@ -105,7 +112,7 @@ class TestAnswer:
     ) -> None:
         image = np.random.default_rng(seed).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         query = encoders.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
-        found = localise(flat, grid, encoders, query, refine=refine, top_k=top_k, refiner=optimiser.refine)
+        found = search(query, refine=refine, top_k=top_k, refiner=optimiser.refine)
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
         gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
@@ -113,25 +120,25 @@ class TestAnswer:
         turned = np.abs(wrap_angle(turns[:, None] - turns[None])) > HEADING_SEPARATION
         assert np.all((gaps >= 1.0) | turned)
         refined = [candidate.cost for candidate in found.candidates if candidate.information is not None]
-        others = [candidate.cost for candidate in found.candidates if candidate.information is None]
+        coarse = [candidate.cost for candidate in found.candidates if candidate.information is None]
         assert bool(refined) == (refine == "lpo")
-        assert [candidate.cost for candidate in found.candidates] == sorted(refined) + sorted(others)
+        assert [candidate.cost for candidate in found.candidates] == sorted(refined) + sorted(coarse)
         assert found.best[found.stage] == found.candidates[0]
         assert flat.room_index_at(positions).tolist() == [candidate.room_index for candidate in found.candidates]
         for candidate in found.candidates:
             assert -math.pi <= panorama_heading(query, candidate) <= math.pi
 
-    def test_a_small_plan_has_fewer_places_than_asked_for(self, encoders: Encoders) -> None:
+    def test_small_plan_has_fewer_candidates(self, encoders: Encoders) -> None:
         plan = plan_of(rectangle(1.2, 1.2))
         grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
         query = layout_query(encoders, plan, PoseSet(np.array([[0.5, 0.6]]), np.array([0])))
         assert len(localise(plan, grid, encoders, query, refine="vdr", top_k=5).candidates) == 1
 
-    def test_the_same_query_gets_the_same_answer(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
+    def test_localisation_is_deterministic(
+        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
     ) -> None:
-        query = layout_query(encoders, flat, some_pose(flat, 1))
-        first, second = (localise(flat, grid, encoders, query, refiner=optimiser.refine).candidates for _ in range(2))
+        query = layout_query(encoders, flat, random_pose(flat, 1))
+        first, second = (search(query, refiner=optimiser.refine).candidates for _ in range(2))
         assert first == second
 
     @given(st.floats(-math.pi, math.pi), st.floats(-10.0, 10.0))
@@ -145,13 +152,11 @@ class TestAnswer:
 class TestStages:
     @pytest.fixture
     def query(self, flat: FloorPlan, encoders: Encoders) -> Query:
-        return layout_query(encoders, flat, some_pose(flat, 3))
+        return layout_query(encoders, flat, random_pose(flat, 3))
 
-    def test_the_answer_says_how_far_it_went(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, query: Query
-    ) -> None:
+    def test_localisation_names_its_stage(self, search: Search, optimiser: PoseRefiner, query: Query) -> None:
         def stage(**options: Any) -> tuple[str, set[str]]:
-            found = localise(flat, grid, encoders, query, **options)
+            found = search(query, **options)
             return found.stage, set(found.timings_ms)
 
         assert stage(refine="none", refiner=optimiser.refine) == ("retrieval", {"retrieve"})
@@ -159,81 +164,75 @@ class TestStages:
         assert stage(refine="lpo", refiner=optimiser.refine) == ("lpo", {"retrieve", "vdr", "lpo"})
         assert stage(refine="lpo", refiner=None) == ("vdr", {"retrieve", "vdr"})
 
-    def test_a_refiner_that_cannot_answer_leaves_the_vdr_pose(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
-    ) -> None:
-        without = localise(flat, grid, encoders, query, refine="vdr")
-        late = localise(flat, grid, encoders, query, refiner=lambda job: None)
+    def test_absent_refinement_keeps_the_vdr_pose(self, search: Search, query: Query) -> None:
+        without = search(query, refine="vdr")
+        late = search(query, refiner=lambda job: None)
         assert late.stage == "vdr"
         assert late.candidates == without.candidates
 
-    def test_the_answer_is_the_best_of_where_the_optimiser_went(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
-    ) -> None:
+    def test_best_refined_candidate_is_first(self, search: Search, query: Query) -> None:
         jobs: list[RefinementJob] = []
 
         def refiner(job: RefinementJob) -> RefinementResult:
             jobs.append(job)
             cost = np.linspace(1.9, 0.9, len(job.position_m))
-            return _result(job, position_m=job.position_m + 0.01, cost=cost)
+            return refinement_result(job, position_m=job.position_m + 0.01, cost=cost)
 
-        found = localise(flat, grid, encoders, query, refiner=refiner)
+        found = search(query, refiner=refiner)
         np.testing.assert_array_equal(found.candidates[0].position_m, jobs[0].position_m[-1] + 0.01)
         assert found.candidates[0].cost == 0.9
         assert found.candidates[0].latent_distance == 0.5
         np.testing.assert_array_equal(found.candidates[0].information, np.eye(2))
         assert found.signals["lpo"].cost == 0.9
 
-    def test_signals_are_of_the_stage_and_not_of_how_many_candidates_are_asked_for(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, query: Query
-    ) -> None:
-        few, many = (localise(flat, grid, encoders, query, top_k=k, refiner=optimiser.refine) for k in (1, 10))
+    def test_signals_are_independent_of_top_k(self, search: Search, optimiser: PoseRefiner, query: Query) -> None:
+        few, many = (search(query, top_k=k, refiner=optimiser.refine) for k in (1, 10))
         assert list(few.signals) == list(few.best) == ["retrieval", "vdr", "lpo"]
         assert few.signals == many.signals
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
-    def test_vdr_of_what_is_compared_by_walls_runs_where_it_is_asked_for_or_lpo_has_nothing(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
+    def test_profile_query_runs_vdr_only_if_needed(
+        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
     ) -> None:
-        query = layout_query(encoders, flat, some_pose(flat, 3), by_profile=True)
+        query = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
         every = LocaliseConfig(every_stage=True)
-        alone = localise(flat, grid, encoders, query, refiner=optimiser.refine)
-        told = localise(flat, grid, encoders, query, refiner=optimiser.refine, config=every)
-        lost = localise(flat, grid, encoders, query, refiner=lambda job: None)
-        assert list(alone.best) == ["lpo"]
-        assert list(told.best) == ["retrieval", "vdr", "lpo"]
+        short = search(query, refiner=optimiser.refine)
+        complete = search(query, refiner=optimiser.refine, config=every)
+        lost = search(query, refiner=lambda job: None)
+        assert list(short.best) == ["lpo"]
+        assert list(complete.best) == ["retrieval", "vdr", "lpo"]
         assert list(lost.best) == ["retrieval", "vdr"]
         assert lost.stage == "vdr"
-        assert "vdr" not in alone.timings_ms
-        assert told.timings_ms["vdr"] > 0.0
-        assert alone.candidates == told.candidates
-        assert alone.signals["lpo"] == told.signals["lpo"]
+        assert "vdr" not in short.timings_ms
+        assert complete.timings_ms["vdr"] > 0.0
+        assert short.candidates == complete.candidates
+        assert short.signals["lpo"] == complete.signals["lpo"]
 
-    def test_the_refiner_is_given_each_candidate_with_its_own_room_and_target(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
+    def test_refiner_gets_each_candidates_room_and_target(
+        self, flat: FloorPlan, encoders: Encoders, search: Search
     ) -> None:
         jobs: list[RefinementJob] = []
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         for heading in (None, 0.5):
             query = encoders.query(image, heading, CameraHeight(CAMERA_M))
             assert query.profile is not None
-            localise(flat, grid, encoders, query, refiner=lambda job: jobs.append(job))
-            expected = localise(flat, grid, encoders, query, refine="none").candidates
+            search(query, refiner=lambda job: jobs.append(job))
+            expected = search(query, refine="none").candidates
             job = jobs[-1]
             assert job.optimise_heading == (heading is None)
             assert job.log_profile is not None
             for candidate in expected:
-                # Candidates at one place, turned differently, are starts of their own; the answer names the best.
-                here = (job.position_m == candidate.position_m).all(axis=1)
-                mine = here & (job.targets == query.latents[candidate.hypothesis]).all(axis=1)
-                index = int(np.flatnonzero(mine)[0])
+                # Candidates at the same place with different headings are separate starts.
+                same_place = (job.position_m == candidate.position_m).all(axis=1)
+                same_target = (job.targets == query.latents[candidate.hypothesis]).all(axis=1)
+                index = int(np.flatnonzero(same_place & same_target)[0])
                 np.testing.assert_array_equal(job.log_profile[index], query.profile.log_m[candidate.hypothesis])
                 np.testing.assert_array_equal(job.walls_m[index], flat.walls_m[candidate.room_index])
                 assert job.heading[index] == candidate.frame_heading
                 assert job.camera_height_m[index] == CAMERA_M
 
-    def test_only_as_many_candidates_are_optimised_as_configured(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
+    def test_number_of_refined_candidates_is_configured(
+        self, flat: FloorPlan, encoders: Encoders, search: Search, query: Query
     ) -> None:
         sizes: list[int] = []
 
@@ -241,39 +240,37 @@ class TestStages:
             sizes.append(len(job.position_m))
 
         config = LocaliseConfig(lpo_candidates=2, profile_candidates=3)
-        by_profile = layout_query(encoders, flat, some_pose(flat, 3), by_profile=True)
-        for each in (query, by_profile):
-            found = localise(flat, grid, encoders, each, top_k=4, refiner=refiner, config=config)
+        by_profile = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
+        for start in (query, by_profile):
+            found = search(start, top_k=4, refiner=refiner, config=config)
             assert len(found.candidates) == 4
         assert sizes == [2, 3]
 
-    def test_two_candidates_that_meet_become_one(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
-    ) -> None:
+    def test_candidates_that_meet_become_one(self, search: Search, query: Query) -> None:
         def refiner(job: RefinementJob) -> RefinementResult:
             count = len(job.position_m)
             together = np.repeat(job.position_m[:1], count, axis=0)
-            return _result(job, position_m=together, cost=np.linspace(0.0, 1e-3, count))
+            return refinement_result(job, position_m=together, cost=np.linspace(0.0, 1e-3, count))
 
-        found = localise(flat, grid, encoders, query, top_k=5, refiner=refiner)
+        found = search(query, top_k=5, refiner=refiner)
         places = np.stack([candidate.position_m for candidate in found.candidates])
         assert np.linalg.norm(places[1:] - places[0], axis=1).min(initial=9.0) >= 1.0
 
     def test_posterior_pairs_each_refined_candidate_with_its_mode(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, search: Search
     ) -> None:
         def unmoved(job: RefinementJob) -> RefinementResult:
-            return _result(job, position_m=job.position_m, cost=np.linspace(0.1, 0.2, len(job.position_m)))
+            return refinement_result(job, position_m=job.position_m, cost=np.linspace(0.1, 0.2, len(job.position_m)))
 
         config = LocaliseConfig(vdr_candidates=5)
         for seed in range(5):
-            query = layout_query(encoders, flat, some_pose(flat, seed))
-            support = localise(flat, grid, encoders, query, refiner=unmoved, config=config).posterior.support
-            # Re-sampling moved the modes by at most the radius of the disc, and so their places.
+            query = layout_query(encoders, flat, random_pose(flat, seed))
+            support = search(query, refiner=unmoved, config=config).posterior.support
+            # Re-sampling moves a mode by at most the radius of the disc.
             moved_m = np.linalg.norm(support.position_m - grid.poses.position_m[support.pose], axis=1)
             assert moved_m.max() <= config.vdr_radius_steps * grid.step_m
 
-    def test_the_clock_counts_a_stage_that_fails(self) -> None:
+    def test_clock_counts_a_failed_stage(self) -> None:
         clock = StageClock()
         with pytest.raises(RuntimeError), clock.stage("lpo"):
             raise RuntimeError
@@ -281,25 +278,25 @@ class TestStages:
 
 
 class TestGrid:
-    def test_the_grid_holds_the_latents_of_its_own_poses_at_heading_zero(
+    def test_grid_has_latents_and_profiles_at_heading_zero(
         self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         assert grid.latents is not None
         assert len(grid.latents) == len(grid.poses)
         index = np.array([0, 5, len(grid.poses) - 1])
-        some = PoseSet(grid.poses.position_m[index], grid.poses.room_index[index])
-        latents, profile_m = encoders.poses(flat, some, np.zeros(3), CAMERA_M)
+        poses = PoseSet(grid.poses.position_m[index], grid.poses.room_index[index])
+        latents, profile_m = encoders.poses(flat, poses, np.zeros(3), CAMERA_M)
         np.testing.assert_allclose(latents, grid.latents[index], atol=1e-5)
         np.testing.assert_array_equal(profile_m, grid.profile_m[index])
 
-    def test_another_camera_height_is_another_grid(self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
+    def test_grid_depends_on_the_camera_height(self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
         higher = build_grid(flat, encoders, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
         assert higher.latents is not None
         assert np.abs(higher.latents - grid.latents).max() > 1e-3
 
 
-def _result(job: RefinementJob, *, position_m: np.ndarray, cost: np.ndarray) -> RefinementResult:
+def refinement_result(job: RefinementJob, *, position_m: np.ndarray, cost: np.ndarray) -> RefinementResult:
     count = len(cost)
     return RefinementResult(
         position_m=position_m,

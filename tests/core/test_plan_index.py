@@ -1,4 +1,4 @@
-"""Prototypes of plans, what they cost, and the index that finds those that are worth comparing."""
+"""Tests of plan prototypes, their costs, and the index that selects plans."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ CLASSES = len(OPENING_CLASSES)
 
 def plan_of(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -> FloorPlan:
     """Two rooms side by side, with a door between them and a window."""
-    width_m, depth_m, other_m = rng.uniform(2.5, 7.0, 3).tolist()
+    width_m, depth_m, second_m = rng.uniform(2.5, 7.0, 3).tolist()
     wall_m = 0.1
-    end_m = width_m + wall_m + other_m
+    end_m = width_m + wall_m + second_m
     document = {
         "ceiling_height_m": float(rng.uniform(2.3, 3.0)),
         "rooms": [
@@ -60,7 +60,7 @@ def plan_of(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -
     }
     if kinds is not None:
         document["opening_kinds"] = list(kinds)
-        document["openings"] = [one for one in document["openings"] if one["kind"] in kinds]
+        document["openings"] = [opening for opening in document["openings"] if opening["kind"] in kinds]
     return FloorPlan.from_dict(document)
 
 
@@ -70,8 +70,8 @@ def grid_of(plan: FloorPlan) -> PoseGrid:
     return PoseGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, STEP_M, 1.5)
 
 
-def query_of(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
-    """What an encoder would say that sees a prototype, with errors; the first hypothesis of the heading is right."""
+def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
+    """Return a noisy prediction at a prototype; the first heading hypothesis is right."""
     row = prototypes.rows[number]
     log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
     kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
@@ -92,13 +92,13 @@ def query_of(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
 
 
 @pytest.fixture(scope="module")
-def parts() -> list[Prototypes]:
+def prototype_sets() -> list[Prototypes]:
     rng = np.random.default_rng(0)
     plans = [plan_of(rng) for _ in range(20)]
     return [prototypes_of(grid_of(plan), plan) for plan in plans]
 
 
-def test_prototypes_stand_for_all_of_the_floor() -> None:
+def test_prototypes_cover_the_floor() -> None:
     plan = plan_of(np.random.default_rng(1), kinds=("door",))
     grid = grid_of(plan)
     prototypes = prototypes_of(grid, plan)
@@ -111,13 +111,13 @@ def test_prototypes_stand_for_all_of_the_floor() -> None:
     np.testing.assert_allclose(prototypes.rows["ceiling_m"], plan.ceiling_heights_m[0], rtol=1e-3)
 
 
-def test_openings_are_packed_without_loss() -> None:
+def test_openings_are_packed_losslessly() -> None:
     kind = np.random.default_rng(0).integers(0, CLASSES, (50, AZIMUTHS)).astype(np.uint8)
     np.testing.assert_array_equal(unpacked_openings(packed_openings(kind)), kind)
 
 
-def slow_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
-    """What `PrototypeCosts` says that it computes, azimuth by azimuth."""
+def reference_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
+    """Return the documented cost of `PrototypeCosts`, azimuth by azimuth."""
     assert query.profile is not None and query.openings is not None  # noqa: PT018
     assert query.ceiling is not None and query.room_type is not None  # noqa: PT018
     reach_m = CONFIG.grid_reach * np.sqrt(2.0) * STEP_M
@@ -129,7 +129,7 @@ def slow_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
         s = np.hypot(scale[azimuth], reach_m * np.exp(-centre[azimuth]))
         r = (float(row["log_profile"][azimuth]) - centre[azimuth] - delta) / (CONFIG.tail * s)
         walls += np.log1p(r * r) / AZIMUTHS
-    # Blurred by the reach at a usual distance.
+    # Openings are blurred by the reach at the median distance.
     spread = reach_m / np.exp(np.median(query.profile.log_m[0, ::every]))
     deviation = spread / (2.0 * np.pi) * COLUMNS
     apart = (np.arange(COLUMNS) + COLUMNS // 2) % COLUMNS - COLUMNS // 2
@@ -141,11 +141,11 @@ def slow_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
         p, prior = blurred[azimuth * every], query.openings.prior
         best = max(floor + (1.0 - floor) * p[c] / prior[c] for c in range(CLASSES))
         if kinds[azimuth] == 0:
-            meant = [c for c in range(CLASSES) if c == 0 or not int(row["claims"]) >> c & 1]
+            kinds_meant = [c for c in range(CLASSES) if c == 0 or not int(row["claims"]) >> c & 1]
         else:
-            meant = [int(kinds[azimuth])]
-        said = floor + (1.0 - floor) * p[meant].sum() / prior[meant].sum()
-        openings += np.log(best / said) / AZIMUTHS
+            kinds_meant = [int(kinds[azimuth])]
+        ratio = floor + (1.0 - floor) * p[kinds_meant].sum() / prior[kinds_meant].sum()
+        openings += np.log(best / ratio) / AZIMUTHS
     height_m = query.camera_height.height_m * np.exp(delta)
     difference = np.log(float(row["ceiling_m"]) - height_m) - query.ceiling.log_m - delta
     ceiling = np.log1p((difference / (CONFIG.tail * np.hypot(np.exp(query.ceiling.log_scale), 0.04))) ** 2)
@@ -157,38 +157,38 @@ def slow_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
 
 
 @pytest.mark.parametrize("kinds", [None, ("door",), ()], ids=["all claimed", "doors claimed", "none claimed"])
-def test_prototypes_cost_what_they_are_said_to(kinds: tuple[str, ...] | None) -> None:
+def test_prototype_cost_is_the_documented_formula(kinds: tuple[str, ...] | None) -> None:
     rng = np.random.default_rng(3)
     plan = plan_of(rng, kinds=kinds)
     prototypes = prototypes_of(grid_of(plan), plan)
-    query = replace(query_of(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
+    query = replace(query_at(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
     n, (k, j) = len(prototypes), costs.shape
     assert (k, j) == (8, len(costs.offsets))
     number, hypothesis, offset = rng.integers(n, size=60), rng.integers(k, size=60), rng.integers(j, size=60)
     found = costs.pairs(prototypes.rows[number], hypothesis, offset)
-    slow = [
-        slow_cost(prototypes.rows[a], query, int(b), float(costs.offsets[c]))
+    expected = [
+        reference_cost(prototypes.rows[a], query, int(b), float(costs.offsets[c]))
         for a, b, c in zip(number, hypothesis, offset, strict=True)
     ]
-    np.testing.assert_allclose(found, slow, rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3)
 
 
-def values_of(code: np.ndarray) -> np.ndarray:
-    """The values of codes, two to a byte."""
+def unpacked_codes(code: np.ndarray) -> np.ndarray:
+    """Return the values of codes, which hold two per byte."""
     return np.stack([code & 15, code >> 4], axis=2).reshape(len(code), -1)
 
 
 @pytest.mark.parametrize("kinds", [None, ("door",), ()], ids=["all claimed", "doors claimed", "none claimed"])
-def test_codes_cost_about_what_their_prototypes_do(kinds: tuple[str, ...] | None) -> None:
+def test_code_cost_approximates_the_prototype_cost(kinds: tuple[str, ...] | None) -> None:
     rng = np.random.default_rng(11)
     plan = plan_of(rng, kinds=kinds)
     prototypes = prototypes_of(grid_of(plan), plan)
-    query = replace(query_of(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
-    # As much of the ceiling as is bounded nowhere.
+    query = replace(query_at(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
+    # A small ceiling weight keeps the bounded ceiling term from mattering.
     costs = PrototypeCosts(query, STEP_M, replace(WEIGHTS, ceiling=0.02), CONFIG)
     (k, j), n = costs.shape, len(prototypes)
-    value = values_of(product_codes(prototypes.rows))
+    value = unpacked_codes(product_codes(prototypes.rows))
     (family,) = np.unique(family_of(prototypes.rows["claims"])).tolist()
     tables = lookup_tables(costs, claims_of(family))
     for hypothesis in range(k):
@@ -199,26 +199,26 @@ def test_codes_cost_about_what_their_prototypes_do(kinds: tuple[str, ...] | None
             assert np.corrcoef(coded, exact)[0, 1] > 0.98
 
 
-def test_the_codes_that_cost_least_are_found_in_the_lists_that_are_searched() -> None:
+def test_scan_finds_the_lowest_codes_of_the_given_lists() -> None:
     rng = np.random.default_rng(12)
     code, first = rng.integers(0, 256, (500, 25)).astype(np.uint8), np.array([0, 37, 37, 200, 500])
     tables = rng.random((3, 50, 16)).astype(np.float32)
-    cost = tables[:, np.arange(50), values_of(code)].sum(axis=2)
+    cost = tables[:, np.arange(50), unpacked_codes(code)].sum(axis=2)
     lists = np.array([[True, False, True, False], [True, True, True, True], [False, False, False, False]])
-    found, told = CodeScan(code, first).search(tables.reshape(3, -1), lists, 250)
+    found, costs = CodeScan(code, first).search(tables.reshape(3, -1), lists, 250)
     within = np.where(np.arange(500) < 200, cost[0], np.inf)
     assert set(found[0, :200].tolist()) == set(range(200))
     assert (found[0, 200:] == -1).all()
-    assert np.isinf(told[0, 200:]).all()
-    np.testing.assert_allclose(told[0, :200], within[found[0, :200]], atol=0.1)
-    # What is rounded is not told apart.
+    assert np.isinf(costs[0, 200:]).all()
+    np.testing.assert_allclose(costs[0, :200], within[found[0, :200]], atol=0.1)
+    # Rounding makes some codes equal.
     assert len(np.intersect1d(found[1], np.argsort(cost[1])[:250])) >= 240
     assert (found[2] == -1).all()
 
 
-def test_masses_are_sums_over_prototypes_and_hypotheses(parts: list[Prototypes]) -> None:
-    few, rng = parts[:4], np.random.default_rng(4)
-    query = query_of(few[1], 3, rng, hypotheses=4)
+def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototypes]) -> None:
+    few, rng = prototype_sets[:4], np.random.default_rng(4)
+    query = query_at(few[1], 3, rng, hypotheses=4)
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
     index = PlanIndex.from_prototypes(few, shipped_cells())
     expected = []
@@ -231,69 +231,69 @@ def test_masses_are_sums_over_prototypes_and_hypotheses(parts: list[Prototypes])
     assert found.argmax() == 1
 
 
-def test_few_comparisons_find_what_all_of_them_do(parts: list[Prototypes]) -> None:
-    index, rng = PlanIndex.from_prototypes(parts, shipped_cells()), np.random.default_rng(5)
-    pairs = sum(map(len, parts)) * 16
-    for number in range(len(parts)):
-        query = query_of(parts[number], 5, rng, hypotheses=16)
+def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) -> None:
+    index, rng = PlanIndex.from_prototypes(prototype_sets, shipped_cells()), np.random.default_rng(5)
+    pairs = sum(map(len, prototype_sets)) * 16
+    for number in range(len(prototype_sets)):
+        query = query_at(prototype_sets[number], 5, rng, hypotheses=16)
         whole = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs)
         few = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 40, scanned=pairs // 10)
         assert few[whole.argmax()] > few.max() - 0.1
-        # What is compared is compared alike; what is not weighs nothing.
+        # Skipped comparisons contribute no mass.
         assert (few <= whole + 1e-6).all()
         assert few.max() == pytest.approx(whole.max(), abs=0.7)
 
 
-def test_an_unknown_camera_height_is_searched(parts: list[Prototypes]) -> None:
+def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> None:
     rng = np.random.default_rng(6)
-    query = query_of(parts[7], 4, rng)
+    query = query_at(prototype_sets[7], 4, rng)
     assert query.profile is not None
-    # Read at 1.5 m, taken at 1.95 m: everything looks smaller than it is.
+    # The camera stood at 1.95 m, not at 1.5 m, so predicted distances are too small.
     smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
-    index = PlanIndex.from_prototypes(parts, shipped_cells())
+    index = PlanIndex.from_prototypes(prototype_sets, shipped_cells())
     assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
     assert index.log_masses(unknown, WEIGHTS, CONFIG, compared=2000).argmax() == 7
 
 
-def test_copies_have_equal_masses_however_few_are_compared(parts: list[Prototypes]) -> None:
-    several = [*parts, parts[3], parts[3]]
+def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]) -> None:
+    several = [*prototype_sets, prototype_sets[3], prototype_sets[3]]
     index, rng = PlanIndex.from_prototypes(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
-        query = query_of(parts[3], 1, rng, hypotheses=8)
+        query = query_at(prototype_sets[3], 1, rng, hypotheses=8)
         masses = index.log_masses(query, WEIGHTS, CONFIG, compared=compared, scanned=scanned)
         assert np.isfinite(masses[3])
         np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
 
 
-def test_plans_with_and_without_openings_are_sorted_and_found_alike() -> None:
+def test_plans_with_and_without_openings_are_found() -> None:
     rng, cells = np.random.default_rng(8), shipped_cells()
-    whole, parts = list[Prototypes](), list[Prototypes]()
+    whole, prototype_sets = list[Prototypes](), list[Prototypes]()
     for number in range(12):
         complete, bare = (plan_of(np.random.default_rng(number), kinds=kinds) for kinds in (None, ()))
         whole.append(prototypes_of(grid_of(complete), complete))
-        parts.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
-    rows = joined(parts).rows.copy()
+        prototype_sets.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
+    rows = joined(prototype_sets).rows.copy()
     rows["cell"] = cells.assign(rows)
-    # None, or doors and windows.
+    # Family 0 has no openings, family 3 has doors and windows.
     assert np.unique(rows["cell"] // (len(cells) // FAMILIES)).tolist() == [0, 3]
     assert np.unique(family_of(rows["claims"])).tolist() == [0, 3]
-    index = PlanIndex.from_prototypes(parts, cells)
+    index = PlanIndex.from_prototypes(prototype_sets, cells)
     for number in range(12):
-        query = query_of(whole[number], 2, rng, hypotheses=8)
+        query = query_at(whole[number], 2, rng, hypotheses=8)
         masses = index.log_masses(query, WEIGHTS, CONFIG, compared=3000)
         assert (masses > masses[number]).sum() <= (2 if number % 2 else 0)
 
 
-def test_cells_cost_about_what_prototypes_in_their_middle_do(parts: list[Prototypes]) -> None:
-    # Cells that have a prototype each, with nothing to average.
-    rows = joined(parts).rows[:50].copy()
+def test_cell_cost_approximates_the_prototype_cost(prototype_sets: list[Prototypes]) -> None:
+    # Each cell has a single prototype.
+    rows = joined(prototype_sets).rows[:50].copy()
     share = (unpacked_openings(rows["openings"])[:, :, None] == np.arange(CLASSES)).astype(np.float32)
     cells = Cells(rows["log_profile"].astype(np.float32), share, version=1)
     rows["claims"] = sum(1 << code for code in range(1, CLASSES))
     family = FAMILIES - 1
     assert cells.assign(rows).tolist() == list(range(family * 50, family * 50 + 50))
-    query = query_of(parts[0], 1, np.random.default_rng(9), hypotheses=4)
+    query = query_at(prototype_sets[0], 1, np.random.default_rng(9), hypotheses=4)
     query = replace(query, ceiling=None, room_type=None)
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
     by_cell = cells.costs(costs, [family])[family]

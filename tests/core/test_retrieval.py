@@ -1,4 +1,4 @@
-"""The numpy half of localisation: retrieval, non-maximum suppression and the Vogel disc."""
+"""Tests of retrieval, non-maximum suppression and Vogel-disc re-sampling."""
 
 from __future__ import annotations
 
@@ -39,12 +39,14 @@ def random_grid(seed: int, poses: int = 60, columns: int = 16) -> PoseGrid:
     return PoseGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, columns)), 0.5, 1.5)
 
 
-def best_places(grid: PoseGrid, query: Query, *, top_k: int, evidence: MatchingConfig | None = None) -> list[Candidate]:
-    costs = grid_costs(PLAN, grid, query, MatchingWeights(), evidence or MatchingConfig())
+def best_candidates(
+    grid: PoseGrid, query: Query, *, top_k: int, config: MatchingConfig | None = None
+) -> list[Candidate]:
+    costs = grid_costs(PLAN, grid, query, MatchingWeights(), config or MatchingConfig())
     return retrieve(costs, grid, query, top_k=top_k, separation_m=1.0)
 
 
-def any_heading(latents: np.ndarray) -> Query:
+def unknown_heading_query(latents: np.ndarray) -> Query:
     return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, False, EXACT)
 
 
@@ -55,7 +57,7 @@ def nearest_neighbour_distances(points: np.ndarray) -> np.ndarray:
 
 
 class PlaceEncoders(Encoders):
-    """Stands in for the networks: a pose's latent is a direction that depends smoothly on where it is."""
+    """Fake encoders: the latent of a pose is a direction that depends smoothly on its position."""
 
     def __init__(self) -> None:
         pass
@@ -80,14 +82,12 @@ class TestRetrieval:
         direct = np.linalg.norm(targets[:, None] - latents[None], axis=-1)
         np.testing.assert_allclose(latent_distances(latents, targets), direct, atol=1e-7)
 
-    def test_the_distance_to_itself_is_zero_not_nan(self) -> None:
+    def test_latent_distance_to_itself_is_zero(self) -> None:
         latents = unit(np.random.default_rng(0), 50, 128).astype(np.float32)
         assert np.diag(latent_distances(latents, latents)).max() < 1e-3
 
     @given(seeds(), st.integers(1, 12), st.floats(0.0, 3.0))
-    def test_kept_places_are_apart_best_first_and_nothing_better_is_left_out(
-        self, seed: int, limit: int, separation_m: float
-    ) -> None:
+    def test_suppression_keeps_the_best_separated_places(self, seed: int, limit: int, separation_m: float) -> None:
         rng = np.random.default_rng(seed)
         position, distance = rng.uniform(0, 5, (40, 2)), rng.uniform(0, 2, 40)
         kept = suppress(position, distance, separation_m=separation_m, limit=limit)
@@ -97,12 +97,13 @@ class TestRetrieval:
         gaps = np.linalg.norm(position[:, None] - position[kept][None], axis=-1)
         assert all(gaps[a, k] >= separation_m for k in range(len(kept)) for a in kept[:k])
         worst_kept = distance[kept[-1]]
-        for other in set(range(40)) - set(kept):
-            shadowed = any(gaps[other, k] < separation_m and distance[i] <= distance[other] for k, i in enumerate(kept))
-            assert shadowed or (len(kept) == limit and distance[other] >= worst_kept)
+        for dropped in set(range(40)) - set(kept):
+            near = [i for k, i in enumerate(kept) if gaps[dropped, k] < separation_m]
+            shadowed = any(distance[i] <= distance[dropped] for i in near)
+            assert shadowed or (len(kept) == limit and distance[dropped] >= worst_kept)
 
     @given(seeds())
-    def test_one_place_is_kept_once_for_every_way_to_be_turned(self, seed: int) -> None:
+    def test_suppression_keeps_a_place_once_per_heading(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         position, heading = np.zeros((60, 2)), rng.uniform(-math.pi, math.pi, 60)
         kept = suppress(position, rng.uniform(0, 2, 60), separation_m=1.0, limit=60, heading=heading)
@@ -111,12 +112,12 @@ class TestRetrieval:
         assert np.abs(wrap_angle(heading[:, None] - heading[kept][None])).min(axis=1).max() <= math.radians(25.0)
 
     @given(seeds(), st.integers(1, 8))
-    def test_the_first_is_the_best_of_all_places_and_hypotheses(self, seed: int, hypotheses: int) -> None:
+    def test_first_candidate_is_the_global_minimum(self, seed: int, hypotheses: int) -> None:
         grid = random_grid(seed)
-        query = any_heading(unit(np.random.default_rng(seed + 1), hypotheses, 8))
+        query = unknown_heading_query(unit(np.random.default_rng(seed + 1), hypotheses, 8))
         assert grid.latents is not None
         distances = latent_distances(grid.latents, query.latents)
-        found = best_places(grid, query, top_k=5)
+        found = best_candidates(grid, query, top_k=5)
         assert found[0].latent_distance == pytest.approx(distances.min())
         for candidate in found:
             place = int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())
@@ -125,94 +126,93 @@ class TestRetrieval:
             assert candidate.room_index == grid.poses.room_index[place]
             assert candidate.frame_heading == query.frame_heading
 
-    def test_a_fine_grid_with_many_headings_gives_as_many_candidates_as_are_asked_for(self) -> None:
+    def test_fine_grid_gives_top_k_candidates(self) -> None:
         rng = np.random.default_rng(0)
         position = np.stack(np.meshgrid(np.arange(0, 6, 0.1), np.arange(0, 4, 0.1)), axis=-1).reshape(-1, 2)
         poses = PoseSet(position, np.zeros(len(position), dtype=int))
         latents = unit(rng, len(position), 8)
-        # One place fits far better than all others, whatever the heading.
+        # One place fits far better than all others at every heading.
         latents[np.linalg.norm(position - 2.0, axis=1) < 1.0] = np.eye(8)[0]
         grid = PoseGrid(poses, latents, np.ones((len(position), 4)), 0.1, 1.5)
-        query = any_heading(np.repeat(np.eye(8)[:1], 64, axis=0))
-        assert len(best_places(grid, query, top_k=40)) == 40
+        query = unknown_heading_query(np.repeat(np.eye(8)[:1], 64, axis=0))
+        assert len(best_candidates(grid, query, top_k=40)) == 40
 
-    def test_a_grid_pose_s_own_latent_retrieves_it(self) -> None:
+    def test_latent_retrieves_its_own_grid_pose(self) -> None:
         grid = random_grid(0)
         for index in (0, 17, 59):
             assert grid.latents is not None
-            query = any_heading(grid.latents[index : index + 1])
-            best = best_places(grid, query, top_k=1)[0]
+            query = unknown_heading_query(grid.latents[index : index + 1])
+            best = best_candidates(grid, query, top_k=1)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
 
-    def test_a_grid_pose_s_own_profile_retrieves_it_turned_as_it_was(self) -> None:
+    def test_profile_retrieves_its_own_grid_pose_and_heading(self) -> None:
         grid = random_grid(0)
         for index in (0, 17, 59):
             # Hypothesis k undoes a turn by k of 8 sectors, two columns each; the truth is hypothesis 3.
             seen = np.roll(np.log(grid.profile_m[index]), -6)
             turned = np.stack([np.roll(seen, 2 * k) for k in range(8)])
             profile = PredictedProfile(turned, np.full((8, 16), -3.0))
-            query = dataclasses.replace(any_heading(unit(np.random.default_rng(1), 8, 8)), profile=profile)
-            best = best_places(grid, query, top_k=1)[0]
+            query = dataclasses.replace(unknown_heading_query(unit(np.random.default_rng(1), 8, 8)), profile=profile)
+            best = best_candidates(grid, query, top_k=1)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
             assert best.hypothesis == 3
             assert best.cost < 1e-6
 
     @given(seeds())
-    def test_a_profile_is_ranked_by_its_cost_and_the_latent_by_its_weight(self, seed: int) -> None:
+    def test_cost_adds_profile_and_weighted_latent(self, seed: int) -> None:
         grid, rng = random_grid(seed), np.random.default_rng(seed)
         query = dataclasses.replace(
-            any_heading(unit(rng, 3, 8)), profile=PredictedProfile(rng.normal(size=(3, 16)), rng.normal(size=(3, 16)))
+            unknown_heading_query(unit(rng, 3, 8)),
+            profile=PredictedProfile(rng.normal(size=(3, 16)), rng.normal(size=(3, 16))),
         )
-        evidence = MatchingConfig(latent_weight=0.7)
+        config = MatchingConfig(latent_weight=0.7)
         assert query.profile is not None
         assert grid.latents is not None
         residual = np.log(grid.profile_m)[None] - query.profile.log_m[:, None]
-        costs = np.log1p(np.square(residual * precisions(query, 0.3, evidence)[:, None])).mean(axis=2)
+        costs = np.log1p(np.square(residual * precisions(query, 0.3, config)[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(grid.latents, query.latents)
-        best = best_places(grid, query, top_k=1, evidence=evidence)[0]
+        best = best_candidates(grid, query, top_k=1, config=config)[0]
         assert best.cost == pytest.approx(costs.min(), rel=1e-4)
-        by_latent = best_places(grid, query, top_k=1, evidence=MatchingConfig(use_profile=False))[0]
+        by_latent = best_candidates(grid, query, top_k=1, config=MatchingConfig(use_profile=False))[0]
         assert by_latent.cost == pytest.approx(latent_distances(grid.latents, query.latents).min())
 
-    def test_of_a_large_grid_the_best_by_some_azimuths_are_compared_in_full(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_large_grid_is_preselected_coarsely(self, monkeypatch: pytest.MonkeyPatch) -> None:
         grid, rng = random_grid(0, poses=400), np.random.default_rng(0)
         seen = np.log(grid.profile_m[[7, 300]]) + rng.normal(scale=0.02, size=(2, 16))
         query = dataclasses.replace(
-            any_heading(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
+            unknown_heading_query(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
         )
-        everything = best_places(grid, query, top_k=3)
+        exhaustive = best_candidates(grid, query, top_k=3)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 50)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 50)
         costs = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig())
         assert costs.compared == 50
-        assert best_places(grid, query, top_k=3)[:2] == everything[:2]
+        assert best_candidates(grid, query, top_k=3)[:2] == exhaustive[:2]
 
 
-class TestDoubt:
+class TestContradictedHeading:
     @pytest.fixture
     def grid(self) -> PoseGrid:
         return random_grid(0, columns=64)
 
     def query(self, grid: PoseGrid, turned_by: int) -> Query:
-        """A picture of one of the grid's poses, said to look along azimuth 0, that is turned by some sectors of 8."""
+        """Return a query at a grid pose with the stated heading 0, turned by `turned_by` sectors of 8."""
         seen = np.roll(np.log(grid.profile_m[17]), 8 * turned_by)
         turned = np.stack([np.roll(seen, 8 * k) for k in range(8)])
         latents = unit(np.random.default_rng(1), 8, 8)
-        searched = dataclasses.replace(any_heading(latents), profile=PredictedProfile(turned, np.full((8, 64), -4.0)))
-        said = PredictedProfile(turned[:1], np.full((1, 64), -4.0))
-        return Query(latents[:1], np.zeros(1), 0.0, True, CameraHeight(1.5), said, searched=searched)
+        searched = dataclasses.replace(
+            unknown_heading_query(latents), profile=PredictedProfile(turned, np.full((8, 64), -4.0))
+        )
+        stated = PredictedProfile(turned[:1], np.full((1, 64), -4.0))
+        return Query(latents[:1], np.zeros(1), 0.0, True, CameraHeight(1.5), stated, searched=searched)
 
     @pytest.mark.parametrize("turned_by", [0, 3])
-    def test_a_heading_is_doubted_when_the_picture_fits_another_far_better(
-        self, grid: PoseGrid, turned_by: int
-    ) -> None:
+    def test_clearly_wrong_heading_is_contradicted(self, grid: PoseGrid, turned_by: int) -> None:
         query = self.query(grid, turned_by)
         assert contradicted(PLAN, grid, query, MatchingWeights(), MatchingConfig()) == (turned_by != 0)
 
-    def test_it_is_not_where_nothing_may_be_doubted_or_another_is_hardly_better(self, grid: PoseGrid) -> None:
+    def test_heading_is_kept_if_check_is_off_or_gain_small(self, grid: PoseGrid) -> None:
         wrong = self.query(grid, 3)
         assert not contradicted(PLAN, grid, wrong, MatchingWeights(), MatchingConfig(heading_doubt=0.0))
         assert not contradicted(PLAN, grid, wrong, MatchingWeights(temperature=0.5), MatchingConfig())
@@ -220,7 +220,7 @@ class TestDoubt:
 
 class TestVogelDisc:
     @given(st.integers(1, 500))
-    def test_points_follow_the_formula_with_its_index(self, samples: int) -> None:
+    def test_points_follow_the_formula(self, samples: int) -> None:
         disc = vogel_disc(samples)
         golden = (1.0 + math.sqrt(5.0)) / 2.0
         for i in {0, 1, samples // 2, samples - 1} & set(range(samples)):
@@ -228,7 +228,7 @@ class TestVogelDisc:
             np.testing.assert_allclose(disc[i], [radius * math.cos(angle), radius * math.sin(angle)], atol=1e-9)
 
     @given(st.integers(1, 500))
-    def test_points_fill_the_unit_disc_from_its_centre(self, samples: int) -> None:
+    def test_points_fill_the_unit_disc(self, samples: int) -> None:
         radius = np.linalg.norm(vogel_disc(samples), axis=1)
         assert radius[0] == 0.0
         assert radius.max() < 1.0
@@ -237,7 +237,7 @@ class TestVogelDisc:
             np.mean(radius[:, None] < [0.25, 0.5, 0.75], axis=0), [0.0625, 0.25, 0.5625], atol=1 / samples
         )
 
-    def test_points_are_even_where_random_ones_clump(self) -> None:
+    def test_points_are_more_even_than_random_ones(self) -> None:
         nearest = nearest_neighbour_distances(vogel_disc(200))
         rng = np.random.default_rng(0)
         angle, radius = rng.uniform(0, 2 * math.pi, 200), np.sqrt(rng.uniform(0, 1, 200))
@@ -252,9 +252,9 @@ class TestResampling:
     def query(self, x: float, y: float, heading_known: bool = True, heading: float = 0.0) -> Query:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))
         latent, _ = PLACES.poses(self.plan, pose, np.array([heading]), 1.5)
-        return (
-            Query(latent, np.zeros(1), 0.0, heading_known, EXACT) if heading_known else any_heading(latent.repeat(8, 0))
-        )
+        if not heading_known:
+            return unknown_heading_query(latent.repeat(8, 0))
+        return Query(latent, np.zeros(1), 0.0, heading_known, EXACT)
 
     def candidate(self, query: Query, x: float, y: float) -> Candidate:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))
@@ -265,7 +265,7 @@ class TestResampling:
     def resample(self, query: Query, start: Candidate, radius_m: float) -> Candidate:
         return resample(self.plan, PLACES, query, start, camera_height_m=1.5, samples=200, radius_m=radius_m)
 
-    def test_the_answer_moves_towards_the_truth_and_within_the_disc(self) -> None:
+    def test_resampling_approaches_the_truth_within_the_disc(self) -> None:
         query = self.query(2.3, 2.6)
         start = self.candidate(query, 2.0, 2.0)
         found = self.resample(query, start, 1.0)
@@ -274,8 +274,8 @@ class TestResampling:
         assert found.latent_distance == pytest.approx(found.cost, abs=1e-6)
         assert np.hypot(found.x_m - 2.0, found.y_m - 2.0) <= 1.0
 
-    def test_samples_outside_all_rooms_are_dropped_and_the_room_follows_the_pose(self) -> None:
-        # The truth lies in the wall between the rooms: whatever is answered is in a room, the one it names.
+    def test_samples_outside_rooms_are_dropped(self) -> None:
+        # The truth lies in the wall between the rooms; the result must lie in the room it names.
         query = self.query(4.3, 2.0)
         found = self.resample(query, self.candidate(query, 3.8, 2.0), 1.0)
         assert self.plan.room_index_at(found.position_m[None])[0] == found.room_index >= 0
@@ -284,13 +284,13 @@ class TestResampling:
         assert moved.room_index == 1
         assert moved.x_m > 4.5
 
-    def test_a_candidate_at_the_optimum_is_kept(self) -> None:
+    def test_optimal_candidate_is_kept(self) -> None:
         query = self.query(2.0, 2.0)
         start = self.candidate(query, 2.0, 2.0)
         found = self.resample(query, start, 1.0)
         assert (found.x_m, found.y_m, found.room_index, found.frame_heading) == (2.0, 2.0, 0, 0.0)
 
-    def test_a_known_heading_is_never_touched_and_an_unknown_one_stays_in_its_sector(self) -> None:
+    def test_only_an_unknown_heading_is_resampled(self) -> None:
         known = self.query(2.3, 2.6)
         assert self.resample(known, self.candidate(known, 2.0, 2.0), 1.0).frame_heading == 0.0
         unknown = self.query(2.3, 2.6, heading_known=False, heading=0.3)

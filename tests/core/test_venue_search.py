@@ -1,4 +1,4 @@
-"""Several plans as one, and how probable it is that the plan is among those that were searched."""
+"""Tests of merged plans and of the probability that the right plan was searched."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WEIGHTS, CONFIG = MatchingWeights(temperature=40.0), MatchingConfig()
 
 
 def plan_of(width_m: float, depth_m: float, *, x_m: float = 0.0, openings: bool = False) -> FloorPlan:
-    """Two rooms side by side, perhaps with a door between them, perhaps far from the origin."""
+    """Return a plan of two rooms side by side, optionally with a door, at a distance from the origin."""
     wall_m, near, far = 0.1, x_m, x_m + width_m
     document = {
         "ceiling_height_m": 2.5,
@@ -44,7 +44,7 @@ def grid_of(plan: FloorPlan) -> PoseGrid:
 
 
 def query_at(plan: FloorPlan, x_m: float, y_m: float, hypotheses: int = 1) -> Query:
-    """What a perfect encoder would say of a place, with as many hypotheses of the heading; the first one is right."""
+    """Return a perfect prediction at a place; the first heading hypothesis is right."""
     position = np.array([[x_m, y_m]])
     profile = profiles_at(plan, position, plan.room_index_at(position), np.zeros(1), COLUMNS)[0]
     shifts = np.arange(hypotheses) * COLUMNS // hypotheses
@@ -61,7 +61,7 @@ def merged_plans() -> MergedPlans:
     return MergedPlans.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
 
 
-def test_every_pose_costs_what_it_costs_in_its_own_plan(merged_plans: MergedPlans) -> None:
+def test_merged_costs_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:
     query = query_at(PLANS[0], 1.3, 1.1)
     whole, _ = MatchingCost(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
         merged_plans.grid.layouts(merged_plans.plan)
@@ -69,20 +69,20 @@ def test_every_pose_costs_what_it_costs_in_its_own_plan(merged_plans: MergedPlan
     parts = []
     for plan in PLANS:
         grid = grid_of(plan)
-        # Of the openings only the kinds count that every plan shows; here one shows none.
+        # Only opening kinds that every plan shows are compared; one plan shows none.
         compared = replace(plan, opening_kinds=frozenset())
         parts.append(MatchingCost(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
     np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
 
 
-def test_layouts_side_by_side_are_those_of_the_plans(merged_plans: MergedPlans) -> None:
-    own = [grid_of(plan).layouts(plan) for plan in PLANS]
+def test_merged_layouts_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:
+    separate = [grid_of(plan).layouts(plan) for plan in PLANS]
     merged = merged_plans.grid.layouts(merged_plans.plan)
     assert merged.kind is not None
     assert merged.seen is not None
-    assert len(merged) == sum(map(len, own))
+    assert len(merged) == sum(map(len, separate))
     first = 0
-    for layouts in own:
+    for layouts in separate:
         rows = merged.rows(np.arange(first, first + len(layouts)))
         assert rows.kind is not None
         np.testing.assert_array_equal(rows.log_profile, layouts.log_profile)
@@ -92,7 +92,7 @@ def test_layouts_side_by_side_are_those_of_the_plans(merged_plans: MergedPlans) 
         first += len(layouts)
 
 
-def test_the_renderer_sees_in_all_plans_what_it_sees_in_each(merged_plans: MergedPlans) -> None:
+def test_merged_plan_renders_like_each_plan(merged_plans: MergedPlans) -> None:
     grid = merged_plans.grid
     seen = profiles_at(
         merged_plans.plan, grid.poses.position_m, grid.poses.room_index, np.zeros(len(grid.poses)), COLUMNS, np.float32
@@ -100,45 +100,43 @@ def test_the_renderer_sees_in_all_plans_what_it_sees_in_each(merged_plans: Merge
     np.testing.assert_allclose(seen, grid.profile_m, atol=2e-3)
 
 
-def test_places_are_told_in_the_frames_of_their_plans(merged_plans: MergedPlans) -> None:
-    own = [grid_of(plan).poses for plan in PLANS]
-    index, last = merged_plans.grid.poses.room_index, np.cumsum([len(one) for one in own])
-    for number, room in enumerate(index):
-        assert merged_plans.plan_of(int(room)) == int(
-            np.searchsorted(np.cumsum([len(one) for one in own]), number, "right")
-        )
-    ones = merged_plans.by_plan(np.ones(len(index)))
-    np.testing.assert_array_equal(ones, [len(one) for one in own])
+def test_merged_rooms_map_to_their_plans(merged_plans: MergedPlans) -> None:
+    separate = [grid_of(plan).poses for plan in PLANS]
+    sizes = [len(poses) for poses in separate]
+    room_index, last = merged_plans.grid.poses.room_index, np.cumsum(sizes)
+    expected = np.repeat(np.arange(len(sizes)), sizes).tolist()
+    assert [merged_plans.plan_of(int(room)) for room in room_index] == expected
+    np.testing.assert_array_equal(merged_plans.by_plan(np.ones(len(room_index))), sizes)
     # No two plans are near each other.
     parts = np.split(merged_plans.grid.poses.position_m, last[:-1])
     for k, part in enumerate(parts):
-        for other in parts[k + 1 :]:
-            assert np.linalg.norm(part[:, None] - other[None], axis=-1).min() > 9.0
+        for later in parts[k + 1 :]:
+            assert np.linalg.norm(part[:, None] - later[None], axis=-1).min() > 9.0
     assert np.abs(merged_plans.grid.poses.position_m).max() < 100.0
 
 
-def test_the_most_probable_plans_are_searched_as_far_as_they_go() -> None:
+def test_most_probable_plans_are_searched_within_limits() -> None:
     log_mass, poses = np.array([-3.0, -1.0, -2.0, -9.0]), np.array([10, 500, 20, 30])
     assert most_probable(log_mass, poses, max_plans=3, max_poses=1000).tolist() == [1, 2, 0]
     assert most_probable(log_mass, poses, max_plans=2, max_poses=1000).tolist() == [1, 2]
     assert most_probable(log_mass, poses, max_plans=4, max_poses=525).tolist() == [1, 2]
     assert most_probable(log_mass, poses, max_plans=4, max_poses=5).tolist() == [1]
-    # Nor those that weigh nothing.
-    nothing = np.array([-np.inf, -1.0, -np.inf, -9.0])
-    assert most_probable(nothing, poses, max_plans=4, max_poses=1000).tolist() == [1, 3]
+    # Plans without mass are skipped.
+    log_mass = np.array([-np.inf, -1.0, -np.inf, -9.0])
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=1000).tolist() == [1, 3]
 
 
-def test_what_was_left_out_keeps_its_share() -> None:
+def test_plans_left_out_keep_their_share() -> None:
     copies = np.full(10, -2.0)
     assert share_searched(copies, np.arange(10), np.full(10, 0.1)) == 1.0
-    # Of ten copies four were searched: each has a quarter among them, a tenth of all.
+    # Four of ten copies were searched: each has a quarter of their mass, a tenth of all.
     assert share_searched(copies, np.arange(4), np.full(4, 0.25)) == pytest.approx(0.4)
-    # One stands out in the full search; those left out are taken for wrong ones.
+    # One plan dominates the full search, so plans left out count as wrong.
     sharp = np.array([1.0 - 3e-5, 1e-5, 1e-5, 1e-5])
     assert share_searched(copies, np.arange(4), sharp) > 0.99
-    # A wrong plan and one of four copies of the right one were searched.
+    # A wrong plan and one of four copies of the right plan were searched.
     mixed = np.array([-1.0, -2.0, -2.0, -2.0, -2.0, -7.0])
     assert share_searched(mixed, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)
-    # What weighs nothing changes nothing.
+    # Plans without mass change nothing.
     more = np.append(mixed, [-np.inf, -np.inf])
     assert share_searched(more, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)
