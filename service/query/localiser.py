@@ -95,7 +95,7 @@ class Localiser:
             PlanNotReadyError: the pose grid was not ready by the deadline.
             DeadlineExceededError: another step missed the deadline.
             StoreUnavailableError: the pose grid is not in memory, and the database cannot be reached.
-            OverloadedError: too many queries are in work, or too many pose grids are computed on demand.
+            OverloadedError: too many queries are in progress, or too many pose grids are computed on demand.
         """
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return (await self._localise(record, query)).answer
