@@ -22,7 +22,7 @@ from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.posterior import probability_map
 from lalaloc_core.localise.ranking import panorama_heading
 
 Picture = Literal["both", "plan", "photograph"]

@@ -2,8 +2,11 @@
 
 The fit is judged by signals that do not compare places: the cost of the best place, also relative to the cost of places
 in other homes (`localise.cohort`), the uncertainty that the image encoder predicts, and the latent distance. A logistic
-model of the signals (`bundle.ConfidenceModel`) is fitted on validation queries and on photographs of unknown places
-(`lalaloc_core.evaluate.calibrate`), and is part of the bundle.
+model of the signals is fitted on validation queries and on photographs of unknown places
+(`lalaloc_core.evaluate.calibrate`).
+
+`confidence_of` is the only function that computes the confidence. The classes of the logistic model
+(`bundle.ConfidenceModel`, `bundle.LogisticModel`) are in `bundle.py`, as their weights are part of the manifest.
 """
 
 from __future__ import annotations

@@ -116,33 +116,35 @@ class Encoders:
         *,
         heading_tolerance: float = 0.0,
     ) -> Query:
-        """Encode a panorama of the bundle's input size.
+        """Return the query of a panorama of the bundle's input size.
+
+        The panorama is first rolled to undo the heading, if it is known. Each hypothesis then assumes a rotation from
+        there by a number of sectors, of which a full turn has `ring_sectors`.
 
         Args:
             image: pixels of the panorama.
-            heading: azimuth of the centre column (radians); None if unknown, with one hypothesis per sector of the
-                ring.
+            heading: azimuth of the centre column (radians); None if unknown, with one hypothesis per sector.
             camera_height: gives the picture its metric scale.
             heading_tolerance: largest error of `heading` (radians); if it is not 0, there are hypotheses for the
                 sectors within it, and the heading is refined.
         """
-        turned, rolled_away, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
-        steps = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
-        every = np.arange(steps)
-        most = min(math.ceil(heading_tolerance / TWO_PI * steps), (steps - 1) // 2)
-        shifts = every if heading is None else np.arange(-most, most + 1)
-        exact = heading is not None and heading_tolerance == 0.0
+        frame, frame_roll, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
+        sectors = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
+        all_shifts = np.arange(sectors)
+        max_shift = min(math.ceil(heading_tolerance / TWO_PI * sectors), (sectors - 1) // 2)
+        shifts = all_shifts if heading is None else np.arange(-max_shift, max_shift + 1)
+        heading_known = heading is not None and heading_tolerance == 0.0
         if self._head is None:
-            latents = self._turned_latents(turned, camera_height.height_m, shifts, steps)
-            roll = rolled_away + shifts * (TWO_PI / steps)
-            return Query(latents, roll, frame_heading, exact, camera_height)
-        # Rolling the ring is turning the camera, so the image is encoded once.
-        outputs = self._outputs(turned, camera_height.height_m)
-        query = self._hypotheses(outputs, shifts, rolled_away, camera_height)
+            latents = self._latents_of_rolled_images(frame, camera_height.height_m, shifts, sectors)
+            roll = frame_roll + shifts * (TWO_PI / sectors)
+            return Query(latents, roll, frame_heading, heading_known, camera_height)
+        # Rolling the ring rotates the camera, so the image is encoded once for all hypotheses.
+        outputs = self._outputs(frame, camera_height.height_m)
+        query = self._query_from_ring(outputs, shifts, frame_roll, camera_height)
         searched = None
         if heading is not None and self.predicts_profile:
-            searched = self._hypotheses(outputs, every, rolled_away, camera_height)
-        return replace(query, frame_heading=frame_heading, heading_known=exact, searched=searched)
+            searched = self._query_from_ring(outputs, all_shifts, frame_roll, camera_height)
+        return replace(query, frame_heading=frame_heading, heading_known=heading_known, searched=searched)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -164,28 +166,35 @@ class Encoders:
             )
         return np.exp(query.profile.log_m[0]), query.frame_heading
 
-    def _turned_latents(
-        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, shifts: Int[np.ndarray, "k"], steps: int
+    def _latents_of_rolled_images(
+        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, shifts: Int[np.ndarray, "k"], sectors: int
     ) -> Float[np.ndarray, "k d"]:
-        """Encode a panorama turned to the right by some numbers of `steps`, for architectures without a ring."""
+        """Encode an image once for each number of sectors to the right, for architectures without a ring."""
         width = image.shape[1]
-        turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
-        return np.concatenate([self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned])
+        frames = (np.roll(image, int(shift) * width // sectors, axis=1) for shift in shifts)
+        return np.concatenate([self._run_image(frame[None], camera_height_m, ["latent"])[0] for frame in frames])
 
-    def _hypotheses(
+    def _query_from_ring(
         self,
         outputs: dict[str, np.ndarray],
         shifts: Int[np.ndarray, "k"],
-        rolled_away: float,
+        frame_roll: float,
         camera_height: CameraHeight,
     ) -> Query:
-        """Return a query with an unknown heading, of a panorama turned to the right by some numbers of sectors."""
+        """Return a query with one hypothesis for each shift, its heading unknown.
+
+        Args:
+            outputs: outputs of the image encoder (`_outputs`).
+            shifts: numbers of sectors by which the ring and the predictions are rolled to the right.
+            frame_roll: angle (radians) by which the image was rolled before it was encoded.
+            camera_height: stated camera height.
+        """
         assert self._head is not None
-        steps = outputs["ring"].shape[1]
+        sectors = outputs["ring"].shape[1]
         ring = np.ascontiguousarray(rolled(outputs["ring"].T, shifts).transpose(0, 2, 1))
         latents = _array(self._head.run(["latent"], {"ring": ring})[0])
-        predictions = self._predictions(outputs, shifts, steps) if self.predicts_profile else {}
-        return Query(latents, rolled_away + shifts * (TWO_PI / steps), 0.0, False, camera_height, **predictions)
+        predictions = self._predictions(outputs, shifts, sectors) if self.predicts_profile else {}
+        return Query(latents, frame_roll + shifts * (TWO_PI / sectors), 0.0, False, camera_height, **predictions)
 
     def _outputs(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
         """Run the image encoder on a panorama; return its ring (c, s) and all other outputs by name.
@@ -201,9 +210,11 @@ class Encoders:
             averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
         return {"ring": ring[0], **averaged}
 
-    def _predictions(self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], steps: int) -> dict[str, Any]:
-        """Return the predictions of a query, for panoramas turned to the right by some numbers of `steps`."""
-        columns = shifts * (len(outputs["log_profile"]) // steps)
+    def _predictions(
+        self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], sectors: int
+    ) -> dict[str, Any]:
+        """Return the predictions of a query, rolled to the right by numbers of sectors."""
+        columns = shifts * (len(outputs["log_profile"]) // sectors)
         profile = PredictedProfile.rolled(outputs["log_profile"], outputs["log_scale"], columns)
         predictions: dict[str, Any] = {"profile": profile}
         if self.predicts_structure:
@@ -230,12 +241,16 @@ class Encoders:
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
-    """Roll a panorama until its centre looks almost along azimuth 0; return it, the angle rolled away, and the rest."""
+    """Roll a panorama by whole pixels so that its centre looks (almost) along azimuth 0.
+
+    Returns:
+        The rolled panorama, the angle (radians) that was rolled away, and the rest of the heading (radians).
+    """
     pixel = TWO_PI / image.shape[1]
     shift = round(heading / pixel)
     # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
-    turned = np.roll(image, shift, axis=1)
-    return turned, shift * pixel, float(wrap_angle(heading - shift * pixel))
+    frame = np.roll(image, shift, axis=1)
+    return frame, shift * pixel, float(wrap_angle(heading - shift * pixel))
 
 
 def _check_classes(manifest: Manifest) -> None:

@@ -9,9 +9,9 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
 * **Walls.** The image encoder predicts a log wall profile μ and a scale b for every azimuth w. The term has the heavy
   tails of a Cauchy distribution: `mean_w log(1 + r_w²)`, with `r_w = (log d_w - μ_w - δ) / (κ s_w)` and
   `s_w² = b_w² + (reach / exp μ_w)²`. κ is the tail factor, δ the log of true over stated camera height, and `reach` the
-  distance (m) from the camera within which the best of the compared poses lies. At a door or passage, 1 / (1 + r²) is
-  the sum of that for the opening and that for the wall behind it times the odds that the prediction is of that wall, at
-  most 1.
+  distance (m) from the camera within which the best of the compared poses lies. At a door or passage the prediction can
+  be of the wall behind it. `1 / (1 + r²)` is then replaced by `min(1, 1 / (1 + r²) + o / (1 + r'²))`, with r' for the
+  wall behind and o for the odds that the prediction is of that wall.
 * **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, with `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the predicted
   probability p of the class c_w that the plan shows, over the frequency π of that class. Kinds that the plan does not
   claim to show completely count as wall.
@@ -257,23 +257,26 @@ class MatchingCost:
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
         precision, offset = self._precision[hypothesis], offset.astype(np.float32)
-        apart = views.log_profile - self._centre[hypothesis]
-        apart *= precision
-        # The same of the walls behind openings, by flat indices, which numpy takes fastest.
-        count, columns = apart.shape
+        # Residuals at δ = 0 for the opening or the pose's own wall; the offset is subtracted for each δ.
+        residual = views.log_profile - self._centre[hypothesis]
+        residual *= precision
+        # Residuals of the walls behind openings, by flat indices, which numpy takes fastest.
+        count, columns = residual.shape
         place = views.pose * columns + views.column
         predicted = np.broadcast_to(hypothesis * columns, count)[views.pose] + views.column
         precision_behind = self._precision.take(predicted)
-        apart_behind = (views.log_behind - self._centre.take(predicted)) * precision_behind
+        residual_behind = (views.log_behind - self._centre.take(predicted)) * precision_behind
         offset_behind = offset if offset.shape[1] == 1 else offset[:, views.pose]
         cost = np.empty((len(offset), count), np.float32)
         for j in range(len(offset)):
-            factor = np.subtract(apart, offset[j, :, None] * precision, out=apart if j == len(offset) - 1 else None)
+            # The last δ reuses the memory of the residuals.
+            out = residual if j == len(offset) - 1 else None
+            factor = np.subtract(residual, offset[j, :, None] * precision, out=out)
             np.square(factor, out=factor)
             factor += 1.0
             if len(place):
-                behind = np.square(apart_behind - offset_behind[j] * precision_behind) + 1.0
-                # At most 1: a door costs nothing where its wall fits, as networks learn to see the wall there.
+                behind = np.square(residual_behind - offset_behind[j] * precision_behind) + 1.0
+                # At least 1: an opening costs nothing where its own wall fits, as networks learn to see that wall.
                 either = np.maximum(1.0 / (1.0 / factor.take(place) + views.odds / behind), 1.0)
                 factor.put(place, either)
             cost[j] = mean_log(factor)

@@ -1,6 +1,8 @@
 """Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
 
-The same code answers over HTTP and in evaluation; only the refiner, which runs pose refinement, differs.
+The same code answers over HTTP and in evaluation; only the refiner, which runs pose refinement, differs. A search is
+therefore a generator: it yields refinement jobs, which the caller runs in this process (`run_steps`) or in another one
+(`next_step`).
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import ConfidenceModel
@@ -22,11 +24,13 @@ from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
 from lalaloc_core.localise.ranking import distinct, ranked
-from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
+from lalaloc_core.localise.refinement import refined_candidates, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve
-from lalaloc_core.localise.steps import run_steps
 from lalaloc_core.localise.vogel import resample
 
+JobT = TypeVar("JobT")
+ResultT = TypeVar("ResultT")
+FoundT = TypeVar("FoundT")
 SearchStage = Literal["retrieval", "vdr", "lpo"]
 Refine = Literal["none", "vdr", "lpo"]
 # Runs pose refinement; None if it has no result (in time).
@@ -128,6 +132,38 @@ class Localisation:
 Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
 
 
+def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | None) -> JobT | FoundT:
+    """Continue a search; return its next job or its result.
+
+    Args:
+        steps: the search.
+        result: result of the last job; None at first, and if there is no result (in time).
+    """
+    try:
+        return steps.send(result)
+    except StopIteration as done:
+        return done.value
+
+
+def run_steps(
+    steps: Generator[JobT, ResultT | None, FoundT], refiner: Callable[[JobT], ResultT | None] | None
+) -> FoundT:
+    """Run a whole search in this process.
+
+    Args:
+        steps: the search.
+        refiner: runs a job; returns None if it has no result (in time). It can be None for searches without jobs.
+    """
+    result: ResultT | None = None
+    while True:
+        try:
+            job = steps.send(result)
+        except StopIteration as done:
+            return done.value
+        assert refiner is not None
+        result = refiner(job)
+
+
 class StageClock:
     """Wall-clock milliseconds per named stage."""
 
@@ -200,7 +236,7 @@ def localise_steps(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Steps:
-    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `steps.py`."""
+    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `next_step`."""
     config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
     search = _Search(plan, grid, encoders, query, config=config, clock=clock, hints=hints, top_k=top_k)
@@ -208,16 +244,16 @@ def localise_steps(
     if refine != "lpo":
         return search.localisation(search.without_lpo(resampling=resampling))
     # If walls are compared, refinement begins with the grid's candidates, and VDR runs on demand.
-    unrefined = None
+    before_lpo = None
     if config.every_stage or not search.by_walls:
-        unrefined = search.without_lpo(resampling=resampling)
-    begun = search.modes if search.by_walls or unrefined is None else unrefined
+        before_lpo = search.without_lpo(resampling=resampling)
+    starts = search.modes if search.by_walls or before_lpo is None else before_lpo
     with clock.stage("lpo"):
-        result = yield search.job(begun)
-        ended = None if result is None else search.refined(begun, result)
-    if ended is not None:
-        return search.localisation(ended)
-    return search.localisation(search.without_lpo(resampling=resampling) if unrefined is None else unrefined)
+        result = yield search.lpo_job(starts)
+        after_lpo = None if result is None else search.after_lpo(starts, result)
+    if after_lpo is not None:
+        return search.localisation(after_lpo)
+    return search.localisation(search.without_lpo(resampling=resampling) if before_lpo is None else before_lpo)
 
 
 class _Search:
@@ -260,16 +296,16 @@ class _Search:
                 margin=config.alike_margin,
                 limit=config.max_candidates + top_k,
             )
-            self._starts = config.starts(query, self.modes)
+            self._lpo_count = config.starts(query, self.modes)
             self._grid_cost = float(costs.cost.min())
             reach_m = matching.grid_reach * grid.step_m
             self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, matching)
         self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
-        # Modes in the order of the candidates of `without_lpo`.
-        self._unrefined_modes = self.modes
-        # Modes that were refined, and the candidates that they became.
-        self._refined_modes, self._ends = list[Candidate](), list[Candidate]()
+        # The mode that each candidate of `without_lpo` comes from.
+        self._modes_before_lpo = self.modes
+        # The modes that LPO refined and their candidates after it, in the same order; empty until then.
+        self._lpo_modes, self._lpo_candidates = list[Candidate](), list[Candidate]()
         self._best = dict[SearchStage, Candidate]()
         self._signals = dict[SearchStage, Signals]()
         self._stage: SearchStage = "retrieval"
@@ -299,29 +335,33 @@ class _Search:
                 for candidate in candidates[:count]
             ]
         order = ranked(resampled, self.query)
-        self._unrefined_modes = [self.modes[index] for index in order] + self.modes[count:]
+        self._modes_before_lpo = [self.modes[index] for index in order] + self.modes[count:]
         resampled = [resampled[index] for index in order]
         self._record("vdr", resampled[0], self._posterior(resampled[:1]))
         return resampled + candidates[count:]
 
-    def job(self, begun: list[Candidate]) -> RefinementJob:
-        """Return the refinement job of the first candidates."""
+    def lpo_job(self, candidates: list[Candidate]) -> RefinementJob:
+        """Return the refinement job of the first of some candidates."""
         weights, matching = self._encoders.manifest.evidence, self._config.matching
-        first = begun[: self._starts]
-        return refinement_job(self._plan, self.query, first, self._grid.camera_height_m, weights, matching)
+        starts = candidates[: self._lpo_count]
+        return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, weights, matching)
 
-    def refined(self, begun: list[Candidate], result: RefinementResult) -> list[Candidate]:
-        """Return the candidates after LPO, best first, followed by those that were not refined."""
-        matching, first, rest = self._config.matching, begun[: self._starts], begun[self._starts :]
-        self._refined_modes = (self.modes if self.by_walls else self._unrefined_modes)[: self._starts]
-        self._ends = refined(self._plan, self._encoders, self.query, first, result, matching, self._hints)
+    def after_lpo(self, candidates: list[Candidate], result: RefinementResult) -> list[Candidate]:
+        """Return the candidates of `lpo_job` after LPO: the refined ones, best first, then the others."""
+        starts, others = candidates[: self._lpo_count], candidates[self._lpo_count :]
+        # By walls, LPO starts at the modes themselves; otherwise at the candidates of `without_lpo`.
+        modes = self.modes if self.by_walls else self._modes_before_lpo
+        self._lpo_modes = modes[: self._lpo_count]
+        self._lpo_candidates = refined_candidates(
+            self._plan, self._encoders, self.query, starts, result, self._config.matching, self._hints
+        )
         self._stage = "lpo"
-        return [self._ends[index] for index in ranked(self._ends, self.query)] + rest
+        return [self._lpo_candidates[index] for index in ranked(self._lpo_candidates, self.query)] + others
 
     def localisation(self, candidates: list[Candidate]) -> Localisation:
         """Return the distinct candidates of the last stage, best first, with everything that was recorded."""
         config, hints, camera_height_m = self._config, self._hints, self._grid.camera_height_m
-        wanted = max(self._top_k, self._starts) if config.by_probability else self._top_k
+        wanted = max(self._top_k, self._lpo_count) if config.by_probability else self._top_k
         answers = distinct(candidates, self.query, config.separation_m, wanted)
         found = self._posterior(answers)
         if config.by_probability:
@@ -351,8 +391,8 @@ class _Search:
             self._costs,
             self._prior,
             self.query,
-            starts=self._refined_modes,
-            ends=self._ends,
+            starts=self._lpo_modes,
+            ends=self._lpo_candidates,
             candidates=candidates,
             temperature=self._encoders.manifest.evidence.temperature,
             separation_m=self._config.separation_m,

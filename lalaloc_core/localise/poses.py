@@ -279,8 +279,13 @@ def grid_candidate(
 class RefinementJob:
     """Starting poses for pose refinement, each with its own targets and room.
 
+    `PoseOptimiser` compares embedded layouts with `targets`, by differences times `precision` if that is not None.
+    `PoseRefiner` reads a job with `log_profile` differently: it passes the optimiser a copy with `log_profile` as the
+    targets, and uses the job's own `targets`, which are latents, for the latent distance alone. Without `log_profile`
+    it compares latents and ignores `precision`.
+
     Attributes:
-        targets: (k, d) latents or other embeddings that those of the layouts are compared with.
+        targets: (k, d) latents, or other embeddings for an optimiser with another embedding.
         position_m: (k, 2) positions (m).
         heading: (k,) headings (radians) in the frame.
         walls_m: (k, n, 4) walls of each pose's room (m), padded.

@@ -1,11 +1,18 @@
 """Posterior probability of every pose of the grid under every hypothesis of the heading.
 
 A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
-queries. The prior is uniform over floor area and over the headings that are searched; costs include that of hints.
+queries. The prior is uniform over floor area and over the searched headings. Costs include the cost of hints.
 
-Candidates are the modes of the posterior. The grid's poses miss a mode's minimum, and refinement finds its depth: a
-mode's pairs are shifted by the gain of its candidate, all others by the median gain. Candidates that end at one place
-are one mode, and refined modes count as equally wide.
+Candidates are the modes of the posterior. A grid pose is up to half a step away from the minimum of its mode.
+Refinement moves a candidate to the minimum; the decrease of its cost is its *gain*. `posterior_of` applies this to all
+pairs:
+
+* Pairs of a refined mode move with its candidate, and their cost is lowered by its gain.
+* The cost of all other pairs is lowered by the median gain.
+* Modes whose candidates end at the same place and heading are merged.
+* Refined modes get equal widths, as the number of pairs near a minimum depends on the position of the grid.
+
+`probability_map` returns the posterior by place, for maps.
 """
 
 from __future__ import annotations
@@ -18,6 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.ranking import HEADING_SEPARATION, TIED, ranking
 from lalaloc_core.render.sampling import PoseSet
@@ -27,6 +35,8 @@ RIGHT_WITHIN_M = 1.0
 HEADING_WITHIN = np.radians(5.0)
 # Pairs whose log likelihood is this far below the best are left out.
 NEGLIGIBLE = 12.0
+# Lattice step (m) on which the places of a probability map are merged.
+_MAP_STEP_M = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,7 +113,7 @@ class Posterior:
         candidate: probability of being within 1 m of each candidate at about its heading, and at no candidate before
             it; at most one in sum.
         heading: probability that the heading of the first candidate is right within 5°.
-        support: the same probability at the refined places; see `probability_map.py`.
+        support: the same probability at the refined places; see `probability_map`.
     """
 
     pose: Float[np.ndarray, "n"]
@@ -324,3 +334,38 @@ def _heading_share(
     # A hypothesis stands for the headings up to half a sector from it.
     half = 0.5 * query.sector
     return float(weight[np.abs(wrap_angle(heading - answer)) <= HEADING_WITHIN + half].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class ProbabilityMap:
+    """Places with their probabilities.
+
+    Places are the refined ones. Candidates can begin up to a metre from the place where they end, so a map of the
+    grid's poses would show the probability beside the answer.
+
+    Attributes:
+        position_m: (k, 2) positions (m).
+        room_index: (k,) rooms.
+        probability: (k,) probabilities; the sum is one.
+    """
+
+    position_m: Float[np.ndarray, "k 2"]
+    room_index: Int[np.ndarray, "k"]
+    probability: Float[np.ndarray, "k"]
+
+
+def probability_map(plan: FloorPlan, poses: PoseSet, posterior: Posterior) -> ProbabilityMap:
+    """Return the places of a posterior over the grid `poses` of a plan.
+
+    Places that refinement moved out of their rooms are left out, unless all were.
+    """
+    support = posterior.support
+    key = np.concatenate([support.pose[:, None], np.rint(support.position_m / _MAP_STEP_M).astype(np.int64)], axis=1)
+    _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    weight = np.bincount(which.ravel(), support.weight, minlength=len(first))
+    position_m, room = support.position_m[first], poses.room_index[support.pose[first]]
+    inside = plan.room_index_at(position_m) == room
+    if not weight[inside].sum() > 0.0:
+        position_m, inside = poses.position_m[support.pose[first]], np.ones(len(first), bool)
+    left = weight[inside]
+    return ProbabilityMap(position_m[inside], room[inside], left / left.sum())

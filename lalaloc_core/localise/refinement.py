@@ -1,4 +1,8 @@
-"""Pose refinement from the search's side: jobs for the refiner, and candidates from its results."""
+"""Pose refinement from the search's side: jobs for the refiner, and candidates from its results.
+
+`refinement_job` makes a `RefinementJob` of candidates, the caller has it run (`optimise.PoseRefiner`, in this process
+or a worker), and `refined_candidates` turns the `RefinementResult` into candidates.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +69,7 @@ def refinement_job(
     )
 
 
-def refined(
+def refined_candidates(
     plan: FloorPlan,
     encoders: Encoders,
     query: Query,
@@ -80,7 +84,8 @@ def refined(
     """
     weights = encoders.manifest.evidence
     rooms = np.array([start.room_index for start in starts])
-    result, left = _kept_inside(starts, result, ~np.isfinite(hints.penalty(plan, result.position_m, rooms)))
+    excluded = ~np.isfinite(hints.penalty(plan, result.position_m, rooms))
+    result = _put_back(starts, result, excluded)
     hint_cost = hints.penalty(plan, result.position_m, rooms) / weights.temperature
     offsets = result.height_offset
     offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
@@ -92,11 +97,12 @@ def refined(
         hypotheses = np.array([start.hypothesis for start in starts])
         columns = encoders.manifest.profile_columns
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
-        found = MatchingCost(plan, query, matching.fine_reach_m, weights, matching).terms(layouts, hypotheses, offsets)
-        cost = found.total(weights)
+        matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
+        by_term = matching_cost.terms(layouts, hypotheses, offsets)
+        cost = by_term.total(weights)
         if matching.latent_weight:
             cost = cost + matching.latent_weight * distance
-        terms = [{name: float(values[k]) for name, values in found._asdict().items()} for k in range(len(starts))]
+        terms = [{name: float(values[k]) for name, values in by_term._asdict().items()} for k in range(len(starts))]
     return [
         replace(
             start,
@@ -108,19 +114,17 @@ def refined(
             height_offset=float(offsets[k]),
             hint_cost=float(hint_cost[k]),
             terms=terms[k],
-            information=None if left[k] else result.information[k],
+            information=None if excluded[k] else result.information[k],
         )
         for k, start in enumerate(starts)
     ]
 
 
-def _kept_inside(
-    starts: list[Candidate], result: RefinementResult, excluded: Bool[np.ndarray, "k"]
-) -> tuple[RefinementResult, Bool[np.ndarray, "k"]]:
-    """Return the result with excluded poses put back to their starts, and `excluded`."""
+def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[np.ndarray, "k"]) -> RefinementResult:
+    """Return the result with excluded poses put back to their starts."""
     if not excluded.any():
-        return result, excluded
-    begun = np.stack([start.position_m for start in starts])
+        return result
+    position_m = np.stack([start.position_m for start in starts])
     heading = np.array([start.frame_heading for start in starts])
     cost = np.array([start.cost for start in starts])
     distance, offset = result.latent_distance, result.height_offset
@@ -128,15 +132,14 @@ def _kept_inside(
         distance = np.where(excluded, [start.latent_distance for start in starts], distance)
     if offset is not None:
         offset = np.where(excluded, [start.height_offset for start in starts], offset)
-    kept = replace(
+    return replace(
         result,
-        position_m=np.where(excluded[:, None], begun, result.position_m),
+        position_m=np.where(excluded[:, None], position_m, result.position_m),
         heading=np.where(excluded, heading, result.heading),
         cost=np.where(excluded, cost, result.cost),
         latent_distance=distance,
         height_offset=offset,
     )
-    return kept, excluded
 
 
 def with_latents(

@@ -13,8 +13,7 @@ from lalaloc_core.localise.bundle import Bundle, ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.posterior import Posterior
-from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.posterior import Posterior, probability_map
 from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.search import SequenceLocalisation

@@ -13,12 +13,11 @@ from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps
+from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step
 from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
 from lalaloc_core.localise.sequence import SequenceJob
 from lalaloc_core.localise.sequence.search import localise_sequence_steps
 from lalaloc_core.localise.stated_camera import KnownHeading
-from lalaloc_core.localise.steps import next_step
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.fair_share import with_headroom

@@ -11,7 +11,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from sqlalchemy import Row
 
 from lalaloc_core.conventions import heading_from_degrees
@@ -43,6 +43,8 @@ from service.storage.records import PlanRecord, VenueRecord
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
+# Plans whose probabilities differ by less than this are a tie.
+_TIED = 1e-9
 # Function that reads the current rows of the plans to search.
 ReadPlans = Callable[[], Awaitable[Sequence[Row[Any]]]]
 
@@ -198,7 +200,7 @@ class VenueLocaliser:
             bundle=self._bundle,
             share=share,
         )
-        plans = self._plan_probabilities(searched.rows, found, share, probability)
+        plans = self._plan_probabilities(searched, found, share, probability)
         return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
 
     async def _ready(
@@ -279,20 +281,26 @@ class VenueLocaliser:
         )
 
     def _plan_probabilities(
-        self, rows: Sequence[Row[Any]], found: Localisation, share: float, probability: Float[np.ndarray, "m"]
+        self, searched: _Searched, found: Localisation, share: float, probability: Float[np.ndarray, "m"]
     ) -> list[PlanProbability]:
         """Return the searched plans, most probable first; `_Searched.shares` gives `share` and `probability`."""
         confidence = found.confidence(self._bundle.manifest.confidence, share)
-        ranked = sorted(zip(probability.tolist(), rows, strict=True), key=lambda entry: -entry[0])
         return [
             PlanProbability(
-                floorplan_id=row.plan_id,
-                level=row.level,
-                name=row.name,
-                probability=None if confidence is None else min(confidence.fit * plan_probability, 1.0),
+                floorplan_id=searched.rows[number].plan_id,
+                level=searched.rows[number].level,
+                name=searched.rows[number].name,
+                probability=None if confidence is None else min(confidence.fit * float(probability[number]), 1.0),
             )
-            for plan_probability, row in ranked
+            for number in _by_probability(probability, np.array(searched.index))
         ]
+
+
+def _by_probability(probability: Float[np.ndarray, "m"], index: Int[np.ndarray, "m"]) -> list[int]:
+    """Return the order of falling probability; copies of a plan, equal up to rounding, are ordered by `index`."""
+    order = np.argsort(-probability, kind="stable")
+    tie = np.concatenate([[0], np.cumsum(-np.diff(probability[order]) >= _TIED)])
+    return order[np.lexsort((index[order], tie))].tolist()
 
 
 def _height_is_possible(record: PlanRecord, form: LocaliseForm) -> bool:

@@ -14,8 +14,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.poses import Candidate, PredictedProfile, Query
-from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of
-from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of, probability_map
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import seeds
 

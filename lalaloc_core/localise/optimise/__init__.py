@@ -16,7 +16,7 @@ layouts themselves.
 Begin with `optimiser.py`; `problem.py` has the evaluation, `descent.py` the two optimisers.
 """
 
-from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.optimise.optimiser import PoseOptimiser, PoseRefiner
+from lalaloc_core.localise.optimise.problem import LpoConfig
 
 __all__ = ["LpoConfig", "PoseOptimiser", "PoseRefiner"]

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lalaloc_core.localise.optimise.config import LpoConfig
-from lalaloc_core.localise.optimise.problem import Evaluation, Problem
+from lalaloc_core.localise.optimise.problem import Evaluation, LpoConfig, Problem
 
 
 class DescentResult(NamedTuple):

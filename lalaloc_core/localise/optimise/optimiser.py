@@ -11,9 +11,8 @@ from torch import Tensor
 
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt
-from lalaloc_core.localise.optimise.problem import Embedding, Norm, Problem
+from lalaloc_core.localise.optimise.problem import Embedding, LpoConfig, Norm, Problem
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
@@ -53,7 +52,7 @@ class PoseOptimiser:
         self._device = device or torch.device("cpu")
 
     def refine(self, job: RefinementJob) -> RefinementResult:
-        """Refine every starting pose of a job within its own room, by its `targets` and, if it has one, `precision`.
+        """Refine every starting pose of a job within its own room, by its `targets` and `precision` alone.
 
         Both distances of the result are by this optimiser's norm.
         """
@@ -101,7 +100,7 @@ class PoseRefiner:
         return cls(encoder, config)
 
     def refine(self, job: RefinementJob) -> RefinementResult:
-        """Refine every starting pose of a job within its own room."""
+        """Refine every starting pose of a job within its own room, by wall profiles if it has them, else by latents."""
         if job.log_profile is None or job.precision is None:
             return self._optimiser(self.encoder, "l2").refine(replace(job, precision=None))
         by_profile = replace(job, targets=job.log_profile)

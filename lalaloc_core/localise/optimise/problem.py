@@ -1,4 +1,21 @@
-"""Problem of pose refinement: the residuals of a job as a function of the unknowns, and their derivatives."""
+"""Problem of pose refinement: the cost of poses as a function of the unknowns, and its derivatives.
+
+The unknowns u of a pose are x and y, then the heading and the height offset δ if they are refined. With the log wall
+profile of the layout at u, the embedding Φ of the layout (or the log profile itself), the targets f and the factors p
+(`RefinementJob.precision`, or 1), the residuals are
+
+    r = p (Φ(layout(u)) - f - δ)                                           `Problem.evaluate`
+
+with the Jacobian J = ∂r / ∂u: the derivative of the renderer in closed form, times that of Φ by forward-mode
+differentiation (`Problem._embedded`). The cost that Levenberg-Marquardt lowers, its slope and its Gauss-Newton
+curvature are
+
+    C = ½ Σ ρ(r) + ½ Σ (s u)²    C' = J w r + s² u    H = J w Jᵀ + s²      `Problem._evaluation`
+
+with ρ(r) = log(1 + r²) and w = 1 / (1 + r²) for the norm "cauchy", else ρ(r) = r² and w = 1; s is the stiffness of
+unknowns with a normal prior. Results report the distance D, and Adam lowers it: the root of Σ r² for "l2", the mean of
+absolute residuals for "l1", and the mean of log(1 + r²) for "cauchy", which is the walls' term of the matching cost.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +28,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.poses import RefinementJob
 from lalaloc_core.render.gradient import ProfileJacobian, log_distance_gradient, log_profile_gradient
 
@@ -21,16 +37,56 @@ Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
 Norm = Literal["l2", "l1", "cauchy"]
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Costs of k poses with derivatives by p unknowns, from the residuals r and their Jacobian.
+@dataclass(frozen=True, kw_only=True)
+class LpoConfig:
+    """Settings of both optimisers.
 
     Attributes:
-        cost: (k,) cost that Levenberg-Marquardt lowers: half the sum of r², or of log(1 + r²), plus half the squares of
-            unknowns with a normal prior, in units of its deviation.
-        slope: (k, p) derivative of the cost.
-        information: (k, p, p) curvature of the cost (Gauss-Newton).
-        distance: (k,) distance by the norm, without the prior.
+        method: the optimiser.
+        margin_m: smallest distance of poses to walls, so that none crosses one.
+        max_iterations: maximum number of Levenberg-Marquardt evaluations, including the first at the start.
+        profile_iterations: the same for wall profiles, as predictions are less accurate than the last steps.
+        exact_cost: poses below this cost continue up to `max_iterations`.
+        tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
+        tolerance_cost: a step that lowers the cost by less than this share, or would by the linear model, ends it too.
+        initial_damping: damping of the first step.
+        max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
+        prune_after: number of evaluations after which starts that cannot become the answer are left.
+        prune_ratio: such starts are farther than the best by this factor.
+        prune_margin: the same for wall profiles: their cost exceeds the best by this.
+        adam_*: the paper's schedule.
+    """
+
+    method: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
+    margin_m: float = 0.03
+    max_iterations: int = 15
+    profile_iterations: int = 4
+    exact_cost: float = 0.01
+    tolerance_m: float = 1e-3
+    tolerance_cost: float = 1e-2
+    initial_damping: float = 1e-2
+    max_step_m: float = 0.5
+    max_turn: float = 0.2
+    prune_after: int = 3
+    prune_ratio: float = 1.5
+    prune_margin: float = 0.6
+    adam_learning_rate: float = 0.01
+    adam_steps: int = 150
+    adam_plateau_threshold: float = 0.05
+    adam_plateau_patience: int = 10
+    adam_stop_threshold: float = 0.001
+    adam_stop_patience: int = 20
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Costs of k poses with derivatives by p unknowns; the symbols are those of the module's docstring.
+
+    Attributes:
+        cost: (k,) C, with the prior.
+        slope: (k, p) C', the derivative of the cost.
+        information: (k, p, p) H, the curvature of the cost.
+        distance: (k,) D, without the prior.
         gradient: (k, p) derivative of the distance.
     """
 
@@ -111,21 +167,21 @@ class Problem:
         return part
 
     def evaluate(self, pose: Float[Tensor, "k p"]) -> Evaluation:
-        """Return the costs at these poses with their derivatives."""
+        """Return the costs at these poses with their derivatives, from the residuals r and the Jacobian J."""
         position_m, heading, height_offset = self.unpack(pose)
         layout = log_profile_gradient(position_m, heading, self._walls_m, self._columns)
         value, jacobian = self._embedded(layout)
         residual = value - self._targets
         if height_offset is not None:
-            # The offset is added to the target, the same for all azimuths.
+            # The offset adds to the target, equally at all azimuths, so its column of J is -1.
             residual = residual - height_offset[:, None]
             jacobian = torch.cat([jacobian, torch.full_like(residual, -1.0)[:, None]], dim=1)
         if self._precision is not None:
             residual, jacobian = residual * self._precision, jacobian * self._precision[:, None]
-        return self._weighed(pose, residual, jacobian)
+        return self._evaluation(pose, residual, jacobian)
 
     def _embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
-        """Return embedded layouts, and their derivatives by the unknowns that move them."""
+        """Return Φ of the layouts, and its derivatives by the m unknowns that move the layout."""
         by_pose = layout.by_pose[:, : self._moving]
         if self._embedding is None:
             return layout.log_m, by_pose
@@ -143,34 +199,34 @@ class Problem:
         )[:2]
         return value[:: self._moving], derivative.reshape(count, self._moving, -1)
 
-    def _weighed(
+    def _evaluation(
         self, pose: Float[Tensor, "k p"], residual: Float[Tensor, "k d"], jacobian: Float[Tensor, "k p d"]
     ) -> Evaluation:
-        """Return the costs by the norm; Cauchy's, that of `localise.matching_cost`, by re-weighted squares."""
-        held = pose * self._stiffness
-        prior = 0.5 * (pose * held).sum(dim=1)
+        """Return C, C', H, D and its gradient, from r and J; `self._stiffness` is s²."""
+        prior_slope = pose * self._stiffness
+        prior = 0.5 * (pose * prior_slope).sum(dim=1)
         if self.norm == "cauchy":
             factor = 1.0 + residual.square()
             total, weight = factor.log().sum(dim=1), 1.0 / factor
-            pull = _by_unknown(jacobian, residual * weight)
-            distance, gradient = total / residual.shape[1], 2.0 * pull / residual.shape[1]
+            slope = _by_unknown(jacobian, residual * weight)
+            distance, gradient = total / residual.shape[1], 2.0 * slope / residual.shape[1]
             information = (jacobian * weight[:, None]) @ jacobian.mT
         else:
             total = residual.square().sum(dim=1)
-            pull, information = _by_unknown(jacobian, residual), jacobian @ jacobian.mT
+            slope, information = _by_unknown(jacobian, residual), jacobian @ jacobian.mT
             if self.norm == "l1":
                 distance = residual.abs().mean(dim=1)
                 gradient = _by_unknown(jacobian, residual.sign()) / residual.shape[1]
             else:
                 distance = total.sqrt()
-                gradient = pull / distance.clamp_min(1e-9)[:, None]
+                gradient = slope / distance.clamp_min(1e-9)[:, None]
         information = information + torch.diag(self._stiffness)
-        return Evaluation(0.5 * total + prior, pull + held, information, distance, gradient)
+        return Evaluation(0.5 * total + prior, slope + prior_slope, information, distance, gradient)
 
     def stay_inside(
         self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig
     ) -> Float[Tensor, "k p"]:
-        """Shorten steps that are too long or would come closer to a wall than the margin."""
+        """Return the steps, shortened so that poses keep the margin to walls and all limits of the settings."""
         length = torch.linalg.vector_norm(step[:, :2], dim=1)
         azimuth = torch.atan2(step[:, 0], step[:, 1])
         free = log_distance_gradient(pose[:, :2], azimuth[:, None], self._walls_m).log_m[:, 0].exp() - config.margin_m
@@ -184,4 +240,5 @@ class Problem:
 
 
 def _by_unknown(jacobian: Float[Tensor, "k p d"], values: Float[Tensor, "k d"]) -> Float[Tensor, "k p"]:
+    """Return the product of the Jacobian and the values of each pose."""
     return (jacobian @ values[:, :, None])[:, :, 0]

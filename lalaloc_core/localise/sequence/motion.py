@@ -4,7 +4,7 @@ With the displacement v from the first place to the second, the measured distanc
 first, clockwise) and, if it was measured, the direction φ (of the displacement against the first heading)::
 
     r_turn = (heading' - heading - τ) / σ_τ
-    r_dist = (|v| - d) / σ_d                                      without a direction
+    r_dist = (‖v‖ - d) / σ_d                                      without a direction
     r_along = (v · u - d) / σ_d,  r_across = (v · u') / (d σ_φ)   with one, u along heading + φ and u' at right angles
 
 and the likelihood is `exp(-½ Σ r²) + FLOOR`, as a measurement can be an outlier. Deviations are widened by the distance

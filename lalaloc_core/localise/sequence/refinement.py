@@ -18,7 +18,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, RefinementJob, RefinementResult
 from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.refinement import refined_candidates, refinement_job
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
 from lalaloc_core.localise.sequence.paths import Observation, Path
@@ -130,7 +130,7 @@ def ended_paths(
             evaluations=np.zeros(len(paths), int),
             height_offset=result.height_offset,
         )
-        ends.append(refined(plan, encoders, picture.query, starts, alone, config.matching))
+        ends.append(refined_candidates(plan, encoders, picture.query, starts, alone, config.matching))
     moved = [replace(path, ends=tuple(candidates[m] for candidates in ends)) for m, path in enumerate(paths)]
     log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
     found = []

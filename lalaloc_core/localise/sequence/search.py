@@ -19,7 +19,7 @@ from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingCost, latent_distances
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, run_steps
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import Posterior, area_shares
 from lalaloc_core.localise.ranking import HEADING_SEPARATION, distinct, suppress
@@ -30,12 +30,11 @@ from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
 from lalaloc_core.localise.sequence.paths import Observation, Path, path_posterior
 from lalaloc_core.localise.sequence.refinement import are_alike, ended_paths, job_parts, path_motion_costs, sequence_job
-from lalaloc_core.localise.steps import run_steps
 
 SequenceRefine = Literal["none", "lpo"]
 # Runs joint refinement; None if it has no result (in time).
 SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
-# Maximum number of a picture's places, the best by every `_STRIDE`th azimuth.
+# Maximum number of a picture's places, the best by every n-th azimuth, with n = `_STRIDE`.
 _MAX_PLACES, _STRIDE = 2048, 4
 # Number of refined paths, and of modes of each picture through which paths are searched.
 _PATHS, _MODES = 8, 8
