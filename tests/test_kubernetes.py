@@ -1,6 +1,6 @@
-"""The manifests are valid for the versions of Kubernetes in use, and fit the service, the image, and one another.
+"""Tests of the Kubernetes manifests: validity, and agreement with the service and the image.
 
-The schemas come with the package kubernetes-validate; nothing is asked of a cluster or a network.
+The schemas come with the package kubernetes-validate; the tests need no cluster and no network.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ KUSTOMIZATION: dict[str, Any] = yaml.safe_load((FOLDER / "kustomization.yaml").r
 RESOURCES: dict[str, dict[str, Any]] = {
     name: yaml.safe_load((FOLDER / name).read_text(encoding="utf-8")) for name in KUSTOMIZATION["resources"]
 }
-BY_KIND = {one["kind"]: one for one in RESOURCES.values()}
-# The oldest that is looked after at the time of writing, and the newest.
+BY_KIND = {manifest["kind"]: manifest for manifest in RESOURCES.values()}
+# Oldest supported and newest version at the time of writing.
 VERSIONS = ("1.34", "1.37")
 POD: dict[str, Any] = BY_KIND["Deployment"]["spec"]["template"]["spec"]
 CONTAINER: dict[str, Any] = POD["containers"][0]
@@ -62,36 +62,38 @@ def test_validation_notices_a_mistake(name: str, path: tuple[str | int, ...], va
 
 
 def test_every_manifest_is_applied() -> None:
-    others = {"kustomization.yaml", "prometheus-adapter.yaml"}
-    assert {path.name for path in FOLDER.iterdir()} - others == set(RESOURCES)
+    not_resources = {"kustomization.yaml", "prometheus-adapter.yaml"}
+    assert {path.name for path in FOLDER.iterdir()} - not_resources == set(RESOURCES)
     name, _, tag = CONTAINER["image"].partition(":")
     assert KUSTOMIZATION["images"] == [{"name": name, "newTag": tag}]
 
 
 def test_manifests_select_the_same_pods() -> None:
-    spec = {kind: one.get("spec", {}) for kind, one in BY_KIND.items()}
+    spec = {kind: manifest.get("spec", {}) for kind, manifest in BY_KIND.items()}
     assert spec["Deployment"]["selector"]["matchLabels"] == LABELS
     assert spec["Service"]["selector"] == LABELS
     assert spec["PodDisruptionBudget"]["selector"]["matchLabels"] == LABELS
     assert spec["NetworkPolicy"]["podSelector"]["matchLabels"] == LABELS
-    assert [one["labelSelector"]["matchLabels"] for one in POD["topologySpreadConstraints"]] == [LABELS]
+    assert [rule["labelSelector"]["matchLabels"] for rule in POD["topologySpreadConstraints"]] == [LABELS]
     scaled = spec["HorizontalPodAutoscaler"]["scaleTargetRef"]
     assert (scaled["kind"], scaled["name"]) == ("Deployment", BY_KIND["Deployment"]["metadata"]["name"])
-    # Else each deployment of a new version would undo what the autoscaler chose.
+    # A replica count would override the autoscaler on every deployment.
     assert "replicas" not in spec["Deployment"]
     assert POD["serviceAccountName"] == BY_KIND["ServiceAccount"]["metadata"]["name"]
-    assert [one["configMapRef"]["name"] for one in CONTAINER["envFrom"]] == [BY_KIND["ConfigMap"]["metadata"]["name"]]
+    assert [source["configMapRef"]["name"] for source in CONTAINER["envFrom"]] == [
+        BY_KIND["ConfigMap"]["metadata"]["name"]
+    ]
 
 
 def test_manifest_settings_exist() -> None:
     given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
     values: dict[str, Any] = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
     assert Settings(**values).access.api_keys
-    named = {one["name"] for one in CONTAINER["env"]}
+    named = {variable["name"] for variable in CONTAINER["env"]}
     assert {name.removeprefix(PREFIX).lower() for name in named} <= SETTING_NAMES
     assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}
     # Secret values come from a secret.
-    assert all("value" not in one and "secretKeyRef" in one["valueFrom"] for one in CONTAINER["env"])
+    assert all("value" not in entry and "secretKeyRef" in entry["valueFrom"] for entry in CONTAINER["env"])
     assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
 
 
@@ -111,35 +113,37 @@ def test_pod_has_minimal_rights() -> None:
     assert POD["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
     assert POD["automountServiceAccountToken"] is False
     assert f"--uid {POD['securityContext']['runAsUser']} " in DOCKERFILE
-    # Writable: the data folder of the image, and temporary files.
-    written = {one["mountPath"] for one in CONTAINER["volumeMounts"]}
+    # Only the data folder and the temporary folder are writable.
+    written = {mount["mountPath"] for mount in CONTAINER["volumeMounts"]}
     assert written == {"/tmp", *re.findall(r"LALALOC_DATA_DIR=(\S+)", DOCKERFILE)}
-    assert {one["name"] for one in CONTAINER["volumeMounts"]} == {one["name"] for one in POD["volumes"]}
-    assert all("sizeLimit" in one["emptyDir"] for one in POD["volumes"])
+    assert {mount["name"] for mount in CONTAINER["volumeMounts"]} == {volume["name"] for volume in POD["volumes"]}
+    assert all("sizeLimit" in volume["emptyDir"] for volume in POD["volumes"])
 
 
 def test_ports_and_probes_match_the_service() -> None:
     [port] = CONTAINER["ports"]
     assert f"EXPOSE {port['containerPort']}" in DOCKERFILE
     assert BY_KIND["Service"]["spec"]["ports"][0]["targetPort"] == port["name"]
-    asked = [CONTAINER[f"{kind}Probe"]["httpGet"] for kind in ("startup", "liveness", "readiness")]
-    assert {one["port"] for one in asked} == {port["name"]}
+    probes = [CONTAINER[f"{kind}Probe"]["httpGet"] for kind in ("startup", "liveness", "readiness")]
+    assert {probe["port"] for probe in probes} == {port["name"]}
     paths = {route.path for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)}
-    assert {one["path"] for one in asked} <= paths
-    # A service that is stopping is to finish what it has, not to be killed.
+    assert {probe["path"] for probe in probes} <= paths
+    # A stopping service is alive but not ready, so it finishes its requests.
     assert CONTAINER["livenessProbe"]["httpGet"]["path"] == "/healthz"
     assert CONTAINER["readinessProbe"]["httpGet"]["path"] == "/readyz"
 
 
 def test_autoscaler_uses_an_existing_metric() -> None:
-    [by_requests] = [one for one in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if one["type"] == "Pods"]
+    [by_requests] = [
+        metric for metric in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if metric["type"] == "Pods"
+    ]
     metric = by_requests["pods"]["metric"]["name"]
     adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
-    assert [one["seriesQuery"].partition("{")[0] for one in adapter["rules"]["custom"]] == [metric]
+    assert [rule["seriesQuery"].partition("{")[0] for rule in adapter["rules"]["custom"]] == [metric]
     telemetry = Telemetry()
     Admission(AdmissionLimits.from_settings(Settings()), telemetry)
     assert f"\n{metric} " in telemetry.render().decode()
-    # More are added before the pods there are begin to refuse.
+    # The autoscaler adds pods before the running pods refuse requests.
     cores = int(CONTAINER["resources"]["limits"]["cpu"])
     shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
     assert shares.compute_threads == cores

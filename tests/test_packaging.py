@@ -1,4 +1,4 @@
-"""Installation and image: what their files name exists, and the right torch is chosen."""
+"""Tests of installation and image: named files exist, and the right torch is chosen."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _constraints() -> dict[str, str]:
 
 
 def _copied() -> list[str]:
-    """Sources of the image that come from the repository."""
+    """Return the sources of the image that come from the repository."""
     copies = re.findall(r"^COPY (?!--from)(.+) \S+$", DOCKERFILE, re.MULTILINE)
     return [source for copy in copies for source in copy.split()]
 
@@ -52,7 +52,7 @@ def test_torch_is_pinned_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gpu", "found", "asked"),
+    ("gpu", "found", "expected"),
     [
         (False, {"2.0.0+cpu"}, ["torch==2.0.0+cpu"]),
         (False, {"2.0.0"}, ["torch==2.0.0+cpu", "torch==2.0.0"]),
@@ -60,7 +60,7 @@ def test_torch_is_pinned_once() -> None:
     ],
 )
 def test_cpu_build_is_tried_first_without_a_gpu(
-    monkeypatch: pytest.MonkeyPatch, gpu: bool, found: set[str], asked: list[str]
+    monkeypatch: pytest.MonkeyPatch, gpu: bool, found: set[str], expected: list[str]
 ) -> None:
     tried = []
 
@@ -74,7 +74,7 @@ def test_cpu_build_is_tried_first_without_a_gpu(
     monkeypatch.setattr(install_torch, "pinned_version", lambda pyproject: "2.0.0")
     monkeypatch.setattr(install_torch, "pip_install", pip_install)
     assert install_torch.main() == 0
-    assert tried == asked
+    assert tried == expected
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ def flat() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def search(flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> Search:
-    return partial(localise, flat, grid, encoders)
+def search(flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner) -> Search:
+    return partial(localise, flat, grid, encoders, refiner=optimiser.refine)
 
 
 @pytest.fixture(scope="module")
@@ -70,26 +70,23 @@ def error_m(found: Localisation, pose: PoseSet) -> float:
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
     def test_each_stage_is_more_accurate(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner, by_profile: bool
+        self, flat: FloorPlan, encoders: Encoders, search: Search, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
         for seed in range(20):
             pose = random_pose(flat, seed)
             query = layout_query(encoders, flat, pose, by_profile=by_profile)
             for refine, distances in errors.items():
-                found = search(query, refine=refine, refiner=optimiser.refine)
+                found = search(query, refine=refine)
                 distances.append(error_m(found, pose))
         median = {refine: float(np.median(distances)) for refine, distances in errors.items()}
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8
 
-    def test_each_stage_lowers_the_latent_distance(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
-    ) -> None:
+    def test_each_stage_lowers_the_latent_distance(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
         for seed in range(10):
             query = layout_query(encoders, flat, random_pose(flat, seed))
-            stages: tuple[Refine, ...] = ("lpo", "vdr", "none")
-            best = [search(query, refine=s, refiner=optimiser.refine).candidates[0] for s in stages]
+            best = [search(query, refine=stage).candidates[0] for stage in ("lpo", "vdr", "none")]
             costs = [candidate.cost for candidate in best]
             assert costs == sorted(costs)
             # Batches of other sizes round differently.
@@ -104,7 +101,6 @@ class TestCandidates:
         flat: FloorPlan,
         encoders: Encoders,
         search: Search,
-        optimiser: PoseRefiner,
         seed: int,
         top_k: int,
         heading_known: bool,
@@ -112,7 +108,7 @@ class TestCandidates:
     ) -> None:
         image = np.random.default_rng(seed).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         query = encoders.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
-        found = search(query, refine=refine, top_k=top_k, refiner=optimiser.refine)
+        found = search(query, refine=refine, top_k=top_k)
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
         gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
@@ -134,11 +130,9 @@ class TestCandidates:
         query = layout_query(encoders, plan, PoseSet(np.array([[0.5, 0.6]]), np.array([0])))
         assert len(localise(plan, grid, encoders, query, refine="vdr", top_k=5).candidates) == 1
 
-    def test_localisation_is_deterministic(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
-    ) -> None:
+    def test_localisation_is_deterministic(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
         query = layout_query(encoders, flat, random_pose(flat, 1))
-        first, second = (search(query, refiner=optimiser.refine).candidates for _ in range(2))
+        first, second = (search(query).candidates for _ in range(2))
         assert first == second
 
     @given(st.floats(-math.pi, math.pi), st.floats(-10.0, 10.0))
@@ -154,14 +148,14 @@ class TestStages:
     def query(self, flat: FloorPlan, encoders: Encoders) -> Query:
         return layout_query(encoders, flat, random_pose(flat, 3))
 
-    def test_localisation_names_its_stage(self, search: Search, optimiser: PoseRefiner, query: Query) -> None:
+    def test_localisation_names_its_stage(self, search: Search, query: Query) -> None:
         def stage(**options: Any) -> tuple[str, set[str]]:
             found = search(query, **options)
             return found.stage, set(found.timings_ms)
 
-        assert stage(refine="none", refiner=optimiser.refine) == ("retrieval", {"retrieve"})
-        assert stage(refine="vdr", refiner=optimiser.refine) == ("vdr", {"retrieve", "vdr"})
-        assert stage(refine="lpo", refiner=optimiser.refine) == ("lpo", {"retrieve", "vdr", "lpo"})
+        assert stage(refine="none") == ("retrieval", {"retrieve"})
+        assert stage(refine="vdr") == ("vdr", {"retrieve", "vdr"})
+        assert stage(refine="lpo") == ("lpo", {"retrieve", "vdr", "lpo"})
         assert stage(refine="lpo", refiner=None) == ("vdr", {"retrieve", "vdr"})
 
     def test_absent_refinement_keeps_the_vdr_pose(self, search: Search, query: Query) -> None:
@@ -185,19 +179,17 @@ class TestStages:
         np.testing.assert_array_equal(found.candidates[0].information, np.eye(2))
         assert found.signals["lpo"].cost == 0.9
 
-    def test_signals_are_independent_of_top_k(self, search: Search, optimiser: PoseRefiner, query: Query) -> None:
-        few, many = (search(query, top_k=k, refiner=optimiser.refine) for k in (1, 10))
+    def test_signals_are_independent_of_top_k(self, search: Search, query: Query) -> None:
+        few, many = (search(query, top_k=k) for k in (1, 10))
         assert list(few.signals) == list(few.best) == ["retrieval", "vdr", "lpo"]
         assert few.signals == many.signals
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
-    def test_profile_query_runs_vdr_only_if_needed(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, optimiser: PoseRefiner
-    ) -> None:
+    def test_profile_query_runs_vdr_only_if_needed(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
         query = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
         every = LocaliseConfig(every_stage=True)
-        short = search(query, refiner=optimiser.refine)
-        complete = search(query, refiner=optimiser.refine, config=every)
+        short = search(query)
+        complete = search(query, config=every)
         lost = search(query, refiner=lambda job: None)
         assert list(short.best) == ["lpo"]
         assert list(complete.best) == ["retrieval", "vdr", "lpo"]

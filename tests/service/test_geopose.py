@@ -1,4 +1,4 @@
-"""Answers on Earth as OGC GeoPose and GeoJSON, and exports of plans."""
+"""Tests of answers as OGC GeoPose and GeoJSON, and of plan exports."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def check_schema(geopose: dict[str, Any]) -> None:
 
 
 def assert_at(geopose: dict[str, Any], pose: dict[str, Any], anchor: Anchor) -> None:
-    """A pose on Earth is the one that a geodesic from the anchor leads to."""
+    """Check a geographic pose against the geodesic from the anchor."""
     geod, place = pyproj.Geod(ellps="WGS84"), geopose["position"]
     azimuth, _, distance = geod.inv(anchor.longitude, anchor.latitude, place["lon"], place["lat"])
-    at = pose["position"]
-    assert distance == pytest.approx(math.hypot(at["x_m"], at["y_m"]), abs=2e-3)
-    bearing = azimuth + anchor.north_deg - math.degrees(math.atan2(at["x_m"], at["y_m"]))
+    position = pose["position"]
+    assert distance == pytest.approx(math.hypot(position["x_m"], position["y_m"]), abs=2e-3)
+    bearing = azimuth + anchor.north_deg - math.degrees(math.atan2(position["x_m"], position["y_m"]))
     assert (bearing + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
     turned = geopose["angles"]["yaw"] + pose["heading_deg"] - anchor.north_deg
     assert (turned + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.01)
@@ -62,7 +62,7 @@ def test_positions_and_headings_match_geodesy(north_deg: float) -> None:
         azimuth, back, distance = geod.inv(plan.anchor.longitude, plan.anchor.latitude, lon, lat)
         assert distance == pytest.approx(math.hypot(x, y), rel=1e-6)
         assert (azimuth + north_deg - math.degrees(math.atan2(x, y)) + 180) % 360 - 180 == pytest.approx(0, abs=1e-4)
-        # Looking on, away from the origin: the azimuth at the far end is another one, by the convergence.
+        # The azimuth at the far end differs by the meridian convergence.
         onwards = plan.anchor.true_azimuth_deg((x, y), math.degrees(math.atan2(x, y)))
         assert (onwards - (back + 180.0) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-4)
         assert plan.anchor.to_plan(np.array([[lon, lat]]))[0] == pytest.approx([x, y], abs=1e-6)
@@ -115,8 +115,8 @@ def test_earth_hint_equals_plan_hint(client: httpx.Client, panorama: bytes) -> N
     fields = {"radius_m": 1.0, "strict": "true", "refine": "none"}
     found = localise(client, plan_id, panorama, near=on_earth, **fields).json()
     in_plan = localise(client, plan_id, panorama, near='{"x_m": 2, "y_m": 1}', **fields).json()
-    assert [one["position"] for one in found["candidates"]] == [one["position"] for one in in_plan["candidates"]]
-    assert all(math.dist(one["position"].values(), (2.0, 1.0)) <= 1.0 + 1e-3 for one in found["candidates"])
+    assert [pose["position"] for pose in found["candidates"]] == [pose["position"] for pose in in_plan["candidates"]]
+    assert all(math.dist(pose["position"].values(), (2.0, 1.0)) <= 1.0 + 1e-3 for pose in found["candidates"])
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[*answer["position"].values()]]))
     assert (geopose["position"]["lon"], geopose["position"]["lat"]) == pytest.approx((lon, lat), abs=1e-8)
     assert geopose["position"]["h"] == pytest.approx(ANCHOR["altitude_m"] + answer["camera_height_m"], abs=1e-3)
-    # 115° in the plan is 90° from north, to the east: a quarter turn clockwise of a camera that looks north.
+    # 115° in the plan is due east.
     assert answer["heading_deg"] == 115.0
     assert geopose["angles"] == pytest.approx({"yaw": -90.0, "pitch": 0.0, "roll": 0.0}, abs=1e-3)
     fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
@@ -183,13 +183,13 @@ def test_every_candidate_has_a_geopose(client: httpx.Client, panorama: bytes) ->
 
 
 def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes) -> None:
-    of_venue = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
+    venue_anchor = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
     ids = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25}), upload(client)]
     far = FLAT | {"rooms": [{"name": "far", "polygon": [[x + 2e4, y] for x, y in FLAT["rooms"][0]["polygon"]]}]}
     ids.append(upload(client, far))
-    anchors = {ids[0]: Anchor(**ANCHOR, north_deg=25.0), ids[1]: Anchor(**of_venue)}
+    anchors = {ids[0]: Anchor(**ANCHOR, north_deg=25.0), ids[1]: Anchor(**venue_anchor)}
     plans = [{"floorplan_id": plan_id} for plan_id in ids]
-    venue_id = client.post("/venues", json={"plans": plans, "anchor": of_venue}).json()["id"]
+    venue_id = client.post("/venues", json={"plans": plans, "anchor": venue_anchor}).json()["id"]
     fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"panorama": panorama}
     response = client.post("/localise", data=fields, files=file)
     assert response.status_code == 200, response.text
@@ -197,7 +197,7 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes
     assert {candidate["floorplan_id"] for candidate in found} == set(ids)
     for candidate in found:
         if candidate["floorplan_id"] == ids[2]:
-            # Too far from the venue's origin for a map that is true to scale.
+            # The plan is too far from the venue's origin.
             assert candidate["geopose"] is None
         else:
             assert_at(candidate["geopose"], candidate, anchors[candidate["floorplan_id"]])
@@ -232,9 +232,9 @@ def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes)
         place = pose["geopose"]["position"]
         assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
         assert feature["properties"] == pose
-    elsewhere = fields | {"floorplan_id": upload(client)}
-    nowhere = client.post("/localise/sequence", data=elsewhere, files=files, headers=headers)
-    assert_problem(nowhere, 409, "floorplan-unanchored")
+    unanchored = fields | {"floorplan_id": upload(client)}
+    refused = client.post("/localise/sequence", data=unanchored, files=files, headers=headers)
+    assert_problem(refused, 409, "floorplan-unanchored")
     keyed = client.post("/localise/sequence", data=fields, files=files, headers=headers | {"Idempotency-Key": "k"})
     assert_problem(keyed, 422, "invalid-request")
 

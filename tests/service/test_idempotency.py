@@ -1,4 +1,4 @@
-"""Requests with an `Idempotency-Key`: executed once, answered alike, also after failures."""
+"""Tests of requests with an `Idempotency-Key`: executed once, same answer, also after failures."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ def _count(client: httpx.Client) -> int:
 def _same(first: httpx.Response, again: httpx.Response) -> bool:
     assert "idempotency-replayed" not in first.headers
     assert again.headers["idempotency-replayed"] == "true"
-    told = ("content-type", "location", "etag")
-    return (first.status_code, first.content, [first.headers.get(name) for name in told]) == (
+    names = ("content-type", "location", "etag")
+    return (first.status_code, first.content, [first.headers.get(name) for name in names]) == (
         again.status_code,
         again.content,
-        [again.headers.get(name) for name in told],
+        [again.headers.get(name) for name in names],
     )
 
 
@@ -82,7 +82,7 @@ def test_repeated_upload_returns_the_same_plan(own: httpx.Client) -> None:
     assert _same(first, _post(own, "a"))
     assert _count(own) == 1
     assert own.get(first.headers["location"]).status_code == 200
-    # Another key, or none, is another upload.
+    # Another key or no key makes another upload.
     assert len({_post(own, "b").json()["id"], upload(own), upload(own)}) == 3
     assert _count(own) == 4
 
@@ -97,7 +97,7 @@ def test_answer_survives_a_restart(start_app: StartApp, tmp_path: Path) -> None:
 def test_multipart_boundary_does_not_matter(own: httpx.Client) -> None:
     first = own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
     for name in ("flat.json", "again.json"):
-        # Every form has a boundary of its own.
+        # Every form has its own boundary.
         assert _same(first, own.post("/floorplans", files={"file": (name, CONTENT)}, headers=_keyed("a")))
 
 
@@ -135,11 +135,11 @@ def test_repeated_query_returns_the_same_answer(own: httpx.Client, panorama: byt
     plan_id = upload(own)
     first = _query(own, "a", plan_id, panorama)
     assert first.status_code == 200
-    # Times and all.
+    # Timings are equal too.
     assert _same(first, _query(own, "a", plan_id, panorama))
     assert_problem(_query(own, "a", plan_id, panorama, top_k="1"), 422, "idempotency-key-reused")
     assert_problem(_query(own, "a", plan_id, panorama + b"\0"), 422, "idempotency-key-reused")
-    # The key of a query is none of an upload.
+    # Keys of queries and uploads are separate.
     assert _post(own, "a").status_code == 201
 
 
@@ -147,7 +147,7 @@ def test_permanent_refusal_is_kept_temporary_is_not(start_app: StartApp, tmp_pat
     with start_app(tmp_path, max_floorplans=1) as client:
         bad = {"rooms": []}
         assert _same(_post(client, "bad", bad), _post(client, "bad", bad))
-        # The request id in it is that of the request that was carried out.
+        # It contains the id of the request that was executed.
         assert _post(client, "bad", bad).json()["type"] == "urn:lalaloc:problem:invalid-floorplan"
         never = "0" * 32
         assert _same(_query(client, "q", never, panorama), _query(client, "q", never, panorama))
@@ -175,7 +175,7 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
 ) -> None:
     with start_app(tmp_path) as client:
         store = Store(database_of(tmp_path))
-        # As the one that died left it: the plan is stored, the answer is not.
+        # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": CONTENT}))
         claim = IdempotencyKeys(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Claimed)
@@ -216,7 +216,7 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
         plan_id = upload(client, hall, wait=False)
-        # It waits for the plan's grid.
+        # The query waits for the plan's grid.
         query = client.build_request(
             "POST",
             "/localise",
@@ -235,11 +235,11 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
 
 
 def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_arguments: Any) -> NoReturn:
+    def unavailable(*_arguments: Any) -> NoReturn:
         raise StoreUnavailableError()
 
-    # The step after the commit: reading the state of the grid.
-    monkeypatch.setattr(StoredGrids, "poses", away)
+    # Reading the state of the grid follows the commit.
+    monkeypatch.setattr(StoredGrids, "poses", unavailable)
     created = _post(own, "a")
     assert (created.status_code, created.json()["status"]) == (201, "ready")
     replaced = own.put(created.headers["location"], json=FLAT, headers={"If-Match": created.headers["etag"]})
@@ -307,14 +307,14 @@ def test_only_errors_of_the_request_are_kept(store: Store, refusal: Exception, k
     assert _idempotent(store).run(NOTHING, lambda _token: Response("done")).body == b"done"
 
 
-@pytest.mark.parametrize("leaves", [True, False], ids=["hangs up", "is told to come again"])
+@pytest.mark.parametrize("leaves", [True, False], ids=["disconnects", "retries later"])
 def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
     async def never() -> Response:
         raise AssertionError("it has not begun")
 
     async def ask() -> None:
         reads = BoundedReads(threads=1, max_pending=4, wait_s=30.0 if leaves else 0.2)
-        # Writers wait meanwhile.
+        # Writers wait for the lock.
         with store._database.writing():
             asking = asyncio.create_task(_idempotent(store).run_async(NOTHING, never, reads))
             await asyncio.sleep(0.3)

@@ -1,4 +1,4 @@
-"""The GeoPose protocol of the Open Spatial Computing Platform, version 2, with the model that ships."""
+"""Tests of the GeoPose protocol of the Open Spatial Computing Platform, version 2, with the shipped model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PRIVACY = {name: [] for name in ("dataRetention", "dataAcceptableUse", "dataSani
 
 
 def oscp_request(picture: bytes, place: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A GeoPoseReq as clients of the protocol send it, every member that is not optional included."""
+    """Return a GeoPoseReq with every required member."""
     camera = {
         "timestamp": 1732266000000,
         "sensorId": "camera",
@@ -48,7 +48,7 @@ def oscp_request(picture: bytes, place: dict[str, Any] | None = None) -> dict[st
 
 
 def gps(east_m: float, north_m: float, accuracy_m: float) -> dict[str, float]:
-    """A reading so far from the anchor."""
+    """Return a geolocation reading at an offset from the anchor."""
     frame = LocalFrame(ANCHOR["longitude"], ANCHOR["latitude"])
     ((longitude, latitude),) = frame.to_earth(np.array([[east_m, north_m]]))
     return {"latitude": float(latitude), "longitude": float(longitude), "accuracy": accuracy_m}
@@ -64,7 +64,7 @@ def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 
 @pytest.fixture(scope="module")
 def home(shipped: httpx.Client) -> str:
-    """The example flat on Earth, besides a flat 400 m to the north and one that is nowhere."""
+    """Id of the anchored example flat; another lies 400 m north, a third has no anchor."""
     upload(shipped, FLAT)
     north = {name: value for name, value in gps(0.0, 400.0, 0.0).items() if name != "accuracy"}
     upload(shipped, FLAT | {"anchor": north, "north_deg": 0})
@@ -72,7 +72,7 @@ def home(shipped: httpx.Client) -> str:
 
 
 def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
-    """An answer is a GeoPoseResp, and where the photograph was taken."""
+    """Check that an answer is a GeoPoseResp at the photograph's pose."""
     assert answer.keys() == {"id", "timestamp", "type", "accuracy", "geopose", "lalaloc"}
     assert (answer["id"], answer["timestamp"], answer["type"]) == ("r1", 1732266000123, "geopose")
     assert answer["accuracy"].keys() == {"position", "orientation"}
@@ -85,7 +85,7 @@ def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
     quaternion = answer["geopose"]["quaternion"]
     assert (quaternion["x"], quaternion["y"]) == (0.0, 0.0)
     assert math.hypot(quaternion["z"], quaternion["w"]) == pytest.approx(1.0)
-    # Direction of the camera's y axis: the image of (0, 1, 0), east and north.
+    # The camera's y axis, (0, 1, 0), rotated to east and north.
     z, w = quaternion["z"], quaternion["w"]
     true_deg = math.degrees(math.atan2(-2.0 * z * w, w * w - z * z))
     assert (true_deg - (pose["heading_deg"] - NORTH_DEG) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=5.0)
@@ -94,19 +94,19 @@ def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
 
 
 def test_query_by_plan_id(shipped: httpx.Client, home: str) -> None:
-    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes())
-    response = shipped.post("/geopose", params={"floorplan_id": home}, json=asked)
+    body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes())
+    response = shipped.post("/geopose", params={"floorplan_id": home}, json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), home, "kitchen.jpg")
     assert response.json()["lalaloc"]["warnings"] == []
 
 
 def test_query_by_geolocation(shipped: httpx.Client, home: str) -> None:
-    # Storeys of one house have one place.
+    # Storeys of a house share its anchor.
     upper = upload(shipped, FLAT | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
-    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(12.0, 8.0, 30.0))
-    asked["sensorReadings"]["wiFiReadings"] = [{"SSID": "x"}]
-    response = shipped.post("/geopose", json=asked)
+    body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(12.0, 8.0, 30.0))
+    body["sensorReadings"]["wiFiReadings"] = [{"SSID": "x"}]
+    response = shipped.post("/geopose", json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), home, "kitchen.jpg")
     assert "wiFiReadings are not used" in response.json()["lalaloc"]["warnings"]
@@ -119,33 +119,33 @@ def test_query_in_a_venue_ignores_a_wrong_reading(shipped: httpx.Client, home: s
     plain = upload(shipped, HOME)
     anchor = ANCHOR | {"north_deg": NORTH_DEG}
     venue = shipped.post("/venues", json={"plans": [{"floorplan_id": plain, "level": 2}], "anchor": anchor}).json()
-    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(900.0, 0.0, 20.0))
-    response = shipped.post("/geopose", params={"venue_id": venue["id"]}, json=asked)
+    body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(900.0, 0.0, 20.0))
+    response = shipped.post("/geopose", params={"venue_id": venue["id"]}, json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), plain, "kitchen.jpg")
     assert response.json()["lalaloc"]["level"] == 2.0
     [warning] = response.json()["lalaloc"]["warnings"]
     assert "geolocation reading" in warning
-    in_plan = shipped.post("/geopose", params={"floorplan_id": home}, json=asked).json()
+    in_plan = shipped.post("/geopose", params={"floorplan_id": home}, json=body).json()
     assert "its accuracy is 20 m: it was not used" in in_plan["lalaloc"]["warnings"][0]
-    bare = shipped.post("/geopose", params={"floorplan_id": plain}, json=asked)
+    bare = shipped.post("/geopose", params={"floorplan_id": plain}, json=body)
     assert_problem(bare, 409, "floorplan-unanchored")
 
 
 def _camera(**changes: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda asked: asked["sensorReadings"]["cameraReadings"][0].update(changes)
+    return lambda request: request["sensorReadings"]["cameraReadings"][0].update(changes)
 
 
-def _asked(**changes: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda asked: asked.update(changes)
+def _request(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda request: request.update(changes)
 
 
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
-    "no id": (lambda asked: asked.pop("id"), "id", "is missing"),
-    "another type": (_asked(type="vps"), "type", "must be 'geopose'"),
-    "no readings": (lambda asked: asked.pop("sensorReadings"), "sensorReadings", "is missing"),
-    "no camera reading": (_asked(sensorReadings={}), "sensorReadings.cameraReadings", "is missing"),
-    "no picture": (_asked(sensorReadings={"cameraReadings": []}), "sensorReadings.cameraReadings", "1 are needed"),
+    "no id": (lambda request: request.pop("id"), "id", "is missing"),
+    "another type": (_request(type="vps"), "type", "must be 'geopose'"),
+    "no readings": (lambda request: request.pop("sensorReadings"), "sensorReadings", "is missing"),
+    "no camera reading": (_request(sensorReadings={}), "sensorReadings.cameraReadings", "is missing"),
+    "no picture": (_request(sensorReadings={"cameraReadings": []}), "sensorReadings.cameraReadings", "1 are needed"),
     "no base64": (_camera(imageBytes="***"), "sensorReadings.cameraReadings.0.imageBytes", "is not Base64"),
     "depth": (_camera(imageFormat="DEPTH"), "sensorReadings.cameraReadings.0.imageFormat", "colours"),
     "a pinhole": (_camera(params={"model": "PINHOLE"}), "sensorReadings.cameraReadings.0.params.model", "full 360°"),
@@ -154,7 +154,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
         "sensorReadings.cameraReadings.0.imageOrientation",
         "upright",
     ),
-    "no sensor": (_asked(sensors=[]), "sensorReadings.cameraReadings.0.sensorId", "no camera with this id"),
+    "no sensor": (_request(sensors=[]), "sensorReadings.cameraReadings.0.sensorId", "no camera with this id"),
     "no place": (lambda _: None, "sensorReadings.geolocationReadings", "without floorplan_id and venue_id"),
 }
 
@@ -163,9 +163,9 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
 def test_missing_and_invalid_members_are_refused(
     client: httpx.Client, panorama: bytes, change: Callable[[dict[str, Any]], None], field: str, words: str
 ) -> None:
-    asked = oscp_request(panorama)
-    change(asked)
-    problem = assert_problem(client.post("/geopose", json=asked), 422, "invalid-request")
+    body = oscp_request(panorama)
+    change(body)
+    problem = assert_problem(client.post("/geopose", json=body), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [field]
     assert words in problem["detail"]
 

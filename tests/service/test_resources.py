@@ -1,4 +1,4 @@
-"""Plans as resources: paging, names, entity tags, revisions, deletion."""
+"""Tests of plan resources: paging, names, entity tags, revisions, deletion."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upl
 from tests.service.postgres import PostgresServer
 
 NEVER = "0123456789abcdef" * 2
-# Large enough for its grid to take a while, and not all of a test.
+# Large enough that its grid is still in preparation when the test looks.
 HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
 
 
 def _hall(step_m: float = 0.25) -> dict[str, Any]:
-    """Settings under which the hall takes a while, and its grid is left to the background."""
+    """Return settings under which the grid of the hall is prepared slowly in the background."""
     return {"grid_step_m": step_m, "inline_grid_poses": 100}
 
 
@@ -37,7 +37,7 @@ def _named(name: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def listed(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, list[str]]]:
-    """An app with seven plans, and their ids from old to new."""
+    """App with seven plans, and their ids from old to new."""
     names = ["Flat 1", "flat 2", "House", "FLAT_3", "100% flat", "Ärger", "house 2"]
     with start_app(tmp_path_factory.mktemp("data")) as client:
         yield client, [upload(client, _named(name), wait=False) for name in names]
@@ -68,7 +68,7 @@ def test_paging_is_stable_under_changes(start_app: StartApp, tmp_path: Path) -> 
         ids = [upload(client, wait=False) for _ in range(4)]
         first = client.get("/floorplans", params={"limit": 2}).json()
         upload(client, wait=False)
-        # The place is found also when the plan that it stands at is gone.
+        # The cursor works after its plan is deleted.
         client.delete(f"/floorplans/{ids[2]}")
         second = client.get("/floorplans", params={"limit": 5, "cursor": first["next_cursor"]}).json()
         assert [plan["id"] for plan in first["floorplans"]] == [ids[3], ids[2]]
@@ -94,7 +94,7 @@ def test_plans_are_found_by_part_of_their_name(
         ({"cursor": "x"}, "cursor"),
         ({"cursor": "A" * 33}, "cursor"),
         ({"cursor": "é" * 32}, "cursor"),
-        # A moment after the last one that there is.
+        # A moment beyond the largest datetime.
         ({"cursor": "_" * 32}, "cursor"),
         ({"limit": 0}, "limit"),
         ({"limit": 501}, "limit"),
@@ -145,8 +145,8 @@ def test_matching_tag_gets_304(client: httpx.Client, path: str) -> None:
         assert again.headers["cache-control"] == "private, no-cache"
     lines = client.get(url, headers=[("If-None-Match", '"other"'), ("If-None-Match", etag)])
     assert lines.status_code == 304
-    for other in ('"other"', 'W/"other"', etag.upper().replace("F", "0")[:-1] + '0"'):
-        changed = client.get(url, headers={"If-None-Match": other})
+    for tag in ('"other"', 'W/"other"', etag.upper().replace("F", "0")[:-1] + '0"'):
+        changed = client.get(url, headers={"If-None-Match": tag})
         assert (changed.status_code, changed.content) == (200, first.content)
     assert "etag" not in client.get("/floorplans").headers
 
@@ -178,7 +178,7 @@ def test_tag_identifies_bytes_while_preparing(start_app: StartApp, tmp_path: Pat
         bodies.setdefault(answer.headers["etag"], set()).add(answer.content)
         assert len(bodies) > 2
         assert all(len(same) == 1 for same in bodies.values())
-        # Progress is no other revision: any of them may be named by who replaces the plan.
+        # Progress does not change the revision, so each tag is valid in If-Match.
         replaced = client.put(url, json=HALL, headers={"If-Match": created.headers["etag"]})
         assert replaced.status_code == 200
 
@@ -210,10 +210,10 @@ def test_kept_revisions_can_be_read(start_app: StartApp, tmp_path: Path) -> None
         url, revisions = created.headers["location"], [created.json()["revision"]]
         revisions += [client.put(url, json=_named(f"Flat {n}")).json()["revision"] for n in (4, 5)]
         for revision, name, status in ((revisions[1], "Flat 4", "superseded"), (revisions[2], "Flat 5", "ready")):
-            told = client.get(url, params={"revision": revision}).json()
-            assert (told["revision"], told["name"], told["status"]) == (revision, name, status)
-        other = client.post("/floorplans", json=FLAT).json()["revision"]
-        for unknown in (revisions[0], other, NEVER, "x", ""):
+            plan = client.get(url, params={"revision": revision}).json()
+            assert (plan["revision"], plan["name"], plan["status"]) == (revision, name, status)
+        foreign = client.post("/floorplans", json=FLAT).json()["revision"]
+        for unknown in (revisions[0], foreign, NEVER, "x", ""):
             assert_problem(client.get(url, params={"revision": unknown}), 404, "unknown-revision")
 
 
@@ -313,7 +313,7 @@ def test_replacing_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
         assert client.put(f"/floorplans/{plan_id}", json=FLAT).status_code == 200
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
-        # Long before the first one would have been done.
+        # The first preparation would have taken much longer.
         wait_for(lambda: "lalaloc_grids_pending 0.0" in client.get("/metrics").text, 5.0)
 
 
@@ -350,7 +350,7 @@ def test_queries_run_while_a_large_plan_is_prepared(start_app: StartApp, tmp_pat
 
 @pytest.fixture
 def replicas(postgres: PostgresServer, start_app: StartApp, tmp_path: Path) -> Iterator[list[httpx.Client]]:
-    """Two apps on one PostgreSQL."""
+    """Two apps on one PostgreSQL database."""
     shared = {"database_url": postgres.new_database(), "sweep_s": 0.2}
     with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:
         yield [first, second]
@@ -373,5 +373,5 @@ def test_replicas_see_changes_at_once(replicas: list[httpx.Client], panorama: by
     assert first.delete(url).status_code == 204
     assert_problem(second.get(url), 404, "unknown-floorplan")
     assert_problem(localise(second, created["id"], panorama), 404, "unknown-floorplan")
-    # Neither keeps anything of it in memory.
+    # Both caches are empty.
     wait_for(lambda: _cached_bytes(first) == _cached_bytes(second) == 0, 10.0)

@@ -1,4 +1,4 @@
-"""Access: scopes of every route with keys, local requests only without keys."""
+"""Tests of access control: scopes of every route with keys, local requests only without keys."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _HTTP_METHODS = {"get", "put", "post", "delete", "patch", "options", "head", "tr
 
 
 def _documented() -> list[tuple[str, str]]:
-    """Method and path of every operation in the API description but those about health."""
+    """Return method and path of every operation in the API description except health checks."""
     paths = create_app().openapi()["paths"]
     return [
         (method.upper(), path)
@@ -67,7 +67,7 @@ def _documented() -> list[tuple[str, str]]:
 
 
 def _served() -> set[tuple[str, str]]:
-    """Method and path of everything that the app answers, documented or not."""
+    """Return method and path of every route of the app, documented or not."""
     free = OPEN_PATHS | PAGES
     routes = [context for context in iter_route_contexts(create_app().routes) if context.path not in free]
     assert all(route.methods for route in routes), "websockets and mounted apps have no scopes"
@@ -81,7 +81,7 @@ ABOUT_A_PLAN = [operation for operation in OPERATIONS if PLAN in operation[1] or
 def make_key(
     store: Store, *, tenant: str = "ours", scopes: tuple[str, ...] = EVERYTHING, rate_per_minute: int | None = None
 ) -> str:
-    """Store a key, as the command line does; gives its text."""
+    """Store a key as the command line does and return its text."""
     secret = new_secret()
     return key_text(
         store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute).id, secret
@@ -89,18 +89,18 @@ def make_key(
 
 
 def bearer(key: str) -> dict[str, str]:
-    """The header that a key is sent in."""
+    """Return the header for a key."""
     return {"Authorization": f"Bearer {key}"}
 
 
 def id_of(key: str) -> str:
-    """The id in a key's text."""
+    """Return the id in a key's text."""
     return key.split("_")[1]
 
 
 @dataclass(frozen=True)
 class Guarded:
-    """A running app with keys on, with a plan of the tenant "ours" in it."""
+    """Running app with keys and a plan of the tenant "ours"."""
 
     client: httpx.Client
     store: Store
@@ -108,22 +108,22 @@ class Guarded:
     key: str
 
     def send(self, method: str, path: str, key: str | None, plan_id: str | None = None) -> httpx.Response:
-        """Send a request that is right but for its key."""
+        """Send a request that is valid except for its key."""
         plan_id = plan_id or self.plan_id
         body: dict[str, Any] = {}
         if f"{{{VENUE}}}" in path:
             made = self.client.post("/venues", json={}, headers=bearer(self.key)).json()
             path = path.replace(f"{{{VENUE}}}", made["id"])
         picture = ("p.jpg", encode_picture(512, 256, "JPEG"), "image/jpeg")
-        asked = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": picture}}
+        form = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": picture}}
         if "{answer_id}" in path:
-            kept = self.client.post("/localise", headers=bearer(self.key), **asked).json()
+            kept = self.client.post("/localise", headers=bearer(self.key), **form).json()
             path = path.replace("{answer_id}", kept["answer_id"])
         if path == "/localise":
-            body = asked
+            body = form
         elif path == "/geopose":
-            told = {"plans": [{"floorplan_id": plan_id}], "anchor": {"latitude": 48.0, "longitude": 11.0}}
-            made = self.client.post("/venues", json=told, headers=bearer(self.key)).json()
+            venue = {"plans": [{"floorplan_id": plan_id}], "anchor": {"latitude": 48.0, "longitude": 11.0}}
+            made = self.client.post("/venues", json=venue, headers=bearer(self.key)).json()
             body = {"json": oscp_request(picture[1]), "params": {"venue_id": made["id"]}}
         elif path == "/localise/sequence":
             body = {"data": {PLAN: plan_id}, "files": [("panorama", picture)] * 2}
@@ -158,7 +158,7 @@ def test_every_route_has_a_scope() -> None:
     assert served - set(NEEDED) == set(), "these routes are closed to everybody: give them a row in NEEDED"
     assert set(NEEDED) - served == set(), "these routes are gone"
     assert set(OPERATIONS) <= served
-    # Paths are compared without the slash that the framework would redirect from.
+    # The framework redirects from a trailing slash, so paths are compared without it.
     assert all(path == "/" or not path.endswith("/") for _, path in NEEDED)
 
 
@@ -179,9 +179,9 @@ def test_only_health_works_without_a_valid_key(guarded: Guarded, method: str, pa
 @pytest.mark.parametrize(("method", "path"), OPERATIONS)
 def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: str) -> None:
     needed = NEEDED[method, path]
-    others = tuple(permission for permission in EVERYTHING if permission != needed)
+    scopes = tuple(permission for permission in EVERYTHING if permission != needed)
     problem = assert_problem(
-        guarded.send(method, path, make_key(guarded.store, scopes=others)), 403, "insufficient-scope"
+        guarded.send(method, path, make_key(guarded.store, scopes=scopes)), 403, "insufficient-scope"
     )
     assert f"'{needed}'" in problem["detail"]
 
@@ -203,9 +203,9 @@ def test_plan_of_another_tenant_does_not_exist(guarded: Guarded, method: str, pa
     never = "0123456789abcdef" * 2
     mine, unknown = guarded.send(method, path, theirs), guarded.send(method, path, theirs, never)
     problem = assert_problem(mine, 404, "unknown-floorplan")
-    told = assert_problem(unknown, 404, "unknown-floorplan")
-    assert problem["detail"].replace(guarded.plan_id, never) == told["detail"]
-    # It is still there for those whose it is.
+    expected = assert_problem(unknown, 404, "unknown-floorplan")
+    assert problem["detail"].replace(guarded.plan_id, never) == expected["detail"]
+    # The owner still reads it.
     assert guarded.send("GET", f"/floorplans/{{{PLAN}}}", guarded.key).json()["name"] == FLAT["name"]
 
 
@@ -292,8 +292,8 @@ def test_invalid_keys_get_the_same_message(guarded: Guarded) -> None:
         "wrong secret": key_text(id_of(guarded.key), new_secret()),
         "the secret of another": key_text("f" * 32, guarded.key.split("_", 2)[2]),
     }
-    told = {guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}
-    assert len(told) == 1
+    details = {guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}
+    assert len(details) == 1
 
 
 @pytest.mark.parametrize(
@@ -406,7 +406,7 @@ def test_api_description_states_scopes_and_refusals() -> None:
         assert "security" not in document["paths"][path]["get"]
 
 
-# --- rates ------------------------------------------------------------------------------------------------------------
+# --- Rates ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.one_replica
@@ -423,7 +423,7 @@ def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: Datab
                 assert 1 <= int(refused.headers["retry-after"]) <= 60
             return sum(answer.status_code == 200 for answer in answers)
 
-        # One more where the clock's minute ends meanwhile.
+        # A minute that ends during the test allows one request more.
         assert 5 <= accepted(usual) <= 6
         assert 9 <= accepted(more) <= 10
         assert accepted(unlimited) == 20
@@ -488,7 +488,7 @@ def test_address_counters_are_bounded(
     assert asyncio.run(count()) <= 2 * 1024
 
 
-# --- the database away ------------------------------------------------------------------------------------------------
+# --- Without the database ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.one_replica
@@ -498,7 +498,7 @@ def test_known_keys_work_without_the_database(
     url = postgres.new_database()
     with start_app(tmp_path, api_keys=True, database_url=url, key_cache_s=0.1) as client:
         store = Store(url)
-        key, other = make_key(store), make_key(store)
+        key, new_key = make_key(store), make_key(store)
         client.headers.update(bearer(key))
         plan_id = upload(client)
         assert localise(client, plan_id, panorama, refine="none").status_code == 200
@@ -508,12 +508,12 @@ def test_known_keys_work_without_the_database(
             sleep(0.2)
             assert localise(client, plan_id, panorama, refine="none").status_code == 200
             assert client.get("/limits").status_code == 200
-            unknown = client.get("/limits", headers=bearer(other))
+            unknown = client.get("/limits", headers=bearer(new_key))
             assert_problem(unknown, 503, "store-unavailable")
             assert "retry-after" in unknown.headers
         finally:
             postgres.start()
-        wait_for(lambda: client.get("/limits", headers=bearer(other)).status_code == 200, 10.0)
+        wait_for(lambda: client.get("/limits", headers=bearer(new_key)).status_code == 200, 10.0)
 
 
 def test_key_is_cached_ten_minutes_without_database(tmp_path: Path) -> None:
@@ -526,7 +526,7 @@ def test_key_is_cached_ten_minutes_without_database(tmp_path: Path) -> None:
         key = asyncio.run(ring.find(presented))
         assert key is not None
         wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
-        # The only connection is taken, so nobody else has one.
+        # The only connection is in use.
         with store._database.reading():
             for clock_s[0] in (1004.0, 1006.0, 1300.0, 1600.0):
                 assert asyncio.run(ring.find(presented)) == key
@@ -553,12 +553,12 @@ def test_busy_database_does_not_extend_the_key_cache(tmp_path: Path) -> None:
         assert key is not None
         wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
         with store._database.reading():
-            # As if others were answered all the while.
+            # Other queries succeed in the meantime.
             store._database._answered_s = float("inf")
             clock_s[0] = 1006.0
             with pytest.raises(StoreBusyError):
                 asyncio.run(ring.find(presented))
-        # Nor is it left alone for a moment.
+        # A busy database is queried again at the next request.
         again = asyncio.run(ring.find(presented))
         assert again is not None
         assert again.id == key.id
@@ -567,7 +567,7 @@ def test_busy_database_does_not_extend_the_key_cache(tmp_path: Path) -> None:
         store.close()
 
 
-# --- without keys -----------------------------------------------------------------------------------------------------
+# --- Without keys -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -593,7 +593,7 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
 
 
 @pytest.mark.parametrize(
-    ("told", "status"),
+    ("options", "status"),
     [
         ({}, 403),
         ({"published_on": "0.0.0.0:8000"}, 403),
@@ -602,7 +602,7 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
     ],
 )
 def test_remote_requests_without_keys_are_refused(
-    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, told: dict[str, Any], status: int
+    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, options: dict[str, Any], status: int
 ) -> None:
     settings = Settings(
         data_dir=tmp_path,
@@ -610,15 +610,15 @@ def test_remote_requests_without_keys_are_refused(
         bundle=tiny_bundle,
         workers=0,
         log_level="error",
-        **told,
+        **options,
     )
     app = create_app(settings)
 
-    async def from_elsewhere(scope: Scope, receive: Receive, send: Send) -> None:
-        # As if the connection had come in over the network.
+    async def from_network(scope: Scope, receive: Receive, send: Send) -> None:
+        # Pretend that the connection came over the network.
         await app({**scope, "server": ("192.0.2.1", 8000)} if scope["type"] == "http" else scope, receive, send)
 
-    with serve(from_elsewhere) as base_url, httpx.Client(base_url=base_url) as client:  # pyright: ignore[reportArgumentType]
+    with serve(from_network) as base_url, httpx.Client(base_url=base_url) as client:  # pyright: ignore[reportArgumentType]
         assert client.get("/healthz").status_code == 200
         wait_for(lambda: client.get("/readyz").status_code == 200)
         for path in ("/", "/docs", "/openapi.json", "/metrics", "/limits", "/floorplans"):
@@ -671,8 +671,8 @@ def test_allowed_hosts_and_pages_are_accepted(
     start_app: StartApp, tmp_path: Path, settings: dict[str, Any], status: int
 ) -> None:
     with start_app(tmp_path, **settings) as client:
-        elsewhere = {"Host": "plans.example:8000", "Origin": "https://plans.example"}
-        assert client.post("/floorplans", json=FLAT, headers=elsewhere).status_code == status
+        headers = {"Host": "plans.example:8000", "Origin": "https://plans.example"}
+        assert client.post("/floorplans", json=FLAT, headers=headers).status_code == status
 
 
 @pytest.mark.parametrize("name", ["plans.example:8443", "https://plans.example", "*.example", "[2001:db8::1]", "a b"])

@@ -1,4 +1,4 @@
-"""The store, on SQLite and on PostgreSQL."""
+"""Tests of the store on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 

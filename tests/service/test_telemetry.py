@@ -1,4 +1,4 @@
-"""Log lines, trace context, metrics, spans, dashboard."""
+"""Tests of log lines, trace context, metrics, spans and the dashboard."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _HEX_16 = st.text("0123456789abcdef", min_size=16, max_size=16)
 
 
 class Log:
-    """The lines that the service wrote since it was attached."""
+    """Log lines of the service since the handler was attached."""
 
     def __init__(self) -> None:
         self._stream = io.StringIO()
@@ -51,12 +51,12 @@ class Log:
         return self._stream.getvalue()
 
     def of_request(self, request_id: str) -> list[dict[str, Any]]:
-        """The lines "request" of one request, once there is one: it is written after the answer."""
+        """Return the "request" lines of a request; waits, because they follow the answer."""
         wait_for(lambda: any(line["message"] == "request" for line in self._of(request_id)), 10.0)
         return [line for line in self._of(request_id) if line["message"] == "request"]
 
     def all_of(self, request_id: str) -> list[dict[str, Any]]:
-        """All lines of one request, once it is over."""
+        """Return all lines of a request, after its end."""
         self.of_request(request_id)
         return self._of(request_id)
 
@@ -67,7 +67,7 @@ class Log:
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The app with its lines about requests."""
+    """App that logs requests."""
     with start_app(tmp_path_factory.mktemp("data"), log_level="debug") as started:
         yield started
 
@@ -77,7 +77,7 @@ def log() -> Iterator[Log]:
     """Log lines of the test."""
     attached = Log()
     logger = logging.getLogger(LOGGER_NAME)
-    # An app that another test started may have set another level for all of this process.
+    # Another test's app can have set another level for this process.
     level = logger.level
     logger.setLevel(logging.DEBUG)
     logger.addHandler(attached.handler)
@@ -87,7 +87,7 @@ def log() -> Iterator[Log]:
 
 
 def _metric(client: httpx.Client, sample: str) -> float:
-    """The value of one sample, 0 where there is none yet."""
+    """Return the value of a sample; 0 if there is none yet."""
     match = re.search(rf"^{re.escape(sample)} (\S+)$", client.get("/metrics").text, re.MULTILINE)
     return float(match[1]) if match else 0.0
 
@@ -111,8 +111,8 @@ def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> N
     found = client.get(f"/floorplans/{plan_id}")
     (line,) = log.of_request(found.headers["x-request-id"])
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", plan_id)
-    other = client.get("/floorplans/not-an-id")
-    (line,) = log.of_request(other.headers["x-request-id"])
+    response = client.get("/floorplans/not-an-id")
+    (line,) = log.of_request(response.headers["x-request-id"])
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", None)
 
 
@@ -257,11 +257,11 @@ def test_metric_labels_are_bounded(client: httpx.Client) -> None:
 def test_dashboard_uses_existing_metrics(client: httpx.Client) -> None:
     dashboard = json.loads((ROOT / "docker" / "grafana" / "lalaloc.json").read_text(encoding="utf-8"))
     expressions = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
-    asked = {name for text in expressions for name in re.findall(r"\b(?:lalaloc|process)_\w+", text)}
+    queried = {name for text in expressions for name in re.findall(r"\b(?:lalaloc|process)_\w+", text)}
     kinds = dict(re.findall(r"^# TYPE (\S+) (\S+)$", client.get("/metrics").text, re.MULTILINE))
     buckets = {f"{name}_bucket" for name, kind in kinds.items() if kind == "histogram"}
-    assert {"lalaloc_stage_seconds_bucket", "lalaloc_grid_cache_bytes", "lalaloc_rejections_total"} <= asked
-    assert sorted(asked - kinds.keys() - buckets) == []
+    assert {"lalaloc_stage_seconds_bucket", "lalaloc_grid_cache_bytes", "lalaloc_rejections_total"} <= queried
+    assert sorted(queried - kinds.keys() - buckets) == []
     assert all(expression.count("{") == expression.count("}") for expression in expressions)
 
 
@@ -314,7 +314,7 @@ def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: 
     ):
         plan_id = upload(client, FLAT)
         answered = localise(client, plan_id, panorama, refine="vdr").headers["traceparent"].split("-")
-        # Sent in batches, the last when the service stops; this one need not wait for it.
+        # Spans are sent in batches; the test does not wait for the last batch.
         wait_for(lambda: any(span.name == "POST /localise" for span in received), 20.0)
     (request,) = [span for span in received if span.name == "POST /localise"]
     assert (request.trace_id.hex(), request.span_id.hex()) == (answered[1], answered[2])
@@ -325,14 +325,16 @@ def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: 
 
 @contextmanager
 def _collector() -> Iterator[tuple[str, list[Any]]]:
-    """A collector that keeps the spans it is sent."""
+    """Run a collector that keeps the spans it receives."""
     received: list[Any] = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["content-length"]))
             message = ExportTraceServiceRequest.FromString(body)
-            received.extend(span for one in message.resource_spans for scope in one.scope_spans for span in scope.spans)
+            received.extend(
+                span for resource in message.resource_spans for scope in resource.scope_spans for span in scope.spans
+            )
             self.send_response(200)
             self.send_header("content-length", "0")
             self.end_headers()
