@@ -213,7 +213,7 @@ def test_unanchored_venue_has_no_geopose(client: httpx.Client, panorama: bytes) 
     response = client.post("/localise", data=fields, files={"panorama": panorama}, headers=headers)
     assert "nor has venue" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
     picture = client.post("/localise", data=fields, files={"panorama": panorama}, headers={"Accept": "image/png"})
-    assert "a picture is of one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
+    assert "a picture shows one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
 
 
 def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes) -> None:
