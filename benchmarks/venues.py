@@ -86,7 +86,7 @@ def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> 
     for number in range(1, times):
         variants = [_variant(block, rng) for block in blocks]
         # One sort of all variants is faster than one per variant.
-        cell = shipped_cells().sort(np.concatenate(variants))
+        cell = shipped_cells().assign(np.concatenate(variants))
         ends = np.cumsum([len(block) for block in variants])
         for block, own in zip(variants, np.split(cell, ends[:-1]), strict=True):
             block["cell"] = own
