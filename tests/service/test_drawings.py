@@ -103,7 +103,7 @@ def test_queue_is_bounded_and_abandoned_jobs_are_cancelled(drawings: Drawings, r
     async def request() -> None:
         first = await _started(drawings.svg(_record("one"), None))
         abandoned = await _started(drawings.svg(_record("two"), None))
-        with pytest.raises(OverloadedError, match="2 others"):
+        with pytest.raises(OverloadedError, match="2 requests are in progress"):
             await drawings.svg(_record("three"), None)
         # The client disconnects.
         abandoned.cancel()

@@ -209,7 +209,7 @@ BAD_PICTURES = {
     "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
     "portrait": (encode_picture(256, 512, "JPEG"), "256 x 512"),
     "square": (encode_picture(256, 256, "PNG"), "twice as wide"),
-    "tiny": (encode_picture(64, 32, "PNG"), "at least 64"),
+    "tiny": (encode_picture(64, 32, "PNG"), "the minimum is 64"),
 }
 
 

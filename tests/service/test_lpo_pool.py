@@ -154,8 +154,8 @@ def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> N
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
         # Two jobs run, and four fill one client's share of the queue.
-        waiting = [threads.submit(_refine, pool, job, 10.0) for _ in range(6)]
-        wait_for(lambda: pool._workers.waiting == 4, 8.0)
+        waiting = [threads.submit(_refine, pool, job, 60.0) for _ in range(6)]
+        wait_for(lambda: pool._workers.waiting == 4, 30.0)
         begin = monotonic()
         assert _refine(pool, job, 20.0) is None
         assert monotonic() - begin < 0.5
