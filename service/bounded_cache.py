@@ -36,7 +36,7 @@ class BoundedCache(Generic[K, V]):
 
     @property
     def bytes(self) -> int:
-        """Bytes of all values."""
+        """Total size of the values in bytes."""
         return int(self._values.currsize)
 
     def get(self, key: K) -> V | None:

@@ -17,7 +17,7 @@ _MAX_WORKERS = 64
 class CoreShares:
     """Numbers of computing threads.
 
-    `workers` times `worker_threads` compute in LPO workers, `compute_threads` times `onnx_threads` in the main process.
+    LPO workers run `workers` times `worker_threads` threads, the main process `compute_threads` times `onnx_threads`.
     """
 
     workers: int
@@ -27,23 +27,23 @@ class CoreShares:
 
     @property
     def total(self) -> int:
-        """Threads that compute under full load."""
+        """Number of threads that compute under full load."""
         return self.workers * self.worker_threads + self.compute_threads * self.onnx_threads
 
 
 def share_cores(
     cores: int, *, workers: int | None, worker_threads: int, compute_threads: int, onnx_threads: int
 ) -> CoreShares:
-    """Resolve open numbers from the shares of queries and LPO, with at least one thread each.
+    """Return the numbers of threads, and choose those left open, with at least one thread each.
 
     On fewer than four cores there is one thread more than cores, because a single LPO worker is mostly idle.
 
     Args:
         cores: usable cores.
-        workers: LPO workers; None: open, 0: none.
-        worker_threads: threads per worker; 0: one, which is most efficient.
-        compute_threads: queries at a time; 0: open.
-        onnx_threads: threads per network; 0: one, which is most efficient.
+        workers: LPO workers; 0 for none, None to choose by LPO's share of the cores.
+        worker_threads: threads per worker; 0 for the default of one, which is most efficient.
+        compute_threads: queries at a time; 0 to use the remaining cores.
+        onnx_threads: threads per network; 0 for the default of one, which is most efficient.
     """
     worker_threads, onnx_threads = worker_threads or 1, onnx_threads or 1
     if workers is None:

@@ -2,10 +2,11 @@
 
 A client is a tenant or, without API keys, a client address. There are two rules and no settings:
 
-* A client can take one more only while it holds fewer than three times the number that would then be left. Alone it
-  gets three quarters; n greedy clients get 3 / (3n + 1) each, and the rest is left for new clients (dynamic thresholds:
-  Choudhury and Hahne, IEEE/ACM Transactions on Networking 6(2), 1998).
-* Waiting jobs are served round-robin by client, so a client with one job waits for at most one job of every other.
+* A client gets one more unit only while it holds fewer than three times the units that then stay free. A client alone
+  gets three quarters of the total; n greedy clients get 3 / (3n + 1) each, and the remainder stays free for new clients
+  (dynamic thresholds: Choudhury and Hahne, IEEE/ACM Transactions on Networking 6(2), 1998).
+* Waiting jobs are served round-robin by client, so a client with one job waits for at most one job of each other
+  client.
 """
 
 from __future__ import annotations
@@ -17,25 +18,25 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-# A client can hold this many times the number that it leaves.
-_TIMES_WHAT_IS_LEFT = 3
+# Largest ratio of the units of a client to the units that stay free.
+_MAX_RATIO = 3
 
 
 def with_headroom(count: int) -> int:
-    """Return the limit at which a client that is alone gets `count`."""
-    return count + -(-count // _TIMES_WHAT_IS_LEFT)
+    """Return the limit at which a client that is alone gets `count` units."""
+    return count + -(-count // _MAX_RATIO)
 
 
 def max_per_client(limit: int) -> int:
-    """Return the number, at least one, that a client can hold of `limit` while it is alone."""
-    return max(limit * _TIMES_WHAT_IS_LEFT // (_TIMES_WHAT_IS_LEFT + 1), 1)
+    """Return the number of units, at least one, that a client alone can hold of `limit`."""
+    return max(limit * _MAX_RATIO // (_MAX_RATIO + 1), 1)
 
 
 class Shares:
-    """Holdings per client. Not thread-safe: for one event loop, or under the owner's lock.
+    """Units held per client. Not thread-safe: for one event loop, or under the owner's lock.
 
     Args:
-        limit: total number.
+        limit: total number of units.
     """
 
     def __init__(self, limit: int) -> None:
@@ -44,25 +45,25 @@ class Shares:
         self._held: Counter[Hashable] = Counter()
 
     def held_by(self, client: Hashable) -> int:
-        """Return the holdings of a client."""
+        """Return the number of units that a client holds."""
         return self._held[client]
 
     def may_take(self, client: Hashable) -> bool:
-        """Return True if a client can take one more."""
+        """Return True if a client can take one more unit."""
         held, left = self._held[client], self.limit - self.in_use - 1
-        return left >= 0 and (held == 0 or held < _TIMES_WHAT_IS_LEFT * left)
+        return left >= 0 and (held == 0 or held < _MAX_RATIO * left)
 
     def take(self, client: Hashable) -> None:
-        """Count one more for a client, without a check."""
+        """Count one more unit for a client, without a check."""
         self.in_use += 1
         self._held[client] += 1
 
     def give_back(self, client: Hashable) -> None:
-        """Count one less for a client."""
+        """Count one unit less for a client."""
         self.in_use -= 1
         self._held[client] -= 1
         if not self._held[client]:
-            # Keeps the counter from growing with every client seen.
+            # Without this the counter would grow with every new client.
             del self._held[client]
 
 
@@ -125,7 +126,7 @@ class FairSemaphore:
         self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
 
     async def acquire(self, client: Hashable) -> None:
-        """Wait for a permit, which must be released."""
+        """Wait for a permit; the caller must release it."""
         permit = asyncio.get_running_loop().create_future()
         self._waiting.append(client, permit)
         self._grant()
@@ -133,7 +134,7 @@ class FairSemaphore:
             await permit
         except asyncio.CancelledError:
             if permit.done() and not permit.cancelled():
-                # The permit came at the moment when the wait was cancelled.
+                # The permit was granted as the wait was cancelled.
                 self.release(client)
             raise
 

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class Threads:
-    """Threads for blocking calls of one event loop, shared fairly between clients; admission bounds the queue.
+    """Threads for blocking calls of one event loop, shared fairly between clients; admission control bounds the queue.
 
     Args:
         name: prefix of thread names.
@@ -29,12 +29,12 @@ class Threads:
         self._semaphore = FairSemaphore(count)
 
     async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a call for a client and return its result; a call that has begun always runs to its end."""
+        """Run a call for a client and return its result; a call that has begun is never cancelled."""
         await self._semaphore.acquire(client)
         loop = asyncio.get_running_loop()
 
         def release(_future: Future[T]) -> None:
-            # The loop may be closed.
+            # The loop can be closed already.
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(self._semaphore.release, client)
 
@@ -43,7 +43,7 @@ class Threads:
         except BaseException:
             self._semaphore.release(client)
             raise
-        # Released when the thread is done, even if the caller has left.
+        # Released when the thread is done, even if the caller was cancelled.
         future.add_done_callback(release)
         return await asyncio.wrap_future(future)
 
@@ -57,11 +57,11 @@ class Threads:
 
 
 class BoundedReads:
-    """Reads of the store with a timeout, also while the store hangs.
+    """Reads of the store with a timeout, which also applies while the store hangs.
 
     Args:
         threads: number of threads.
-        max_pending: reads that can run or wait; bounds the threads and requests lost to a hanging store.
+        max_pending: limit of running and waiting reads; bounds the threads and requests that a hanging store blocks.
         wait_s: timeout of a read.
     """
 

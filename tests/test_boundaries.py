@@ -1,4 +1,4 @@
-"""The architecture as a test: imports point down, and the numpy side never meets torch."""
+"""Tests of the architecture: modules import lower layers only, and the numpy side never loads torch."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# The one place where layers are written down. A module has the layer of its longest listed prefix, and may import
-# from lower layers and from its own layer in its own folder.
+# Layers of the modules. A module has the layer of its longest listed prefix, and can import from lower layers and from
+# its own layer in its own folder.
 LAYERS = {
     "lalaloc_core.errors": 0,
     "lalaloc_core.conventions": 0,
@@ -42,7 +42,7 @@ LAYERS = {
     "lalaloc_core.importers.formats": 5,
     "lalaloc_core.importers.registry": 3,
     "lalaloc_core.importers": 6,
-    # The wing that learns.
+    # Training.
     "lalaloc_core.learn.metrics": 1,
     "lalaloc_core.learn.azimuth_metrics": 1,
     "lalaloc_core.learn.synth.records": 2,
@@ -53,14 +53,14 @@ LAYERS = {
     "lalaloc_core.learn.synth.augmentation": 4,
     "lalaloc_core.learn.synth.scene": 4,
     "lalaloc_core.learn.synth.rendering": 5,
-    # Independent of synth: neither may import the other.
+    # Independent of synth; neither imports the other.
     "lalaloc_core.learn.heldout": 3,
     "lalaloc_core.learn.data": 5,
     "lalaloc_core.learn.data.synthetic": 6,
     "lalaloc_core.learn.training": 7,
     "lalaloc_core.learn.export": 9,
     "lalaloc_core.learn": 9,
-    # The wing that measures.
+    # Evaluation.
     "lalaloc_core.evaluate.methods": 7,
     "lalaloc_core.evaluate.runs": 8,
     "lalaloc_core.evaluate.calibrate": 9,
@@ -69,22 +69,22 @@ LAYERS = {
     "lalaloc_core.evaluate.bench": 10,
     "lalaloc_core.evaluate": 10,
     "lalaloc_core.cli": 11,
-    # Below everything: it may import nothing of the rest.
+    # The client imports nothing from the other packages.
     "lalaloc_client": 0,
     "lalaloc_client.asynchronous": 1,
     "lalaloc_client.blocking": 1,
 }
-# The seam between the wings: what the modules of a package may not import, whatever their layers.
+# Forbidden imports of a package, regardless of layers.
 QUERY_SIDE = ("floorplan", "importers", "panorama", "render", "nets", "localise", "draw")
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),
     "service": ("lalaloc_core.learn", "lalaloc_core.evaluate", "lalaloc_core.cli"),
 }
-# The service's layers lie above all of the core's, lowest first.
+# Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
     "fair_share",
-    # `workers` is what runs in worker processes: it loads nothing of what watches over them.
+    # `workers` runs in worker processes and does not import their supervisors.
     "cores settings setting_groups setting_types errors problem_kinds schemas threads bounded_cache telemetry workers",
     "pools storage",
     "grids preview security conversion",
@@ -101,7 +101,7 @@ LAYERS |= {
     for index, names in enumerate(SERVICE_LAYERS)
     for name in names.split()
 }
-# Importing these loads torch; importing anything else must not.
+# Only these packages load torch when imported.
 TORCH_PACKAGES = (
     "lalaloc_core.nets",
     "lalaloc_core.localise.optimise",
@@ -133,7 +133,7 @@ def _tree(module: str) -> ast.Module:
 
 
 def _imported(module: str, nodes: Iterator[ast.AST]) -> set[str]:
-    """Names of the modules that import statements among `nodes` load."""
+    """Return the names of the modules that import statements among `nodes` load."""
     found = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -147,7 +147,7 @@ def _imported(module: str, nodes: Iterator[ast.AST]) -> set[str]:
 
 
 def _at_import_time(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that run when the module is imported: not those in functions, nor those for the type checker only."""
+    """Yield the nodes that run at import, without functions and imports for the type checker."""
     for child in ast.iter_child_nodes(node):
         lazy = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         typing_only = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
@@ -180,7 +180,7 @@ def _reaches_torch(module: str, seen: set[str]) -> bool:
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if name not in OURS])
-def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: str) -> None:
+def test_modules_import_from_lower_layers_or_their_folder(module: str) -> None:
     layer = _layer(module)
     assert layer is not None, f"{module} has no layer yet, add it to LAYERS"
     for target in sorted(_imported(module, ast.walk(_tree(module)))):
@@ -197,7 +197,7 @@ def _is_in(module: str, package: str) -> bool:
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_wings_are_kept_apart(package: str) -> None:
+def test_forbidden_imports_are_absent(package: str) -> None:
     crossing = [
         (module, target)
         for module in MODULES
@@ -208,7 +208,7 @@ def test_wings_are_kept_apart(package: str) -> None:
     assert crossing == []
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_imports_have_no_cycles() -> None:
     graph = {module: _imported(module, ast.walk(_tree(module))) & MODULES.keys() for module in MODULES}
     try:
         TopologicalSorter(graph).prepare()
@@ -217,35 +217,35 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
-def test_every_package_says_what_it_is_for_and_where_to_begin(package: str) -> None:
+def test_package_docstring_names_its_first_file(package: str) -> None:
     begin = re.search(r"Begin\s+with\s+`([^`]+)`", ast.get_docstring(_tree(package)) or "")
     assert begin
     assert (MODULES[package].parent / begin[1]).exists()
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
-def test_every_file_that_a_package_s_docstring_names_exists(package: str) -> None:
+def test_files_in_package_docstrings_exist(package: str) -> None:
     folder = MODULES[package].parent
     named = re.findall(r"`([\w/]+\.py)`", ast.get_docstring(_tree(package)) or "")
-    # Named from the folder itself, from that around it, or from the top.
+    # Paths are relative to the folder, its parent or the repository.
     assert [name for name in named if not any((base / name).exists() for base in (folder, folder.parent, ROOT))] == []
 
 
-def test_the_layer_table_names_no_module_that_is_gone() -> None:
+def test_layer_table_lists_existing_modules() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if not _in_torch_package(name)])
-def test_no_module_outside_the_torch_packages_imports_torch_when_it_is_imported(module: str) -> None:
+def test_torch_is_imported_in_torch_packages_only(module: str) -> None:
     assert not _reaches_torch(module, set())
 
 
-def test_every_torch_package_is_one() -> None:
+def test_torch_packages_import_torch() -> None:
     lazy = [name for name in TORCH_PACKAGES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(name))]
-    assert lazy == [], "these could be opened to the numpy side"
+    assert lazy == [], "these packages do not load torch, so remove them from TORCH_PACKAGES"
 
 
-def test_the_client_needs_nothing_but_httpx_and_its_event_streams() -> None:
+def test_client_imports_httpx_and_pydantic_only() -> None:
     modules = [name for name in MODULES if name.split(".")[0] == "lalaloc_client"]
     loaded = {name for module in modules for name in _imported(module, _at_import_time(_tree(module)))}
     tops = {name.split(".")[0] for name in loaded} - sys.stdlib_module_names

@@ -7,8 +7,8 @@ from starlette.requests import Request
 
 def preferred(request: Request, offered: tuple[str, ...]) -> str:
     """Return the offered media type that the request prefers; the first one if several tie or none is accepted."""
-    wanted = ",".join(request.headers.getlist("accept"))
-    ranges = [_range(part) for part in wanted.split(",") if part.strip()]
+    accepted = ",".join(request.headers.getlist("accept"))
+    ranges = [_range(part) for part in accepted.split(",") if part.strip()]
     if not ranges:
         return offered[0]
     return max(offered, key=lambda media: _quality(media, ranges))

@@ -94,7 +94,7 @@ class Slots:
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
-        """Release the held slot during the block, and take it again afterwards."""
+        """Release the held slot during the block, and take it back afterwards."""
         self._give_back(client)
         try:
             yield
@@ -103,10 +103,10 @@ class Slots:
             self._shares.take(client)
 
     def check(self, client: str) -> None:
-        """Check that the client could get a slot or wait for one.
+        """Check that a slot or a place in the queue is free for the client.
 
         Raises:
-            OverloadedError: no slot and no place in the queue is free for the client.
+            OverloadedError: neither is free.
         """
         if not self._shares.may_take(client) and not self._places.may_take(client):
             raise self._refusal(client)
@@ -220,7 +220,7 @@ class Admission:
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
 
     def drain(self) -> None:
-        """Announce that the service is about to stop. Safe to call in a signal handler."""
+        """Announce that the service will stop soon. Safe to call in a signal handler."""
         self.draining = True
 
     def stop(self) -> None:

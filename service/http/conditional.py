@@ -56,9 +56,9 @@ def conditional_answer(
     Raises:
         InvalidRequestError: `If-None-Match` is not a list of entity tags.
     """
-    known = _tags(request, "If-None-Match")
+    none_match = _tags(request, "If-None-Match")
     common = {"ETag": etag, **_CACHED, **(headers or {})}
-    if known is not None and (known.any or etag.strip('"') in known.all):
+    if none_match is not None and (none_match.any or etag.strip('"') in none_match.all):
         return Response(status_code=304, headers=common)
     return Response(content, media_type=media_type, headers=common)
 
@@ -67,18 +67,18 @@ def expected_revision(request: Request, resource_id: str, revision_id: str, *, w
     """Check the preconditions of a change to a plan or venue at its current revision.
 
     Returns:
-        the revision that it must still have when the change is stored; None for any.
+        The revision that must still be current when the change is stored; None for any.
 
     Raises:
         RevisionMismatchError: `If-Match` does not name the revision, or `If-None-Match` does.
         InvalidRequestError: a header is not a list of entity tags.
     """
-    wanted, unwanted = _tags(request, "If-Match"), _tags(request, "If-None-Match")
-    if unwanted is not None and (unwanted.any or revision_id in _revisions(unwanted.all)):
+    match, none_match = _tags(request, "If-Match"), _tags(request, "If-None-Match")
+    if none_match is not None and (none_match.any or revision_id in _revisions(none_match.all)):
         raise RevisionMismatchError(resource_id, "any other (If-None-Match)", revision_id, what=what)
-    if wanted is None or wanted.any:
+    if match is None or match.any:
         return None
-    named = _revisions(wanted.strong)
+    named = _revisions(match.strong)
     if revision_id not in named:
         raise RevisionMismatchError(resource_id, ", ".join(sorted(named)) or "a weak tag", revision_id, what=what)
     return revision_id
@@ -89,7 +89,7 @@ def _revisions(tags: frozenset[str]) -> set[str]:
 
 
 def _tags(request: Request, name: str) -> Tags | None:
-    """Return the tags in a header, which can come in several lines; None without the header."""
+    """Return the tags of a header, whose lines are joined; None without the header."""
     values = request.headers.getlist(name)
     if not values:
         return None

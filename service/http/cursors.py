@@ -1,4 +1,4 @@
-"""Cursors: places in a list as opaque text, one text per place."""
+"""Cursors: positions in a list as opaque text, with one text per position."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _LAST = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // _MICROSECOND
 
 
 def cursor_text(cursor: Cursor) -> str:
-    """Return the cursor of a place in a list of plans or venues."""
+    """Return the cursor of a position in a list of plans or venues."""
     moment = (cursor.created_at - _EPOCH) // _MICROSECOND
     return base64.urlsafe_b64encode(_LAYOUT.pack(moment, bytes.fromhex(cursor.id))).decode("ascii")
 
 
 def parse_cursor(text: str) -> Cursor:
-    """Return the place of a cursor.
+    """Return the position of a cursor.
 
     Raises:
         InvalidRequestError: not a cursor of `cursor_text`.
@@ -41,12 +41,12 @@ def parse_cursor(text: str) -> Cursor:
 
 
 def venue_cursor_text(place: VenuePlace) -> str:
-    """Return the cursor of a place in the plans of a venue."""
+    """Return the cursor of a position in the plans of a venue."""
     return base64.urlsafe_b64encode(_VENUE_LAYOUT.pack(place.level, bytes.fromhex(place.plan_id))).decode("ascii")
 
 
 def parse_venue_cursor(text: str) -> VenuePlace:
-    """Return the place of a cursor in the plans of a venue.
+    """Return the position of a cursor in the plans of a venue.
 
     Raises:
         InvalidRequestError: not a cursor of `venue_cursor_text`.

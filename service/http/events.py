@@ -1,6 +1,6 @@
-"""Server-sent events about plans that are being prepared, also by another replica.
+"""Server-sent events about plans in preparation, by this replica or another.
 
-All streams together cost a few queries per look, however many they are, and no thread of their own.
+All streams share one task that polls the store, so the cost does not grow with their number.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from service.threads import BoundedReads
 _POLL_INTERVAL_S = 0.25
 HEARTBEAT_S = 15.0
 # Delay before a browser reconnects.
-_ASK_AGAIN_MS = 3000
+_RETRY_MS = 3000
 # Timeout for sending the end of a stream to a slow reader.
 _LAST_BYTES_S = 5.0
 _FINAL = frozenset({"ready", "failed", "deleted"})
@@ -40,7 +40,7 @@ async def _always() -> bool:
 
 
 class EventStream(StreamingResponse):
-    """Stream that ends in bounded time, even if its client does not read."""
+    """Stream that ends in bounded time, even if its client stops reading."""
 
     media_type = "text/event-stream"
 
@@ -66,10 +66,10 @@ class PlanEvents:
     Args:
         store: the store.
         grids: states of pose grids.
-        admission: tells when the service stops.
+        admission: slots of the app; streams end when the service stops.
         reads: threads for reading the store.
         max_s: timeout of a stream.
-        heartbeat_s: interval of comments on an idle stream, and of checking that its caller is still authorised.
+        heartbeat_s: interval of comments on an idle stream, and of checks that its caller is still authorised.
     """
 
     def __init__(
@@ -103,14 +103,14 @@ class PlanEvents:
             # The task outlives this request, so it must not log under its ids.
             self._watch = asyncio.create_task(self._poll_all(), context=Context())
         try:
-            yield f"retry: {_ASK_AGAIN_MS}\n\n".encode()
+            yield f"retry: {_RETRY_MS}\n\n".encode()
             until = monotonic() + self._max_s
-            ask_at = monotonic() + self._heartbeat_s
+            check_at = monotonic() + self._heartbeat_s
             while (left_s := until - monotonic()) > 0.0 and not self._admission.stopping:
-                if monotonic() >= ask_at:
+                if monotonic() >= check_at:
                     if not await still_authorised():
                         return
-                    ask_at = monotonic() + self._heartbeat_s
+                    check_at = monotonic() + self._heartbeat_s
                 try:
                     async with asyncio.timeout(min(left_s, self._heartbeat_s)):
                         event = await subscriber.next()
@@ -157,7 +157,7 @@ class PlanEvents:
 
 
 class _Subscriber:
-    """One stream; a new event replaces one that was not sent yet."""
+    """Subscriber of one stream; a new event replaces an unsent one."""
 
     def __init__(self, plan_id: str) -> None:
         self.plan_id = plan_id

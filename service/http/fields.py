@@ -1,4 +1,4 @@
-"""Checks of request fields: faults in plain words, JSON bodies, and query parameters."""
+"""Checks of request fields: error messages, JSON bodies, and query parameters."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
     if kind == "missing":
         return field, "is missing"
     if kind in ("too_short", "too_long"):
-        wanted = context.get("min_length", context.get("max_length"))
-        return field, f"is given {context.get('actual_length')} times, {wanted} are needed"
+        limit = context.get("min_length", context.get("max_length"))
+        return field, f"is given {context.get('actual_length')} times, {limit} are needed"
     words = _WORDS[kind](context) if kind in _WORDS else str(fault.get("msg", "invalid"))
     value = fault.get("input")
     shown = f"is '{str(value)[:_MAX_SHOWN]}': " if isinstance(value, str | int | float) else ""
@@ -72,7 +72,7 @@ def parse_document(model: type[Model], content: bytes) -> Model:
     """Parse a JSON text as a model.
 
     Raises:
-        InvalidRequestError: not JSON, a duplicate key, or faulty fields, of which the first twenty are named.
+        InvalidRequestError: not JSON, a duplicate key, or faulty fields; the error names the first twenty.
     """
     try:
         value = read_json(content, _MAX_DEPTH)
@@ -91,13 +91,13 @@ async def check_parameters(request: Request) -> None:
     Raises:
         InvalidRequestError: unknown parameters, or a parameter given more than once.
     """
-    given = Counter(name for name, _ in request.query_params.multi_items())
-    if not given:
+    counts = Counter(name for name, _ in request.query_params.multi_items())
+    if not counts:
         return
     known = _parameters_of(request.scope.get("route"))
-    faults = [(name[:50], _unknown(known)) for name in given if name not in known]
+    faults = [(name[:50], _unknown(known)) for name in counts if name not in known]
     once = [name for name, repeatable in known.items() if not repeatable]
-    faults += [(name, "given more than once") for name in once if given[name] > 1]
+    faults += [(name, "given more than once") for name in once if counts[name] > 1]
     if faults:
         raise InvalidRequestError(faults)
 

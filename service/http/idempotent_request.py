@@ -1,7 +1,7 @@
-"""`Idempotency-Key`: a request that is sent twice is executed once, and both get the same answer.
+"""`Idempotency-Key`: a request that is sent twice is executed once, and both attempts get the same answer.
 
-The answer is kept for a day, permanent errors included. After an error that may be temporary, the next attempt executes
-the request again under the same token. While one attempt is running, others are refused. If its process dies, the next
+Answers and permanent errors are kept for a day. After an error that may be temporary, the next attempt executes the
+request again under the same token. While an attempt is running, others are refused. If its process dies, the next
 attempt takes over under the same token once the lease has expired.
 """
 
@@ -164,7 +164,7 @@ class IdempotentRequest:
         """Return the answer to a permanent error, which is kept; None for other errors."""
         if self._key is None:
             return None
-        # A lost decoder may not be the picture's fault.
+        # A decoder can also die for reasons other than the picture.
         if isinstance(error, _PERMANENT_ERRORS) and not isinstance(error.__cause__, JobLostError):
             return self._keep(token, problem_answer(self._request, error))
         self._abandon(token)

@@ -91,7 +91,7 @@ def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
     kind = HTTP_PROBLEMS.get(error.status_code, ProblemKind(error.status_code, "http-error", "HTTP error"))
     detail = f"{request.method} {request.url.path[:200]}: {error.detail}"
     headers = dict(error.headers or {})
-    # The framework names the methods of one route of the path, there may be more.
+    # The framework lists the methods of the first matching route; the path can have more routes.
     if error.status_code == 405 and (methods := [*permissions_needed(routed_path(request.scope))]):
         headers["Allow"] = ", ".join([*methods, *(["HEAD"] if "GET" in methods else [])])
     return _answer(request, kind, detail, headers=headers)

@@ -1,6 +1,6 @@
 """HTTP server of the app, with bounded connections and a stop that finishes requests in progress.
 
-The app also runs under other ASGI servers, which then have to bound connections and stop by themselves.
+The app also runs under other ASGI servers, which must then bound connections and stop by themselves.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _HEAD_DEADLINE_S = 10.0
 # threads and the store.
 _FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
 # Descriptors for pipes of workers, listeners, files of the model and of the interpreter.
-_OTHERS = 192
+_RESERVED_DESCRIPTORS = 192
 # SQLite opens the database, its log and its index.
 _PER_DATABASE_CONNECTION = 3
 _MIN_CONNECTIONS = 16
@@ -67,7 +67,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 
 
 class Server(uvicorn.Server):
-    """Server that stops in steps: reports that it stops, refuses new requests, finishes those in progress, closes."""
+    """Server that stops in steps: announce the stop, refuse new requests, finish those in progress, close."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
         super().__init__(config)
@@ -80,7 +80,7 @@ class Server(uvicorn.Server):
         if self._stopping_since is not None:
             os._exit(1)
         self._stopping_since = monotonic()
-        # Ends the process even if a thread or a disk hangs.
+        # This ends the process even if a thread or a disk hangs.
         last_resort = threading.Timer(self._settings.requests.stop_deadline_s, os._exit, [1])
         last_resort.daemon = True
         last_resort.start()
@@ -88,7 +88,7 @@ class Server(uvicorn.Server):
         if admission is None:
             self.should_exit = True
         elif self._settings.requests.stop_notice_s > 0.0:
-            # Load balancers need time to notice.
+            # Load balancers need time to react.
             admission.drain()
         else:
             admission.stop()
@@ -180,7 +180,7 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
 def _send_at_once(transport: asyncio.Transport) -> None:
     """Disable Nagle's algorithm, which delays bodies by up to 40 ms.
 
-    asyncio does so only for listening sockets that it created itself.
+    asyncio disables it only for listening sockets that it created itself.
     """
     connection = transport.get_extra_info("socket")
     if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
@@ -197,17 +197,17 @@ def max_connections_of(wanted: int, settings: Settings) -> int:
     Raises:
         ConfigError: the system allows too few descriptors.
     """
-    others = _OTHERS + _PER_DATABASE_CONNECTION * settings.database.connections
-    allowed = _raised_to(wanted + others)
-    if allowed - others < _MIN_CONNECTIONS:
+    reserved = _RESERVED_DESCRIPTORS + _PER_DATABASE_CONNECTION * settings.database.connections
+    allowed = _raised_to(wanted + reserved)
+    if allowed - reserved < _MIN_CONNECTIONS:
         raise ConfigError(
-            f"the system allows {allowed} file descriptors; at least {others + _MIN_CONNECTIONS} are needed. Raise "
+            f"the system allows {allowed} file descriptors; at least {reserved + _MIN_CONNECTIONS} are needed. Raise "
             "`ulimit -n`"
         )
-    if allowed - others < wanted:
-        fields = {"max_connections": allowed - others, "wanted": wanted, "descriptors": allowed}
+    if allowed - reserved < wanted:
+        fields = {"max_connections": allowed - reserved, "wanted": wanted, "descriptors": allowed}
         logging.getLogger(LOGGER_NAME).warning("fewer connections than set", extra={"fields": fields})
-    return min(wanted, allowed - others)
+    return min(wanted, allowed - reserved)
 
 
 def _raised_to(needed: int) -> int:

@@ -49,10 +49,10 @@ class UploadLimits:
     """Limits of an upload.
 
     Attributes:
-        max_bytes: size of the file.
-        name: setting that `max_bytes` comes from.
+        max_bytes: maximum size of the file.
+        name: setting of `max_bytes`.
         deadline_s: timeout of the whole upload.
-        idle_s: timeout for the next bytes; also the tolerated lag behind `bytes_per_s`.
+        idle_s: timeout for the next bytes; also the tolerated delay behind `bytes_per_s`.
         bytes_per_s: minimum rate.
     """
 
@@ -241,7 +241,7 @@ async def _sort(
 
 
 async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:
-    """Yield the body as it arrives, while it is neither too large nor too slow."""
+    """Yield the body as it arrives, within the limits of size and rate."""
     max_bytes = limits.max_bytes + envelope_bytes
     stated = request.headers.get("content-length", "")
     # Refuse before reading if the stated length is too large.

@@ -19,8 +19,8 @@ Replicas = Annotated[int, Field(ge=1, le=1000)]
 
 # Queries per search replica: one computes while the other waits for encoder or LPO.
 _SEARCH_THREADS = 2
-# Requests queued at a replica besides the running one, so that it never idles.
-_NEXT = 1
+# Requests queued at a replica besides the running request, so that it never idles.
+_QUEUED_REQUESTS = 1
 
 
 class RayOptions(BaseModel):
@@ -73,15 +73,15 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
     encoder = serve.deployment(
         EncoderReplica,
         name="encoder",
-        max_ongoing_requests=1 + _NEXT,
-        **_scaled("encoder", options, target=1.0 + _NEXT),
+        max_ongoing_requests=1 + _QUEUED_REQUESTS,
+        **_scaled("encoder", options, target=1.0 + _QUEUED_REQUESTS),
     ).bind(single, sha256)
     lpo = serve.deployment(
         LpoReplica,
         name="lpo",
-        max_ongoing_requests=1 + _NEXT,
+        max_ongoing_requests=1 + _QUEUED_REQUESTS,
         max_queued_requests=settings.lpo.queue,
-        **_scaled("lpo", options, target=1.0 + _NEXT),
+        **_scaled("lpo", options, target=1.0 + _QUEUED_REQUESTS),
     ).bind(single, sha256)
     # 0 workers turn LPO off; any other number is replaced by the number of replicas.
     optimiser = None if settings.compute.workers == 0 else lpo

@@ -50,7 +50,7 @@ class RemoteEncoders(Encoders):
         *,
         heading_tolerance: float = 0.0,
     ) -> Query:
-        """See `Encoders.query`; for threads, which wait for the answer.
+        """Compute a query as `Encoders.query` does; blocks, so call it from a thread.
 
         Raises:
             DeadlineExceededError: no answer in time, or two replicas died.
@@ -68,7 +68,7 @@ class RemoteEncoders(Encoders):
 
 
 class RemoteOptimiser:
-    """Remote LPO; a job can fail for any reason, and the query then keeps the VDR pose, as with `LpoPool`.
+    """Remote LPO; if a job fails for any reason, the query keeps the VDR pose, as with `LpoPool`.
 
     Args:
         lpo: deployment of LPO; None if LPO is off.
@@ -84,14 +84,14 @@ class RemoteOptimiser:
 
     @property
     def state(self) -> PoolState:
-        """State of one worker that is always ready; Ray starts and replaces the replicas."""
+        """Return the state of one worker that is always ready; Ray starts and replaces the replicas."""
         workers = 0 if self._lpo is None else 1
         return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
 
     async def refine(
         self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
     ) -> RefinementResult | SequenceResult | None:
-        """See `LpoPool.refine`; clients do not take turns."""
+        """Refine as `LpoPool.refine` does, but without taking turns between clients."""
         if self._lpo is None or timeout_s <= 0.0:
             return None
         deadline = monotonic() + timeout_s
@@ -117,7 +117,7 @@ class RemoteOptimiser:
 
 
 class _SearchCaller:
-    """Client of the search replicas; equal plans and venues go to the same replica."""
+    """Client of the search replicas; sends queries about the same plan or venue to the same replica."""
 
     def __init__(self, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
         self._search = search
@@ -158,7 +158,7 @@ class _SearchCaller:
         raise DeadlineExceededError(self._settings.requests.request_deadline_s)
 
     def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
-        """Count an answer in this process, whose metrics are scraped."""
+        """Count an answer in the metrics of this process, which are scraped."""
         for name, spent_ms in answer.timings_ms.model_dump(exclude_none=True).items():
             self._telemetry.stage_seconds.labels(name).observe(spent_ms / 1e3)
         self._telemetry.answers.labels(answer.stage).inc()

@@ -55,7 +55,7 @@ class LpoReplica:
     """Pose refinement on torch: the body of an LPO worker, in a process that Ray supervises."""
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
-        """See `EncoderReplica`."""
+        """Load the refiner; check the bundle as `EncoderReplica` does."""
         self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.cores.worker_threads)
 
     def refine(self, job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
@@ -68,7 +68,7 @@ class SearchReplica:
     """Search: the service without HTTP, with remote encoder and LPO."""
 
     def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle, lpo: DeploymentHandle) -> None:
-        """See `EncoderReplica`."""
+        """Build the localisers; check the bundle as `EncoderReplica` does."""
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
         backends = Backends(
@@ -120,7 +120,7 @@ class SearchReplica:
         """Return a plan from this replica's own cache."""
         record = await self._runtime.plan_lookup.find(tenant, plan_id, self._runtime.reads)
         if record is None:
-            # Deleted meanwhile.
+            # The plan was deleted meanwhile.
             raise UnknownFloorPlanError(plan_id)
         return record
 

@@ -98,7 +98,7 @@ class AccessControl:
         """Refuse requests from other machines and from pages of other sites.
 
         Raises:
-            ExposedWithoutKeysError: such a request.
+            ExposedWithoutKeysError: the request comes from another machine or site.
         """
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
@@ -132,7 +132,7 @@ def _client_of(request: Request) -> str:
 
 
 def _needed(request: Request) -> Permission:
-    """Return the scope that a request's route needs.
+    """Return the scope that the request's route requires.
 
     Raises:
         HTTPException: unknown route or method.

@@ -19,7 +19,7 @@ _CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 def is_local(server: tuple[str, int | None] | None) -> bool:
-    """Return True if a connection must come from this machine.
+    """Return True if only this machine can reach the server's local address.
 
     Args:
         server: local address: host and port, or path and None; None for a Unix socket.
@@ -51,7 +51,7 @@ def check_origin(
     allowed: Set[str] = frozenset(),
     pages: Set[str] = frozenset(),
 ) -> None:
-    """Refuse requests that pages of other sites make a browser send.
+    """Refuse requests that a page of another site makes a browser send.
 
     Args:
         method: HTTP method.

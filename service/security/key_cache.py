@@ -29,7 +29,7 @@ _MEMORY_BYTES = 8 * 2**20
 
 
 @dataclass(frozen=True)
-class _Known:
+class _CachedKey:
     """Key that was valid; times in seconds of the cache's clock."""
 
     key: ApiKey
@@ -50,7 +50,7 @@ class KeyCache:
         self._keys = keys
         self._fresh_s = fresh_s
         self._clock = clock
-        self._known: BoundedCache[str, _Known] = BoundedCache(_MEMORY_BYTES, lambda _: _RECORD_BYTES)
+        self._known: BoundedCache[str, _CachedKey] = BoundedCache(_MEMORY_BYTES, lambda _: _RECORD_BYTES)
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lalaloc-keys")
         self._breaker = CircuitBreaker(clock)
 
@@ -67,9 +67,9 @@ class KeyCache:
             StoreUnavailableError: the database is away, and the key is not cached.
             StoreBusyError: all database connections are in use.
         """
-        known = self._known.get(presented.hash)
-        if known is not None and self._clock() < known.refresh_s:
-            key = known.key
+        cached = self._known.get(presented.hash)
+        if cached is not None and self._clock() < cached.refresh_s:
+            key = cached.key
         else:
             key = await asyncio.get_running_loop().run_in_executor(self._threads, self._look_up, presented.hash)
         if key is None or not hmac.compare_digest(key.id, presented.id):
@@ -77,14 +77,14 @@ class KeyCache:
         return key
 
     def close(self) -> None:
-        """Finish the look-up in progress, drop the others."""
+        """Finish the look-up in progress and drop the waiting ones."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def _look_up(self, key_hash: str) -> ApiKey | None:
-        known = self._known.get(key_hash)
+        cached = self._known.get(key_hash)
         # Another request may have looked it up meanwhile.
-        if known is not None and self._clock() < known.refresh_s:
-            return known.key
+        if cached is not None and self._clock() < cached.refresh_s:
+            return cached.key
         try:
             key = self._find(key_hash)
         except StoreBusyError:
@@ -92,15 +92,15 @@ class KeyCache:
             raise
         except StoreUnavailableError:
             now_s = self._clock()
-            if known is None or now_s - known.verified_s > _TRUSTED_S:
+            if cached is None or now_s - cached.verified_s > _TRUSTED_S:
                 raise
-            self._known.put(key_hash, replace(known, refresh_s=now_s + self._fresh_s))
-            return known.key
+            self._known.put(key_hash, replace(cached, refresh_s=now_s + self._fresh_s))
+            return cached.key
         if key is None:
             self._known.drop(lambda cached, _: cached == key_hash)
             return None
         now_s = self._clock()
-        self._known.put(key_hash, _Known(key, now_s, now_s + self._fresh_s))
+        self._known.put(key_hash, _CachedKey(key, now_s, now_s + self._fresh_s))
         if key.last_used_at is None or datetime.now(UTC) - key.last_used_at > _TOUCHED_EVERY:
             self._threads.submit(self._touch, key.id)
         return key

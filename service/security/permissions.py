@@ -111,7 +111,7 @@ def caller_of(scope: Scope) -> Caller:
 
 
 def network_of(client: str) -> str:
-    """Return the network that an address counts for: the address itself, or the /64 of an IPv6 address."""
+    """Return the network that an address is counted under: the address itself, or the /64 of an IPv6 address."""
     try:
         address = ipaddress.ip_address(client)
     except ValueError:

@@ -69,7 +69,7 @@ class RateLimits:
         return TooManyRefusedKeysError(self._refused.amount, retry_after_s)
 
     async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
-        """Return whole seconds until the count drops."""
+        """Return the whole seconds until the count drops."""
         freed_at_s, _ = await self._limiter.get_window_stats(limit, identifier)
         return max(math.ceil(freed_at_s - time.time()), 1)
 

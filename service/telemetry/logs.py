@@ -11,7 +11,7 @@ from service.telemetry.log_fields import current_log_fields
 LOGGER_NAME = "lalaloc"
 # The HTTP server's access log contains query strings and adds nothing to ours.
 _SERVER, _SERVER_ACCESS = "uvicorn", "uvicorn.access"
-# Its warnings about client input are in the answers and in the request's line already.
+# The warnings about client input are already in the answers and in the log line of the request.
 _FORMS = "python_multipart"
 
 

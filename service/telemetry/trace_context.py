@@ -17,7 +17,7 @@ _PARENT = re.compile(r"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})
 
 @dataclass(frozen=True)
 class TraceContext:
-    """Span of a trace: lower-case hexadecimal ids, and the flag of the caller's sampling."""
+    """Span of a trace: lower-case hexadecimal ids, and the caller's sampling flag."""
 
     trace_id: str
     span_id: str
@@ -25,14 +25,14 @@ class TraceContext:
 
     @property
     def header(self) -> str:
-        """Value of `traceparent`; unknown flags are not passed on, as the recommendation demands."""
+        """Value of `traceparent`; unknown flags are cleared, as the recommendation requires."""
         return f"00-{self.trace_id}-{self.span_id}-{_SAMPLED if self.sampled else 0:02x}"
 
 
 def parse_traceparent(values: Sequence[str]) -> TraceContext | None:
     """Return the caller's span; None if the header is missing, repeated or invalid.
 
-    Of later versions than 00 the known part is read if a dash ends it.
+    In versions above 00, the known fields are read if a dash follows them.
     """
     match = _PARENT.fullmatch(values[0].strip(" \t")) if len(values) == 1 else None
     if match is None:

@@ -1,7 +1,7 @@
 """OpenTelemetry spans of requests and their stages; the extra `otel` is imported only when used.
 
-An instrumentation library does not replace this: spans of stages are made after the fact from measured times, some of
-them from other processes, and request and trace ids exist without the extra as well.
+Instrumentation libraries do not fit: spans of stages are created afterwards from measured times, some of them from
+other processes, and request and trace ids also exist without the extra.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def otlp_exporter(endpoint: str) -> SpanExporter:
 
 @dataclass(frozen=True)
 class OpenSpan:
-    """Open span, with its start on the clock of the stages (`perf_counter`, seconds)."""
+    """Open span, with its start on the clock of the stages (`perf_counter`, in seconds)."""
 
     span: Span
     began_ns: int
@@ -78,8 +78,8 @@ class Tracing:
             context = trace.set_span_in_context(trace.NonRecordingSpan(caller))
         began_ns, began_s = time_ns(), perf_counter()
         span = self._tracer.start_span("request", context, kind=trace.SpanKind.SERVER, start_time=began_ns)
-        own = span.get_span_context()
-        ids = TraceContext(f"{own.trace_id:032x}", f"{own.span_id:016x}", own.trace_flags.sampled)
+        created = span.get_span_context()
+        ids = TraceContext(f"{created.trace_id:032x}", f"{created.span_id:016x}", created.trace_flags.sampled)
         return ids, OpenSpan(span, began_ns, began_s)
 
     def end(self, opened: OpenSpan, log_fields: RequestLogFields, *, method: str, route: str, status: int) -> None:

@@ -161,14 +161,16 @@ class TestPredictedProfile:
     def test_profile_averages_panorama_and_mirror_image(self, encoders: Encoders) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
-        said = []
+        predicted_profiles = []
         for view in (image, image[:, ::-1]):
             inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.array([CAMERA_M], np.float32)}
             assert encoders._image is not None
             (predicted,) = encoders._image.run(["log_profile"], inputs)
-            said.append(np.asarray(predicted)[0])
+            predicted_profiles.append(np.asarray(predicted)[0])
         assert left_over == 0.0
-        np.testing.assert_allclose(np.log(profile), 0.5 * (said[0] + said[1][::-1]), atol=1e-5)
+        np.testing.assert_allclose(
+            np.log(profile), 0.5 * (predicted_profiles[0] + predicted_profiles[1][::-1]), atol=1e-5
+        )
         assert profile.shape == (COLUMNS,)
 
     def test_network_without_profile_is_a_bundle_error(self, opened_bundle: Bundle) -> None:

@@ -119,11 +119,11 @@ _PIECES = {
 
 @pytest.mark.parametrize("kind", _PIECES)
 def test_many_segments_are_read_in_linear_time(kind: str) -> None:
-    name, at, piece = _PIECES[kind]
+    name, offset, piece = _PIECES[kind]
     plain = _picture(name)
 
     def read(count: int) -> Callable[[], None]:
-        content = plain[:at] + piece * count + plain[at:]
+        content = plain[:offset] + piece * count + plain[offset:]
 
         def work() -> None:
             with suppress(InvalidPanoramaError):

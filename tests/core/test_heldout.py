@@ -38,9 +38,9 @@ def keys() -> list[HomeKey]:
 
 
 def photograph(scenes: HeldoutScenes, name: str, camera: int) -> HeldoutPhotograph:
-    (one,) = scenes.load(name).cameras[camera].photographs.values()
-    assert isinstance(one, HeldoutPhotograph)
-    return one
+    (shot,) = scenes.load(name).cameras[camera].photographs.values()
+    assert isinstance(shot, HeldoutPhotograph)
+    return shot
 
 
 class TestIndependence:
@@ -223,10 +223,10 @@ class TestScenes:
     )
     def test_invalid_arguments_are_refused(self, wrong: dict, message: str) -> None:
         with pytest.raises(InvalidInputError, match=message):
-            build_dataset(asked(wrong))
+            build_dataset(run_info(wrong))
 
 
-def asked(generated: dict) -> RunInfo:
+def run_info(generated: dict) -> RunInfo:
     return RunInfo(
         label="test",
         method="oracle",
@@ -239,7 +239,7 @@ def asked(generated: dict) -> RunInfo:
 
 class TestRuns:
     def test_run_uses_heldout_homes(self) -> None:
-        dataset = build_dataset(asked({"homes": 2, "furniture": "empty"}))
+        dataset = build_dataset(run_info({"homes": 2, "furniture": "empty"}))
         assert dataset == HeldoutScenes(homes=2, furniture="empty")
         assert dataset.description == "out-of-family homes (seed 0)"
 

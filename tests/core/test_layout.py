@@ -25,13 +25,15 @@ TWO_ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, at=(4.2, 0.0)
 DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
 
 
-def view_along(plan: FloorPlan, at: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M) -> LayoutView:
+def view_along(
+    plan: FloorPlan, position_m: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M
+) -> LayoutView:
     """Render one ray for each azimuth."""
     count = len(azimuths_deg)
-    position = np.tile(at, (count, 1)).astype(float)
-    room = plan.room_index_at(position)
+    positions = np.tile(position_m, (count, 1)).astype(float)
+    room = plan.room_index_at(positions)
     # With a single column a pose's ray is along its heading.
-    return layout_view(position, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
+    return layout_view(positions, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
 
 
 def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:

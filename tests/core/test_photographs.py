@@ -95,8 +95,8 @@ class TestWalls:
             there = np.arange(COLUMNS) // 16 % 3 == number
             sloped[: ROWS // 2, there] = room((2.0, 3.0), ceiling_m=ceiling_m)[: ROWS // 2, there]
         sloped[ROWS // 2 + 20 :, 100:200] = SOFA
-        for one in (panorama, sloped):
-            unseen = np.isnan(read_walls_and_openings(one, by_colour, WIDTH).log_distance)
+        for picture in (panorama, sloped):
+            unseen = np.isnan(read_walls_and_openings(picture, by_colour, WIDTH).log_distance)
             assert unseen[14:24].all()
             assert not unseen[30:].any()
 

@@ -49,9 +49,9 @@ def test_opening_belongs_to_both_rooms_of_a_wall() -> None:
     assert plan.warnings == ()
 
 
-@pytest.mark.parametrize("at", [4.0, 4.2, 3.9, 4.3])
-def test_opening_near_a_wall_is_placed_on_it(at: float) -> None:
-    plan = with_openings(DOOR | {"line": [[at, 1.0], [at, 1.9]]})
+@pytest.mark.parametrize("x_m", [4.0, 4.2, 3.9, 4.3])
+def test_opening_near_a_wall_is_placed_on_it(x_m: float) -> None:
+    plan = with_openings(DOOR | {"line": [[x_m, 1.0], [x_m, 1.9]]})
     assert [face.room for face in plan.opening_faces] == [0, 1]
 
 

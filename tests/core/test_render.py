@@ -83,7 +83,7 @@ class TestTorch:
         np.testing.assert_allclose(back_project(depth_in_torch).numpy(), back_project(depth), atol=1e-9)
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_the_result_has_the_type_of_the_positions(self, dtype: torch.dtype) -> None:
+    def test_result_has_the_type_of_the_positions(self, dtype: torch.dtype) -> None:
         plan = plan_of(rectangle(4.0, 3.0))
         walls = torch.tensor(plan.walls_m[:1], dtype=dtype)
         profile = wall_profile(torch.ones(1, 2, dtype=dtype), torch.zeros(1, dtype=dtype), walls, 8)
@@ -100,12 +100,12 @@ class TestTorch:
         def render(unknowns: torch.Tensor) -> torch.Tensor:
             return wall_profile(unknowns[:, :2], unknowns[:, 2], walls, COLUMNS)[0]
 
-        at = torch.tensor(pose)
-        backward = torch.autograd.functional.jacobian(render, at)[:, 0].numpy()  # type: ignore[call-overload]
+        point = torch.tensor(pose)
+        backward = torch.autograd.functional.jacobian(render, point)[:, 0].numpy()  # type: ignore[call-overload]
         for unknown in range(3):
-            tangent = torch.zeros_like(at)
+            tangent = torch.zeros_like(point)
             tangent[0, unknown] = 1.0
-            forward = torch.func.jvp(render, (at,), (tangent,))[1]
+            forward = torch.func.jvp(render, (point,), (tangent,))[1]
             shifted = [pose + sign * step * tangent.numpy() for sign in (-1.0, 1.0)]
             walls_hit = [nearest_wall(p[:, :2], p[:, 2], scene.walls_m)[0] for p in (pose, *shifted)]
             # The derivative exists only where the same wall is hit on both sides.

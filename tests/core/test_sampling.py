@@ -89,7 +89,7 @@ class TestRandomPoses:
         assert (wall_distance(plan, poses) > 0.98 * 0.15).all()
 
     @given(plans(), seeds())
-    def test_the_same_seed_gives_the_same_poses(self, plan: FloorPlan, seed: int) -> None:
+    def test_same_seed_gives_the_same_poses(self, plan: FloorPlan, seed: int) -> None:
         first, second = (random_poses(plan, 20, np.random.default_rng(seed)) for _ in range(2))
         np.testing.assert_array_equal(first.position_m, second.position_m)
         np.testing.assert_array_equal(first.room_index, second.room_index)
@@ -141,7 +141,7 @@ class TestTriplets:
         assert drawn is not None
         assert (wall_distance(plan, drawn[0]) > 0.0).all()
 
-    def test_the_same_seed_gives_the_same_triplets(self) -> None:
+    def test_same_seed_gives_the_same_triplets(self) -> None:
         first, second = (sample_triplets(BIG, 4, TripletSampling(), np.random.default_rng(7)) for _ in range(2))
         assert first is not None
         assert second is not None
@@ -166,7 +166,7 @@ class TestNeighbours:
         assert (distance[positives:] > sampling.negative_radius_m).all()
         assert (wall_distance(BIG, poses) > 0.0).all()
 
-    def test_the_same_seed_gives_the_same_neighbours(self) -> None:
+    def test_same_seed_gives_the_same_neighbours(self) -> None:
         anchor = random_poses(BIG, 1, np.random.default_rng(0))
         first, second = (sample_neighbours(BIG, anchor, TripletSampling(), np.random.default_rng(7)) for _ in range(2))
         assert first is not None

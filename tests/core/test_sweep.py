@@ -67,9 +67,9 @@ def test_free_standing_walls_have_two_sides() -> None:
     assert len(swept_views(poses.position_m, np.zeros(len(poses)), poses.room_index, plan.wall_table, 64, 1.5).row)
 
 
-@pytest.mark.parametrize("at", [(0.0, 0.0), (4e5, -5e6)])
-def test_profiles_in_a_spiral_far_from_the_origin(at: tuple[float, float]) -> None:
-    plan = plan_of((np.array(spiral(80)) + at).tolist())
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (4e5, -5e6)])
+def test_profiles_in_a_spiral_far_from_the_origin(origin_m: tuple[float, float]) -> None:
+    plan = plan_of((np.array(spiral(80)) + origin_m).tolist())
     poses = pose_grid(plan, 0.5)
     heading = np.linspace(-1.0, 1.0, len(poses))
     swept = profiles_at(plan, poses.position_m, poses.room_index, heading, COLUMNS)

@@ -99,7 +99,7 @@ def test_facts_match_the_scene(known: list[tuple[Shot, frozenset[str]]], materia
 
 
 def test_sun_patches_are_lit(known: list[tuple[Shot, frozenset[str]]], materials: MaterialLibrary) -> None:
-    """Without the sun the picture is another one, wherever a patch is said to be."""
+    """The picture without the sun differs if the facts name a sun patch."""
     renderer = PanoramaRenderer(materials, height=64, width=128)
     seen = differs = 0
     for shot, facts in known:
@@ -107,7 +107,7 @@ def test_sun_patches_are_lit(known: list[tuple[Shot, frozenset[str]]], materials
             continue
         scene = build_scene(shot, materials)
         dark = dataclasses.replace(scene, sun=Sun(np.zeros(Sun.WIDTH)))
-        with_sun, without = (renderer.render_scenes([one])[0].int() for one in (scene, dark))
+        with_sun, without = (renderer.render_scenes([lit])[0].int() for lit in (scene, dark))
         seen += 1
         differs += bool(((with_sun - without).abs().amax(dim=-1) > 12).float().mean() > 2e-4)
     assert seen >= 5

@@ -256,10 +256,10 @@ def test_each_room_has_one_camera_at_the_home_s_height(seed: int) -> None:
     assert len({shot.camera_height_m for shot in shots}) == len({shot.seed for shot in shots}) == 1
     assert 1.2 <= shots[0].camera_height_m <= 1.7
     for shot, room in zip(shots, home.plan.rooms, strict=True):
-        at = shapely.Point(shot.position_m)
+        position = shapely.Point(shot.position_m)
         margin_m = min(POSE_MARGIN_M - 1e-9, 0.9 * shapely.maximum_inscribed_circle(room.shape).length)
-        assert room.shape.contains(at)
-        assert room.shape.exterior.distance(at) >= margin_m
+        assert room.shape.contains(position)
+        assert room.shape.exterior.distance(position) >= margin_m
         assert shot.camera_height_m <= room.ceiling_height_m - 0.3
 
 
@@ -314,7 +314,7 @@ def test_every_room_has_nine_panoramas_and_three_depths(root: Path) -> None:
                         assert image.mode == ("I;16" if name == "depth.png" else "RGB")
 
 
-def test_empty_depth_matches_the_layout_except_doors_and_fittings(root: Path) -> None:
+def test_empty_depth_matches_the_layout_except_doors(root: Path) -> None:
     for folder, home, shots in homes_of(root):
         for shot in shots:
             panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
@@ -464,22 +464,22 @@ def test_full_disk_is_an_error_without_partial_scenes(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
+def test_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, ending: signal.Signals) -> None:
     program = "import sys; from lalaloc_core.cli import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["synth", "--scenes", "40", "--split", "test", "--out", str(tmp_path), "--height", "64"]
     process = subprocess.Popen(
         [sys.executable, "-c", program, *arguments, "--workers", "2"], start_new_session=True, stderr=subprocess.PIPE
     )
     wait_until(lambda: bool(list(tmp_path.glob("scene_*[0-9]"))))
-    if how == signal.SIGINT:
+    if ending == signal.SIGINT:
         # As a terminal does it.
-        os.killpg(process.pid, how)
+        os.killpg(process.pid, ending)
     else:
         process.kill()
     _, errors = process.communicate(timeout=60.0)
     wait_until(lambda: not group_exists(process.pid))
-    if how == signal.SIGINT:
+    if ending == signal.SIGINT:
         assert process.returncode == 130
         assert b"goes on where it stopped" in errors
         assert b"Traceback" not in errors

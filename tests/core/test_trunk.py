@@ -347,7 +347,7 @@ class TestBundle:
         assert mirrored.ceiling is not None
         assert mirrored.ceiling.log_m == pytest.approx(plain.ceiling.log_m, abs=1e-5)
 
-    def test_the_stated_height_is_one_offset(self, service: Encoders) -> None:
+    def test_stated_height_is_one_offset(self, service: Encoders) -> None:
         low, high = (service.query(panorama(), 0.0, CameraHeight(height)) for height in (1.0, 2.0))
         assert low.profile is not None
         assert high.profile is not None

@@ -196,7 +196,7 @@ class TestValidation:
             return validate(stage.modules)
 
         found = scores()
-        names = {f"{by}{what}" for by in ("", "profile_") for what in ("within_1m", "median_cm")} | {"nll"}
+        names = {f"{by}{measure}" for by in ("", "profile_") for measure in ("within_1m", "median_cm")} | {"nll"}
         assert {f"{prefix}_{name}" for prefix in ("val", "heldout") for name in names} <= set(found)
         assert {"val_profile_within_1m_full", "val_median_cm_full"} <= set(found)
         assert all(np.isfinite(value) for value in found.values())

@@ -1,6 +1,6 @@
-"""What the shipped model says of how sure it is: of photographs of the plan's home, and of what is none.
+"""Tests of the shipped model's confidence, on photographs of the plan's home and on other pictures.
 
-Rendered homes of the validation split, beyond those that confidence is fitted on.
+The homes are rendered from the validation split, outside the range that the calibration uses.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ BUNDLE = Path(__file__).parents[2] / "models" / "default"
 HOMES = 12
 FIRST_HOME = 1000
 HEIGHT, WIDTH = 128, 256
-# A few degrees: what a compass is off by.
+# Typical error of a compass.
 TOLERANCE_DEG = 5.0
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A rendered photograph of a home."""
+    """Rendered photograph of a home."""
 
     plan: dict[str, Any]
     picture: bytes
@@ -42,14 +42,14 @@ class Shot:
 
 @pytest.fixture(scope="module")
 def shots() -> list[Shot]:
-    """One photograph of each of some homes."""
+    """Return one photograph per home."""
     source = GeneratedScenes(homes=FIRST_HOME + HOMES, shots_per_home=1)
     found = []
     for number in range(FIRST_HOME, FIRST_HOME + HOMES):
         scene = source.load(f"validation-{number:05d}")
         camera = scene.cameras[0]
         picture = png(camera.photographs[source.appearances[0]].image(HEIGHT, WIDTH))
-        # With the camera's height as the plan's own, one grid per home is enough.
+        # One grid per home is enough if the plan has the height of the camera.
         plan = {**scene.plan.to_dict(), "camera_height_m": round(camera.camera_height_m, 2)}
         height_m = plan["camera_height_m"]
         found.append(Shot(plan, picture, camera.position_m, np.degrees(camera.heading) % 360.0, height_m))
@@ -58,7 +58,7 @@ def shots() -> list[Shot]:
 
 @pytest.fixture(scope="module")
 def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The production app with the bundle that ships, and a worker that is warm."""
+    """Yield a client of the production app with the shipped bundle and a ready worker."""
     assert Bundle.open(BUNDLE).manifest.confidence is not None, "calibrate the bundle before it ships"
     deadlines = {"lpo_deadline_s": 60.0, "request_deadline_s": 90.0}
     with start_app(tmp_path_factory.mktemp("data"), bundle=BUNDLE, workers=1, **deadlines) as client:
@@ -69,7 +69,7 @@ def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 
 @pytest.fixture(scope="module")
 def homes(shipped: httpx.Client, shots: list[Shot]) -> list[str]:
-    """The homes' plans, ready, in the order of their photographs."""
+    """Return the ids of the uploaded plans, in the order of `shots`."""
     return [upload(shipped, shot.plan) for shot in shots]
 
 
@@ -80,7 +80,7 @@ def given(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture(scope="module")
 def right(shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool) -> list[dict[str, Any]]:
-    """Answers to every photograph in its own home."""
+    """Return the answer to each photograph in its own home."""
     pairs = zip(shots, homes, strict=True)
     return [ask(shipped, home, shot.picture, shot.heading_deg if given else None) for shot, home in pairs]
 
@@ -92,12 +92,12 @@ def png(image: np.ndarray) -> bytes:
 
 
 def blank(value: int) -> bytes:
-    """A wall right before the camera."""
+    """Return a picture of a wall directly in front of the camera."""
     return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
 
 
 def outdoors(sky: tuple[int, int, int], ground: tuple[int, int, int]) -> bytes:
-    """A plain under the sky, paler towards the horizon, with grain."""
+    """Return a picture of a plain under a sky that is paler towards the horizon, with grain."""
     up = np.linspace(1.0, -1.0, HEIGHT)[:, None, None]
     colours = np.where(up > 0.0, np.array(sky) + 60.0 * (1.0 - up), np.array(ground) * (0.7 - 0.3 * up))
     grain = np.random.default_rng(0).normal(0.0, 6.0, (HEIGHT, WIDTH, 3))
@@ -113,7 +113,7 @@ PICTURES_OF_NO_ROOM = {
 
 
 def ask(client: httpx.Client, plan_id: str, picture: bytes, heading_deg: float | None, **fields: Any) -> dict[str, Any]:
-    """An answer of the last stage."""
+    """Return an answer of the last stage."""
     if heading_deg is not None:
         fields["heading_deg"] = heading_deg
     response = localise(client, plan_id, picture, **fields)
@@ -127,12 +127,14 @@ def confidences(answers: list[dict[str, Any]]) -> np.ndarray:
     return np.array([answer["confidence"] for answer in answers])
 
 
-def test_a_photograph_of_the_home_is_trusted(right: list[dict[str, Any]]) -> None:
+def test_photograph_of_the_home_is_trusted(right: list[dict[str, Any]]) -> None:
     assert np.median(confidences(right)) > 0.7
 
 
 @pytest.mark.parametrize("picture", PICTURES_OF_NO_ROOM.values(), ids=PICTURES_OF_NO_ROOM.keys())
-def test_a_picture_of_no_room_is_not(shipped: httpx.Client, homes: list[str], given: bool, picture: bytes) -> None:
+def test_picture_of_no_room_is_not_trusted(
+    shipped: httpx.Client, homes: list[str], given: bool, picture: bytes
+) -> None:
     answers = [ask(shipped, home, picture, 0.0 if given else None) for home in homes[:4]]
     assert confidences(answers).max() < 0.1
 
@@ -142,35 +144,35 @@ def upside_down(picture: np.ndarray) -> np.ndarray:
 
 
 def cut_out(picture: np.ndarray) -> np.ndarray:
-    """What an ordinary camera shows, drawn out to the size of a panorama."""
+    """Return the view of an ordinary camera, enlarged to the size of a panorama."""
     part = Image.fromarray(picture[HEIGHT // 3 : 2 * HEIGHT // 3, WIDTH // 4 : WIDTH // 2])
     return np.array(part.resize((WIDTH, HEIGHT), Image.Resampling.BILINEAR))
 
 
 @pytest.mark.parametrize("change", [upside_down, cut_out])
-def test_a_picture_that_is_no_panorama_of_the_home_is_not_trusted(
+def test_changed_panorama_is_not_trusted(
     shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool, change: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     answers = []
     for shot, home in zip(shots, homes, strict=True):
         changed = change(np.array(Image.open(io.BytesIO(shot.picture))))
         answers.append(ask(shipped, home, png(changed), shot.heading_deg if given else None))
-    # Some rooms look much the same upside down, and some parts of a room like a room.
+    # Some rooms look similar upside down, and some parts of a room look like a room.
     assert np.mean(confidences(answers) < 0.1) > 0.6
     assert confidences(answers).mean() < 0.25
 
 
-def test_a_photograph_of_another_home_is_hardly_trusted(
+def test_photograph_of_another_home_is_rarely_trusted(
     shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool
 ) -> None:
     pairs = zip(shots, homes[1:] + homes[:1], strict=True)
     foreign = [ask(shipped, home, shot.picture, shot.heading_deg if given else None) for shot, home in pairs]
-    # Some homes have a room like it.
+    # Some homes have a similar room.
     assert np.mean(confidences(foreign) < 0.1) >= 0.7
     assert confidences(foreign).mean() < 0.25
 
 
-def test_an_answer_tells_its_spread(right: list[dict[str, Any]], given: bool) -> None:
+def test_answer_has_a_covariance(right: list[dict[str, Any]], given: bool) -> None:
     for answer in right:
         covariance = np.array(answer["covariance_m2"])
         np.testing.assert_array_equal(covariance, covariance.T)
@@ -179,18 +181,18 @@ def test_an_answer_tells_its_spread(right: list[dict[str, Any]], given: bool) ->
     assert np.median([np.sqrt(np.trace(answer["covariance_m2"])) for answer in right]) < 0.5
 
 
-def test_right_answers_lie_within_their_spread(shots: list[Shot], right: list[dict[str, Any]]) -> None:
+def test_covariance_matches_the_errors(shots: list[Shot], right: list[dict[str, Any]]) -> None:
     distances = []
     for shot, answer in zip(shots, right, strict=True):
         offset = np.array([answer["position"]["x_m"], answer["position"]["y_m"]]) - shot.position_m
         if np.hypot(*offset) < 1.0:
             distances.append(offset @ np.linalg.solve(np.array(answer["covariance_m2"]), offset))
     assert len(distances) >= HOMES // 2
-    # Half of them should be below 1.4, nineteen in twenty below 6; a handful of answers tells no more than the order.
+    # 50 % should be below 1.4 and 95 % below 6; a few answers only show the order of magnitude.
     assert 0.15 < np.median(distances) < 10.0
 
 
-def test_a_heading_of_a_compass_is_corrected(shipped: httpx.Client, shots: list[Shot], homes: list[str]) -> None:
+def test_compass_heading_is_corrected(shipped: httpx.Client, shots: list[Shot], homes: list[str]) -> None:
     off = []
     for shot, home in list(zip(shots, homes, strict=True))[:6]:
         wrong_deg = shot.heading_deg + 0.8 * TOLERANCE_DEG
@@ -204,7 +206,7 @@ COPIES = 4
 
 
 def copies(plan: dict[str, Any]) -> dict[str, Any]:
-    """A plan of `COPIES` times the same home side by side."""
+    """Return a plan with `COPIES` copies of a home side by side."""
     corners = np.concatenate([room["polygon"] for room in plan["rooms"]])
     step_m = float(np.ptp(corners[:, 0])) + 3.0
 
@@ -215,16 +217,14 @@ def copies(plan: dict[str, Any]) -> dict[str, Any]:
     for k in range(COPIES):
         rooms += [{**room, "id": f"{room['id']}-{k}", "polygon": moved(room["polygon"], k)} for room in plan["rooms"]]
         openings += [
-            {key: value for key, value in one.items() if key != "rooms"} | {"line": moved(one["line"], k)}
-            for one in plan.get("openings", [])
+            {key: value for key, value in opening.items() if key != "rooms"} | {"line": moved(opening["line"], k)}
+            for opening in plan.get("openings", [])
         ]
     return {**plan, "rooms": rooms, "openings": openings}
 
 
-def test_of_copies_of_a_home_none_is_surer_than_its_share(
-    shipped: httpx.Client, shots: list[Shot], given: bool
-) -> None:
-    # The first stands in a room so narrow that the grid fits its copies unequally.
+def test_copies_of_a_home_share_the_probability(shipped: httpx.Client, shots: list[Shot], given: bool) -> None:
+    # The first room is so narrow that the grid fits its copies unequally.
     for shot in shots[:3]:
         answer = ask(
             shipped, upload(shipped, copies(shot.plan)), shot.picture, shot.heading_deg if given else None, top_k=10
@@ -234,7 +234,7 @@ def test_of_copies_of_a_home_none_is_surer_than_its_share(
         assert sum(shares) <= 1.0
 
 
-def test_a_heading_that_the_panorama_contradicts_is_said_and_not_followed(
+def test_contradicted_heading_is_searched_with_a_warning(
     shipped: httpx.Client, shots: list[Shot], homes: list[str]
 ) -> None:
     warned = 0
@@ -249,22 +249,20 @@ def test_a_heading_that_the_panorama_contradicts_is_said_and_not_followed(
     assert warned >= 3
 
 
-def test_a_heading_that_is_right_is_not_doubted(right: list[dict[str, Any]], given: bool) -> None:
+def test_right_heading_is_not_doubted(right: list[dict[str, Any]], given: bool) -> None:
     assert sum(bool(answer["warnings"]) for answer in right) <= 1
     if given:
         assert np.median([answer["heading_confidence"] for answer in right]) > 0.7
 
 
 def plain_room(size_m: tuple[float, float]) -> dict[str, Any]:
-    """A plan of one room without openings."""
+    """Return a plan of one room without openings."""
     polygon = [[0.0, 0.0], [size_m[0], 0.0], list(size_m), [0.0, size_m[1]]]
     return {"rooms": [{"name": "room", "polygon": polygon, "ceiling_height_m": 2.5}], "camera_height_m": 1.5}
 
 
 @pytest.mark.parametrize(("size_m", "ways"), [((3.2, 4.6), 2), ((3.2, 3.2), 4)], ids=["rectangle", "square"])
-def test_a_plain_room_is_split_between_its_headings(
-    shipped: httpx.Client, size_m: tuple[float, float], ways: int
-) -> None:
+def test_plain_room_splits_between_its_headings(shipped: httpx.Client, size_m: tuple[float, float], ways: int) -> None:
     room, picture = upload(shipped, plain_room(size_m)), painted_room(size_m, (0.8, 1.0))
     answer = ask(shipped, room, picture, None, top_k=5)
     shares = [candidate["probability"] for candidate in answer["candidates"]]
@@ -273,11 +271,11 @@ def test_a_plain_room_is_split_between_its_headings(
     assert answer["heading_confidence"] <= 1.0 / ways + 0.05
     turns = {round(candidate["heading_deg"] / (360.0 / ways)) % ways for candidate in answer["candidates"][:ways]}
     assert turns == set(range(ways))
-    # With the heading nothing is left to doubt.
+    # A known heading removes the ambiguity.
     assert ask(shipped, room, picture, 0.0)["confidence"] > 0.8
 
 
-def test_a_plain_corridor_is_known_across_and_not_along(shipped: httpx.Client, given: bool) -> None:
+def test_plain_corridor_is_uncertain_along_only(shipped: httpx.Client, given: bool) -> None:
     size_m = (40.0, 1.8)
     answer = ask(
         shipped, upload(shipped, plain_room(size_m)), painted_room(size_m, (15.0, 0.8)), 0.0 if given else None

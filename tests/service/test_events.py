@@ -77,7 +77,7 @@ def test_progress_is_streamed_until_ready(start_app: StartApp, tmp_path: Path) -
         progress = [event["progress"] for _, event in events]
         assert progress == sorted(progress)
         assert progress[-1] == 1.0
-        assert all(one != other for one, other in itertools.pairwise(events))
+        assert all(event != following for event, following in itertools.pairwise(events))
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
 
 

@@ -48,7 +48,7 @@ def test_idle_tenant_gets_a_slot(limit: int, steps: list[tuple[str, bool]]) -> N
             shares.take(client)
         elif not takes and shares.held_by(client):
             shares.give_back(client)
-        assert shares.in_use == sum(shares.held_by(one) for one in "abcd") <= limit
+        assert shares.in_use == sum(shares.held_by(client) for client in "abcd") <= limit
         assert shares.may_take("newcomer") == (shares.in_use < limit)
 
 

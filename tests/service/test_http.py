@@ -57,9 +57,9 @@ def test_unknown_query_parameter_is_refused(
 ) -> None:
     url = path.replace("PLAN", upload(client)) if "PLAN" in path else path
     problem = assert_problem(client.request(method, url), 422, "invalid-request")
-    told = {fault["field"]: fault["message"] for fault in problem["errors"]}
-    assert told.keys() == faults.keys()
-    assert all(faults[name] in told[name] for name in faults)
+    messages = {fault["field"]: fault["message"] for fault in problem["errors"]}
+    assert messages.keys() == faults.keys()
+    assert all(faults[name] in messages[name] for name in faults)
 
 
 def test_every_get_answers_head(client: httpx.Client) -> None:
@@ -219,11 +219,11 @@ def test_operations_describe_temporary_refusals(client: httpx.Client) -> None:
     document = client.get("/openapi.json").json()
     for path, operations in document["paths"].items():
         for operation in operations.values():
-            told = {status: response["description"] for status, response in operation["responses"].items()}
-            assert all(f"problem:{slug}" in told.get("503", "") for slug in ("overloaded", "stopping")) == (
+            descriptions = {status: response["description"] for status, response in operation["responses"].items()}
+            assert all(f"problem:{slug}" in descriptions.get("503", "") for slug in ("overloaded", "stopping")) == (
                 path not in EXEMPT
             )
-            assert ("504" in told) == (path not in EXEMPT)
+            assert ("504" in descriptions) == (path not in EXEMPT)
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
@@ -295,7 +295,7 @@ def test_request_with_two_lengths_is_refused_and_closed(client: httpx.Client, pa
     assert "both Content-Length and Transfer-Encoding" in answer
 
 
-@pytest.mark.parametrize(("scheme", "told"), [("https", "max-age=31536000"), ("http", None)])
-def test_https_answers_have_hsts(client: httpx.Client, scheme: str, told: str | None) -> None:
+@pytest.mark.parametrize(("scheme", "expected"), [("https", "max-age=31536000"), ("http", None)])
+def test_https_answers_have_hsts(client: httpx.Client, scheme: str, expected: str | None) -> None:
     response = client.get("/healthz", headers={"x-forwarded-proto": scheme})
-    assert response.headers.get("strict-transport-security") == told
+    assert response.headers.get("strict-transport-security") == expected

@@ -83,7 +83,7 @@ def test_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ([], "--scope"),
         (["--scope", "admin"], "admin"),
@@ -96,12 +96,12 @@ def test_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str])
     ],
 )
 def test_invalid_key_options_are_refused(
-    data_dir: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: str
+    data_dir: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         main([*CREATE, *options])
     assert ended.value.code == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not data_dir.exists()
 
 

@@ -24,15 +24,15 @@ TWO_ROOMS = {"rooms": [room(0.0), room(4.0)]}
 
 
 def test_limits_match_the_settings(client: httpx.Client) -> None:
-    told = client.get("/limits").json()
-    assert told.keys() == LimitsAnswer.model_fields.keys()
+    limits = client.get("/limits").json()
+    assert limits.keys() == LimitsAnswer.model_fields.keys()
     settings = Settings()
     # Left to the number of cores; this app has no LPO workers.
     resolved = Settings(workers=0, onnx_threads=1)
-    assert told.pop("max_queries") == resolved.query_limit > 0
-    assert told.pop("max_queries_per_tenant") == max_per_client(resolved.query_limit) < resolved.query_limit
-    assert told.pop("max_pending_requests") == resolved.pending_limit > resolved.query_limit
-    assert told == {name: settings.values()[name] for name in told}
+    assert limits.pop("max_queries") == resolved.query_limit > 0
+    assert limits.pop("max_queries_per_tenant") == max_per_client(resolved.query_limit) < resolved.query_limit
+    assert limits.pop("max_pending_requests") == resolved.pending_limit > resolved.query_limit
+    assert limits == {name: settings.values()[name] for name in limits}
 
 
 @pytest.mark.parametrize(

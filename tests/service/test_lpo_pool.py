@@ -93,7 +93,7 @@ def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: Refinement
     jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
     alone = [_refine(pool, job, 20.0) for job in jobs]
     with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda one: _refine(pool, one, 20.0), jobs))
+        together = list(threads.map(lambda job: _refine(pool, job, 20.0), jobs))
     for first, second in zip(alone, together, strict=True):
         assert first is not None
         assert second is not None

@@ -60,14 +60,14 @@ def test_ray_answers_like_one_process(
     on_ray: httpx.Client, plan_id: str, start_app: StartApp, data_dir: Path, panorama: bytes
 ) -> None:
     assert on_ray.get("/readyz").status_code == 200
-    told = localise(on_ray, plan_id, panorama, refine="vdr", heading_deg=30).json()
+    answer = localise(on_ray, plan_id, panorama, refine="vdr", heading_deg=30).json()
     with start_app(data_dir) as alone:
         expected = localise(alone, plan_id, panorama, refine="vdr", heading_deg=30).json()
     for name in ("position", "heading_deg", "room", "cost", "stage", "model", "floorplan_revision"):
-        assert told[name] == pytest.approx(expected[name]), name
+        assert answer[name] == pytest.approx(expected[name]), name
     optimised = localise(on_ray, plan_id, panorama, heading_deg=30).json()
     assert optimised["stage"] == "lpo"
-    assert optimised["cost"] <= told["cost"]
+    assert optimised["cost"] <= answer["cost"]
 
 
 @pytest.mark.slow
@@ -106,15 +106,15 @@ def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -
 
 @pytest.mark.slow
 def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    named = ray.util.list_named_actors(all_namespaces=True)
-    [lpo] = [one for one in named if one["name"].startswith(f"SERVE_REPLICA::{NAME}#lpo#")]
+    actors = ray.util.list_named_actors(all_namespaces=True)
+    [lpo] = [actor for actor in actors if actor["name"].startswith(f"SERVE_REPLICA::{NAME}#lpo#")]
     ray.kill(ray.get_actor(**lpo), no_restart=True)
     assert localise(on_ray, plan_id, panorama).status_code == 200
     wait_for(lambda: localise(on_ray, plan_id, panorama).json()["stage"] == "lpo", timeout_s=120.0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         ({"search_max": "0"}, "search_max is '0': .*greater than or equal to 1"),
         ({"searchers": "2"}, "searchers is '2': .*known: ingress_min, ingress_max"),
@@ -122,11 +122,11 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panora
     ],
 )
 def test_invalid_replica_numbers_are_refused(
-    arguments: dict[str, str], told: str, tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: dict[str, str], message: str, tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LALALOC_BUNDLE", str(tiny_bundle))
     assert isinstance(app({"search_max": "2"}), serve.Application)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=message):
         app(arguments)
 
 

@@ -166,14 +166,14 @@ def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) ->
     environment = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
     done = subprocess.run(script, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["stage"] == "lpo"
-    assert "onnxruntime" in told["modules"]
-    assert not {"torch", "safetensors", "matplotlib", "onnx"} & set(told["modules"])
+    report = json.loads(done.stdout)
+    assert report["stage"] == "lpo"
+    assert "onnxruntime" in report["modules"]
+    assert not {"torch", "safetensors", "matplotlib", "onnx"} & set(report["modules"])
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "told"),
+    ("variable", "value", "message"),
     [
         ("LALALOC_WORKER", "2", "unknown setting LALALOC_WORKER"),
         ("LALALOC_BUNDLE", "no/such", "no model bundle at"),
@@ -181,14 +181,14 @@ def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) ->
     ],
 )
 def test_invalid_setting_stops_the_start(
-    tiny_bundle: Path, tmp_path: Path, variable: str, value: str, told: str
+    tiny_bundle: Path, tmp_path: Path, variable: str, value: str, message: str
 ) -> None:
     environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
     command = [sys.executable, "-m", "service", "--port", "0"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     # Nor does it say where it could be reached.
     assert (done.returncode, done.stdout) == (1, "")
-    assert told in done.stderr
+    assert message in done.stderr
     assert done.stderr.count("\n") == 1
 
 

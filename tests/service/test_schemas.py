@@ -26,10 +26,10 @@ def test_answers_are_rounded(client: httpx.Client, panorama: bytes) -> None:
     third = [[0, 0], [4 / 3, 0], [4 / 3, 10 / 3], [0, 10 / 3]]
     plan_id = upload(client, {"ceiling_height_m": 2.5, "rooms": [{"name": "x", "polygon": third}]})
     answers = [localise(client, plan_id, panorama), client.get(f"/floorplans/{plan_id}"), client.get("/floorplans")]
-    told = [json.loads(answer.text) for answer in answers]
+    documents = [json.loads(answer.text) for answer in answers]
     # The plan itself is unchanged.
-    assert told[1].pop("plan")["rooms"][0]["polygon"] == third
-    numbers = _numbers(told)
+    assert documents[1].pop("plan")["rooms"][0]["polygon"] == third
+    numbers = _numbers(documents)
     assert len(numbers) > 20
     assert [number for number in numbers if number != round(number, 6)] == []
     # Uploaded numbers are unchanged.

@@ -109,14 +109,14 @@ def test_busy_connection_is_not_closed() -> None:
         assert answer.result(30.0).json() == "done"
 
 
-@pytest.mark.parametrize(("proxies", "told"), [(None, "127.0.0.1"), ("127.0.0.1", "203.0.113.7")])
-def test_only_named_proxies_are_trusted(monkeypatch: pytest.MonkeyPatch, proxies: str | None, told: str) -> None:
+@pytest.mark.parametrize(("proxies", "client_host"), [(None, "127.0.0.1"), ("127.0.0.1", "203.0.113.7")])
+def test_only_named_proxies_are_trusted(monkeypatch: pytest.MonkeyPatch, proxies: str | None, client_host: str) -> None:
     monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
     if proxies is not None:
         monkeypatch.setenv("FORWARDED_ALLOW_IPS", proxies)
     with _served(_app(), Settings()) as port:
         answer = httpx.get(f"http://127.0.0.1:{port}/who", headers={"x-forwarded-for": "203.0.113.7"})
-    assert answer.json() == told
+    assert answer.json() == client_host
 
 
 def test_descriptor_limit_bounds_connections() -> None:
@@ -132,11 +132,11 @@ def test_descriptor_limit_bounds_connections() -> None:
         "    print(error)\n"
     )
 
-    def told(soft: int, hard: int) -> str:
+    def output(soft: int, hard: int) -> str:
         command = [sys.executable, "-c", code, str(soft), str(hard)]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    assert told(256, 4096) == "1024 1240"
-    assert told(256, 1024) == "808 1024"
-    assert told(2048, 4096) == "1024 2048"
-    assert "128 file descriptors; at least 232 are needed" in told(128, 128)
+    assert output(256, 4096) == "1024 1240"
+    assert output(256, 1024) == "808 1024"
+    assert output(2048, 4096) == "1024 2048"
+    assert "128 file descriptors; at least 232 are needed" in output(128, 128)

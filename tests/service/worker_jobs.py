@@ -35,9 +35,9 @@ def run_broken(_connection: Connection, log: str) -> None:
     _note(log, "start")
 
 
-def _work(log: str, what: str, argument: Any) -> Any:
-    _note(log, what)
-    match what:
+def _work(log: str, kind: str, argument: Any) -> Any:
+    _note(log, kind)
+    match kind:
         case "echo":
             return argument
         case "sleep":

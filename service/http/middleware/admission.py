@@ -25,7 +25,7 @@ class AdmissionMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
-        # Without its lifespan an app has no slots.
+        # An app without its lifespan has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
         if scope["type"] != "http" or admission is None or (path := routed_path(scope)) in EXEMPT:
             await self._app(scope, receive, send)

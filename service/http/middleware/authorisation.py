@@ -19,7 +19,7 @@ class AuthorisationMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
-        # Without its lifespan an app has nothing to guard.
+        # An app without its lifespan has no access control.
         access: AccessControl | None = getattr(scope["app"].state, "access_control", None)
         if scope["type"] == "http" and access is not None and routed_path(scope) not in OPEN_PATHS:
             request = Request(scope)

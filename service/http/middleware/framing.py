@@ -1,4 +1,4 @@
-"""Refusal of requests that state the length of their body twice."""
+"""Refusal of requests with two body lengths."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from service.http.problems import problem_answer
 
 
 class FramingMiddleware:
-    """Middleware that answers 400 if a proxy could have used the other of two lengths (RFC 9112, 6.1)."""
+    """Middleware that answers 400 to a request with both body lengths, since a proxy can use either (RFC 9112, 6.1)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -29,7 +29,7 @@ _CLIENT_CLOSED = 499
 
 
 class TelemetryMiddleware:
-    """Outermost middleware, which sees even the answers to unexpected errors.
+    """Outermost middleware, which also sees the answers to unexpected errors.
 
     A valid `X-Request-ID` or `traceparent` of the client is kept; both are returned.
 
@@ -58,7 +58,7 @@ class TelemetryMiddleware:
             await self._app(scope, exchange.receive, exchange.send)
         except Exception:
             logging.getLogger(LOGGER_NAME).exception("unexpected error")
-            # After a complete answer, re-raising would only log the trace again, without ids.
+            # Re-raising after a complete answer would only log the trace again, without ids.
             if not exchange.complete:
                 raise
         finally:
@@ -114,7 +114,7 @@ class TelemetryMiddleware:
         logging.getLogger(LOGGER_NAME).log(level, "request", extra={"fields": fields})
 
     def _template(self, scope: Scope) -> str:
-        """Return the route's template; real paths would make a time series per floor plan."""
+        """Return the route's template; real paths would create a time series per floor plan."""
         if "route" in scope:
             return getattr(scope["route"], "path", "unmatched")
         found = (route.path for route in self._routes if route.path_regex.match(scope["path"]))
