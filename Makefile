@@ -27,7 +27,7 @@ serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with t
 # The core's tests run in two processes with one thread each; the service's tests need an otherwise idle machine. The
 # second half runs even if the first fails.
 test: lint site ## lint, build the site, run the tests
-	status=0; \
+	@status=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web || status=1; \
 	$(BIN)/python -m pytest tests/service tests/client tests/web || status=1; \
 	exit $$status

@@ -23,14 +23,6 @@ _ACCURACY_ROWS = {
     "heldout_empty": "out-of-distribution, unfurnished, known heading",
     "layout": "true layout as query, known heading",
 }
-_TERM_ROWS = {
-    "all": "all terms",
-    "without_openings": "without openings",
-    "without_see_through": "without looking through openings",
-    "without_ceiling": "without ceilings",
-    "without_room_type": "without room types",
-    "walls_alone": "walls alone",
-}
 
 
 def accuracy_table() -> str:
@@ -55,18 +47,6 @@ def accuracy_table() -> str:
                 f"{scores['n']}",
             )
         )
-    return "\n".join(rows)
-
-
-def terms_table() -> str:
-    """Return the share within 1 m with and without each term of the matching cost as a Markdown table."""
-    terms = _bench()["terms"]
-    columns = [(family, heading) for family in ("test", "heldout") for heading in ("known_heading", "unknown_heading")]
-    titles = [f"{family}, {heading.removesuffix('_heading')} heading" for family, heading in columns]
-    rows = [_row("", *titles), "|---" * (len(columns) + 1) + "|"]
-    for name, title in _TERM_ROWS.items():
-        shares = (_percent(terms[family][name][heading]["within_1m"]) for family, heading in columns)
-        rows.append(_row(title, *shares))
     return "\n".join(rows)
 
 
@@ -101,8 +81,9 @@ def speed_table() -> str:
 
 
 def paper_tables() -> str:
-    """Return every table of the paper with our figures beside the paper's, as Markdown."""
-    return "\n".join(markdown(TableResult.read(PAPER_TABLES / f"{table.name}.json")) for table in TABLES).rstrip()
+    """Return the measured tables of the paper with our figures beside the paper's, as Markdown."""
+    paths = [PAPER_TABLES / f"{table.name}.json" for table in TABLES]
+    return "\n".join(markdown(TableResult.read(path)) for path in paths if path.exists()).rstrip()
 
 
 def _row(*cells: str) -> str:
