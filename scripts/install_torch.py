@@ -50,7 +50,7 @@ def pinned_version(pyproject: str) -> str:
 
 
 def has_gpu() -> bool:
-    """Whether an NVIDIA driver answers and lists a GPU."""
+    """Return true if an NVIDIA driver answers and lists a GPU."""
     try:
         listing = subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=30, check=True, text=True)
     except (OSError, subprocess.SubprocessError):
@@ -59,7 +59,7 @@ def has_gpu() -> bool:
 
 
 def is_installed(version: str, *, wants_cpu: bool) -> bool:
-    """Whether this environment has the version; without a GPU any build of it will do, as it was the best found."""
+    """Return true if this environment has the version; without a GPU any build of it suffices."""
     try:
         installed = importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:

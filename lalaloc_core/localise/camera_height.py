@@ -48,12 +48,12 @@ class CameraHeight:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the height is exact."""
+        """True if the height is exact."""
         return self.std_m == 0.0
 
     @property
     def is_unknown(self) -> bool:
-        """Whether the height is unknown."""
+        """True if the height is unknown."""
         return math.isinf(self.std_m)
 
     @property

@@ -155,7 +155,7 @@ class Hints:
 
     @property
     def are_none(self) -> bool:
-        """Whether there are no hints."""
+        """True if there are no hints."""
         return self.near is None and self.rooms is None and self.level is None
 
     @property

@@ -1,4 +1,4 @@
-"""What is said of a shot is true of its scene, and what is new in a room leaves its layout alone."""
+"""Facts of shots match their scenes; new objects in a room keep its layout."""
 
 from __future__ import annotations
 

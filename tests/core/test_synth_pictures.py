@@ -1,4 +1,4 @@
-"""What the camera of a synthetic photograph does: supersampling, lenses, patches, compression."""
+"""Camera of synthetic photographs: supersampling, lenses, patches, compression."""
 
 from __future__ import annotations
 

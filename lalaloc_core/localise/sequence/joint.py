@@ -121,7 +121,7 @@ class _Evaluation:
     curvature: Float[np.ndarray, "m u u"]
 
     def replaced(self, other: _Evaluation, chosen: Bool[np.ndarray, "m"]) -> _Evaluation:
-        """Those that are chosen taken from another one."""
+        """Return the evaluation with the chosen rows of another one."""
         return _Evaluation(
             np.where(chosen, other.cost, self.cost),
             np.where(chosen[:, None], other.slope, self.slope),

@@ -72,7 +72,7 @@ class Motion:
 
     @property
     def is_unknown(self) -> bool:
-        """Whether nothing was measured."""
+        """True if nothing was measured."""
         return self.distance_m is None and self.turn is None
 
     @property
