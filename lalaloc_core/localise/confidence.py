@@ -5,7 +5,7 @@ in other homes (`localise.cohort`), the uncertainty that the image encoder predi
 model of the signals is fitted on validation queries and on photographs of unknown places
 (`lalaloc_core.evaluate.calibrate`).
 
-`confidence_of` is the only function that computes the confidence. The classes of the logistic model
+`confidence_of` computes the confidence of an answer; `sequence.search` combines it for several photographs. The classes of the logistic model
 (`bundle.ConfidenceModel`, `bundle.LogisticModel`) are in `bundle.py`, as their weights are part of the manifest.
 """
 
@@ -34,7 +34,7 @@ class Signals:
         latent_distance: of the answer. Pictures without a room fit anywhere, as their predictions are uncertain, but
             their latents are far from every layout's.
         cost_to_chance: log of the cost of the plan's best grid pose over the cost of a fit by chance.
-        answer_to_chance: the same for the answer, whose cost refinement has lowered, most of all at the right place.
+        answer_to_chance: the same for the refined answer; refinement lowers the cost most at the right place.
     """
 
     log_odds: float

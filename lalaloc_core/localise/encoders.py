@@ -1,4 +1,4 @@
-"""The exported encoders on onnxruntime: layouts and panoramas to latents. This module never imports torch."""
+"""The exported encoders on onnxruntime: latents of layouts; latents and predictions of panoramas. Never imports torch."""
 
 from __future__ import annotations
 

@@ -341,7 +341,7 @@ class _Search:
         return resampled + candidates[count:]
 
     def lpo_job(self, candidates: list[Candidate]) -> RefinementJob:
-        """Return the refinement job of the first of some candidates."""
+        """Return the refinement job of the first candidates."""
         weights, matching = self._encoders.manifest.evidence, self._config.matching
         starts = candidates[: self._lpo_count]
         return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, weights, matching)

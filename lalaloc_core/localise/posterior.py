@@ -224,7 +224,7 @@ def _width_corrections(
     depth: Float[np.ndarray, "r"],
     temperature: float,
 ) -> Float[np.ndarray, "m"]:
-    """Return log factors that make refined modes as wide as the deepest, of ties as the widest.
+    """Return log factors that give all refined modes the width of the deepest; of tied modes, of the widest.
 
     The number of grid poses that fit a mode depends on where the lattice lies, and differs between copies of one room.
 

@@ -1,4 +1,4 @@
-"""Program of a decoding worker process, the only part of the service that opens uploaded pictures.
+"""Program of a decoding worker process, which opens uploaded photographs.
 
 It turns an uploaded file into a `Panorama` or a `DecodeRefusal`. It also rasterises drawings, which keeps the
 interpreter busy for as long.

@@ -54,7 +54,7 @@ class PoseOptimiser:
     def refine(self, job: RefinementJob) -> RefinementResult:
         """Refine every starting pose of a job within its own room, by its `targets` and `precision` alone.
 
-        Both distances of the result are by this optimiser's norm.
+        `cost` and `latent_distance` of the result are distances by this optimiser's norm.
         """
         problem = Problem(self._embedding, self._columns, self._norm, job, self._device)
         descend = adam if self.config.method == "adam" else levenberg_marquardt

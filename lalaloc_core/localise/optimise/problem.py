@@ -45,7 +45,7 @@ class LpoConfig:
         method: the optimiser.
         margin_m: smallest distance of poses to walls, so that none crosses one.
         max_iterations: maximum number of Levenberg-Marquardt evaluations, including the first at the start.
-        profile_iterations: the same for wall profiles, as predictions are less accurate than the last steps.
+        profile_iterations: the same for wall profiles; more steps would follow errors of the prediction.
         exact_cost: poses below this cost continue up to `max_iterations`.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
         tolerance_cost: a step that lowers the cost by less than this share, or would by the linear model, ends it too.
