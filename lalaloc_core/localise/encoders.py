@@ -1,4 +1,4 @@
-"""The exported encoders on onnxruntime: latents of layouts; latents and predictions of panoramas. Never imports torch."""
+"""Exported encoders on onnxruntime: latents of layouts, latents and predictions of panoramas. Never imports torch."""
 
 from __future__ import annotations
 
