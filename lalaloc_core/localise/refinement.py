@@ -32,8 +32,8 @@ def refinement_job(
 ) -> RefinementJob:
     """Return the job that refines candidates, each within its own room.
 
-    The refiner compares walls, or latents if the model predicts no walls; other terms do not move poses. An azimuth with
-    a view through an opening counts by the probability that the prediction is of the pose's own wall.
+    The refiner compares walls, or latents if the model predicts no walls; other terms do not move poses. An azimuth
+    with a view through an opening counts by the probability that the prediction is of the pose's own wall.
     """
     rooms = np.array([candidate.room_index for candidate in candidates])
     hypotheses = np.array([candidate.hypothesis for candidate in candidates])
