@@ -30,7 +30,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-mo
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
-# The library's query side; the wings that learn and evaluate are used through the command line.
+# The library's query side; training and evaluation are used through the command line.
 apidoc_modules = [
     {"path": "../lalaloc_client", "destination": "reference/python/lalaloc_client"},
     {

@@ -21,7 +21,8 @@ TWO_PI = 2.0 * math.pi
 # A lower camera height was probably given in another unit.
 MIN_CAMERA_HEIGHT_M = 0.1
 
-# Classes of what a horizontal ray meets at eye height; the index is the code in plans, layouts, networks and search.
+# Classes of the surface that a horizontal ray hits at eye height; the index is the code in plans, layouts, networks
+# and search.
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 

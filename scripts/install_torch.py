@@ -41,7 +41,7 @@ def main() -> int:
 
 
 def pinned_version(pyproject: str) -> str:
-    """The version in the one `torch==` requirement of a pyproject.toml."""
+    """Return the version in the only `torch==` requirement of a pyproject.toml."""
     extras = tomllib.loads(pyproject)["project"]["optional-dependencies"]
     requirements = [requirement for extra in extras.values() for requirement in extra]
     versions = {match[1] for requirement in requirements if (match := re.fullmatch(r"torch==([\w.]+)", requirement))}

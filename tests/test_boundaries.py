@@ -147,7 +147,7 @@ def _imported(module: str, nodes: Iterator[ast.AST]) -> set[str]:
 
 
 def _at_import_time(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes that run at import, without functions and imports for the type checker."""
+    """Yield the nodes that run at import: not in functions, and not for the type checker only."""
     for child in ast.iter_child_nodes(node):
         lazy = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         typing_only = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)

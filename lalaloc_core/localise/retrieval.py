@@ -29,7 +29,7 @@ _ALL_COMPARED = 2560
 _ESTIMATED = 65_536
 # Largest gain of refinement plus error of the coarse pass, in units of the cost.
 _MARGIN = 0.35
-# The last of the pairs compared in full, which calibrate the coarse pass for those that were not.
+# The last pairs compared in full, which calibrate the coarse pass for the other pairs.
 _CALIBRATING = 256
 # Best pairs that are searched for distinct candidates at first.
 _FIRST_RANKED = 1024

@@ -107,7 +107,7 @@ class TestPlans:
 class TestTruth:
     @staticmethod
     def closed(seed: int) -> tuple[FloorPlan, Tracer]:
-        """A home without any opening or furniture."""
+        """Return a home without openings or furniture."""
         rng = np.random.default_rng(seed)
         plan = sample_plan(rng, "closed").plan
         return plan, Tracer(shell_parts(plan, [], rng))

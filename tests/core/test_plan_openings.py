@@ -87,7 +87,7 @@ def test_passage_to_two_rooms_is_split() -> None:
 
 
 def test_nearer_wall_gets_the_opening() -> None:
-    """A recess as deep as a wall is thick."""
+    """Test a recess as deep as a wall is thick."""
     recessed = [[0, 0], [4, 0], [4, 3], [3, 3], [3, 3.2], [1, 3.2], [1, 3], [0, 3]]
     document = plan_document(recessed) | {"openings": [{"kind": "window", "line": [[1.2, 3.2], [2.8, 3.2]]}]}
     assert [face.wall for face in FloorPlan.from_dict(document).opening_faces] == [4]

@@ -42,7 +42,7 @@ def slivers(count: int) -> dict[str, Any]:
 
 
 def test_crossing_combs_stay_within_the_work_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The total size of intersected pairs is limited, independent of the number of rooms."""
+    """Check that the total size of intersected pairs is limited, independent of the number of rooms."""
     intersected = []
     intersection = shapely.intersection
 

@@ -48,7 +48,7 @@ def home_of(seed: int) -> Home:
 
 
 def shut(home: Home) -> Home:
-    """The same home with every door and wide opening shut."""
+    """Return the home with every door and wide opening shut."""
     openings = tuple(
         opening if opening.kind == "window" else dataclasses.replace(opening, kind="door_shut")
         for opening in home.openings

@@ -27,7 +27,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def camera(**settings: float) -> Exposure:
-    """One row of an otherwise neutral exposure."""
+    """Return one row of a neutral exposure."""
     return Exposure(torch.from_numpy(Exposure.row(**settings))[None])
 
 

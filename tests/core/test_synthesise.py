@@ -68,7 +68,7 @@ def content(root: Path) -> dict[str, bytes]:
 
 
 def homes_of(root: Path) -> Iterator[tuple[Path, Home, list]]:
-    """The scenes of a folder with the homes and shots that they must show."""
+    """Yield the scenes of a folder with the homes and shots that they must show."""
     for number in NUMBERS["test"]:
         home, rng = home_of(TEST, SEED, number)
         yield root / f"scene_{number:05d}", home, stage_rooms(home, rng)

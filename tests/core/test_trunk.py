@@ -190,7 +190,7 @@ class TestEncoder:
 
     @pytest.mark.parametrize("factor", [0.5, 1.1, 1.7])
     def test_camera_height_scales_lengths_only(self, encoder: TrunkImageEncoder, factor: float) -> None:
-        """An error of the stated height is one offset of the log profile and the log ceiling."""
+        """Check that an error of the stated height is one offset of the log profile and the log ceiling."""
         image, height = pictures(2), torch.tensor([1.2, 1.6])
         plain, scaled = encoder(image, height), encoder(image, factor * height)
         assert plain.structure is not None
@@ -209,7 +209,7 @@ class TestEncoder:
 
     @pytest.mark.parametrize("turns", [1, 3])
     def test_encoder_is_equivariant_to_rolling(self, encoder: TrunkImageEncoder, turns: int) -> None:
-        """Rolling by whole columns of the coarsest map is exact: azimuth has no border."""
+        """Check that rolling by whole columns of the coarsest map is exact, because azimuth has no border."""
         image, height = pictures(2), torch.tensor([1.2, 1.6])
         pixels = turns * TAP_STRIDES[-1]
         plain, rolled = encoder(image, height), encoder(image.roll(pixels, 2), height)
@@ -224,7 +224,7 @@ class TestEncoder:
         torch.testing.assert_close(rolled.structure.log_ceiling, plain.structure.log_ceiling, atol=1e-5, rtol=1e-5)
 
     def test_sectors_align_with_their_pixels(self) -> None:
-        """Interpolation maps the centre of a column's receptive field to the sector there."""
+        """Check that interpolation maps the centre of a column's receptive field to its sector."""
         for stride in TAP_STRIDES:
             weights = _interpolation(256, stride, 64)
             torch.testing.assert_close(weights.sum(dim=1), torch.ones(64))
@@ -234,7 +234,7 @@ class TestEncoder:
             torch.testing.assert_close(weights[middle] @ place, (middle + 0.5) * 4.0 - 0.5)
 
     def test_trunk_columns_are_centred_for_interpolation(self) -> None:
-        """The centre of mass of a column's receptive field, for equal weights, is the expected one."""
+        """Check the centre of mass of a column's receptive field for equal weights."""
         trunk = Trunk(WIDE.trunk)
         for parameter in trunk.parameters():
             parameter.data.fill_(0.01 if parameter.ndim > 1 else 0.0)

@@ -63,7 +63,7 @@ def batch() -> dict[str, torch.Tensor]:
 
 
 def plan(**changes: Any) -> FloorPlan:
-    """A square room of 4 m with a window in its northern wall."""
+    """Return a square room of 4 m with a window in its northern wall."""
     document: dict[str, Any] = {
         "rooms": [{"polygon": [[0, 0], [4, 0], [4, 4], [0, 4]], "ceiling_height_m": 2.5, "type": "bedroom"}],
         "openings": [{"kind": "window", "line": [[1, 4], [3, 4]], "sill_m": 0.9, "head_m": 2.0}],

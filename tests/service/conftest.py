@@ -59,13 +59,13 @@ def _skip_per_replica_tests(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture(scope="session")
 def panorama() -> bytes:
-    """A valid panorama without content: smooth colours, 512 x 256."""
+    """Return a valid panorama without content: smooth colours, 512 x 256."""
     return encode_picture(512, 256, "JPEG")
 
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[PostgresServer]:
-    """A PostgreSQL server for the tests."""
+    """Yield a PostgreSQL server for the tests."""
     programs = postgres_programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed; on Debian and Ubuntu the package is postgresql")
@@ -137,7 +137,7 @@ class InTurn(httpx.BaseTransport):
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """One app for the tests of a module that do not disturb each other."""
+    """Yield one app for the tests of a module, which do not disturb each other."""
     with start_app(tmp_path_factory.mktemp("data")) as started:
         yield started
 
@@ -162,7 +162,7 @@ def serve(app: FastAPI) -> Iterator[str]:
 
 
 def encode_picture(width: int, height: int, picture_format: str, **options: Any) -> bytes:
-    """A smooth picture as encoded bytes."""
+    """Return a smooth picture as encoded bytes."""
     x, y = np.meshgrid(np.linspace(0.0, 6.28, width), np.linspace(0.0, 3.14, height))
     channels = [127.0 + 120.0 * np.sin(x + phase) * np.sin(y) for phase in (0.0, 2.0, 4.0)]
     buffer = io.BytesIO()

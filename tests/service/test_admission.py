@@ -26,7 +26,7 @@ PLACES = 3
 
 @pytest.fixture(scope="module")
 def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """An app with few places, one thread that computes, and large grids that take their time."""
+    """Yield an app with few slots, one computing thread, and large grids that take long."""
     limits = {"max_pending_requests": PLACES + 1, "max_queries": 1, "max_waiting_queries": 0, "max_reads": 2}
     limits["compute_threads"] = 1
     with start_app(tmp_path_factory.mktemp("data"), upload_deadline_s=30.0, **limits) as client:
@@ -35,7 +35,7 @@ def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 @contextmanager
 def _open_upload(client: httpx.Client, path: str = "/floorplans") -> Iterator[socket.socket]:
-    """An upload whose body does not come."""
+    """Open an upload that never sends its body."""
     with socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=10.0) as connection:
         head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         connection.sendall(f"{head}Content-Length: 100000\r\n\r\n{{".encode())

@@ -30,7 +30,7 @@ Event = tuple[str, dict[str, Any]]
 
 
 def _events(response: httpx.Response) -> Iterator[Event]:
-    """The events of a stream as they come; comments are left out."""
+    """Yield the events of a stream as they arrive, without comments."""
     name, data = "message", ""
     for line in response.iter_lines():
         field, _, value = line.partition(": ")

@@ -160,7 +160,7 @@ def test_addresses_of_a_network_count_as_one(address: str, network: str) -> None
 
 @contextmanager
 def _sent(client: httpx.Client, head: str) -> Iterator[socket.socket]:
-    """A request from another address whose answer is not read."""
+    """Send a request from another address without reading its answer."""
     address = (client.base_url.host, client.base_url.port or 80)
     with socket.socket() as connection:
         # Next to nothing of the answer fits in.
@@ -247,7 +247,7 @@ def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path
 
 
 def _endless_picture() -> bytes:
-    """A JPEG of so many scans that decoding it takes most of a minute."""
+    """Return a JPEG with so many scans that decoding it takes most of a minute."""
     from tests.core.test_images import of_scans
 
     return of_scans(14_000, 7_000, 400)

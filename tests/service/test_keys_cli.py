@@ -16,7 +16,7 @@ CREATE = ["keys", "create", "--tenant", "acme", "--name", "camera 7"]
 
 @pytest.fixture
 def data_dir(tmp_path: Path, database_of: DatabaseOf, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The data folder that the settings in the environment name."""
+    """Return the data folder that the settings in the environment name."""
     monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path / "data"))
     if not (url := database_of(tmp_path / "data")).startswith("sqlite"):
         monkeypatch.setenv("LALALOC_DATABASE_URL", url)

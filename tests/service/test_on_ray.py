@@ -40,7 +40,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[httpx.Client]:
-    """The service on Ray, with two replicas that search."""
+    """Yield the service on Ray with two search replicas."""
     # Deadlines as they would be on a machine that has nothing else to do are not what is tested.
     patient: dict[str, Any] = {"request_deadline_s": 50.0, "decode_stall_s": 50.0, "lpo_deadline_s": 30.0}
     processes: dict[str, Any] = {"decode_workers": 1, "import_workers": 1}
@@ -51,7 +51,7 @@ def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[http
 
 @pytest.fixture(scope="module")
 def plan_id(on_ray: httpx.Client) -> str:
-    """A plan, stored through Ray."""
+    """Return the id of a plan that was stored through Ray."""
     return upload(on_ray, FLAT)
 
 

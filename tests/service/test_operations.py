@@ -23,7 +23,7 @@ PAGE = (GUIDES / "operate.md").read_text(encoding="utf-8")
 
 
 def stored(client: httpx.Client, panorama: bytes) -> tuple[list[dict[str, object]], object]:
-    """All plans, and where the panorama is in the oldest of them."""
+    """Return all plans, and the position of the panorama in the oldest plan."""
     plans = client.get("/floorplans").json()["floorplans"]
     answer = localise(client, plans[-1]["id"], panorama, heading_deg=0)
     assert answer.status_code == 200, answer.text
@@ -99,7 +99,7 @@ def test_documented_settings_exist() -> None:
 
 
 def own_database(postgres: PostgresServer) -> str:
-    """A database, where those of the other tests are schemas; gives its address."""
+    """Create a database of its own, because other tests only use schemas, and return its address."""
     name = f"backup_{uuid.uuid4().hex}"
     run(postgres, "psql", "--command", f"CREATE DATABASE {name}", postgres.url())
     return postgres.url().rpartition("/")[0] + f"/{name}"

@@ -23,7 +23,7 @@ LPO_DEADLINE_S = 60.0
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """An app with one LPO worker, on untrained networks of the paper's architecture."""
+    """Yield an app with one LPO worker, on untrained networks of the paper's architecture."""
     sizes = PaperConfig(width=8, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128)
     config = dataclasses.replace(PRESETS["paper"], paper=sizes)
     folder = tmp_path_factory.mktemp("paper")

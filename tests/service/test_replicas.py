@@ -156,7 +156,7 @@ OF_THE_PROXY = {
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The proxy, without any replica that answers."""
+    """Yield the proxy without any replica that answers."""
     with ExitStack() as stack:
         nobody = [stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}")) for port in (9, 19)]
         yield stack.enter_context(nginx(tmp_path_factory.mktemp("nginx"), nobody, status=502))

@@ -26,7 +26,7 @@ class _Service:
     port: int
 
     def connect(self, sent: bytes) -> socket.socket:
-        """A connection on which something was sent already."""
+        """Return a connection on which some bytes were sent already."""
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=20.0)
         connection.sendall(sent)
         return connection

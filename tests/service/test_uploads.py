@@ -23,7 +23,7 @@ HEAD = (
 
 @contextmanager
 def open_body(client: httpx.Client) -> Iterator[socket.socket]:
-    """A connection on which a body has been announced."""
+    """Open a connection on which a body has been announced."""
     port = client.base_url.port
     assert port is not None
     with socket.create_connection(("127.0.0.1", port), timeout=20.0) as connection:

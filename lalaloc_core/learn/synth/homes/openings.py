@@ -168,7 +168,7 @@ def _door_or_opening(
         head = ceiling_m if rng.random() < 0.45 else rng.uniform(2.0, ceiling_m)
         stubs = np.where(rng.random(2) < 0.3, 0.0, rng.uniform(0.05, 0.6, 2))
         if is_public and rng.random() < 0.6 and facing.length_m - stubs.sum() > _WIDE_M:
-            # Open plan: nothing of the wall is left but stubs at its ends, if that.
+            # Open plan: at most stubs remain at the ends of the wall.
             width, side = facing.length_m - stubs.sum(), stubs[0] / max(stubs.sum(), 1e-6)
         elif is_public:
             width = rng.uniform(0.8, max(0.9, facing.length_m))

@@ -194,7 +194,7 @@ def _before(
         ],
         dim=-1,
     )
-    # Furniture in the own room before a hole; beyond the hole it shares the slot of what lies behind it.
+    # Furniture in the own room before a hole; beyond the hole it shares the slot of the surface behind it.
     slot = torch.where(furniture & (hit_m < own_m), 0, shell.slot)
     incidence = (own_normal * direction).sum(dim=-1).abs()[:, :, None]
     wall_gap = torch.where(vertical == 0.0, 10.0, (own_m - hit_m).abs() * incidence)

@@ -167,7 +167,7 @@ def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Flo
     """Draw a position in front of an opening or in it, clear of the walls beside it; None if none is found."""
     start, along, inwards = wall_frame(room, opening.wall)
     ends = shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
-    # A hair wider than the opening itself, so that nothing of it is left.
+    # Slightly wider than the opening, so that no sliver of it remains.
     walls = room.shape.boundary.difference(ends.buffer(1e-3))
     low, high = (_IN_OPENING_M, POSE_MARGIN_M) if rng.random() < 0.5 else (POSE_MARGIN_M, _THRESHOLD_M)
     for _ in range(_TRIES):
