@@ -63,7 +63,7 @@ def test_hard_places_include_openings_and_clear_walls() -> None:
             nearest_m = room.shape.boundary.distance(here)
             assert nearest_m > 0.029
             inside += nearest_m < POSE_MARGIN_M - 1e-6
-    # Three in ten hard places are thresholds, if there is an opening, and every other one of them is in it.
+    # 30 % of the hard places are thresholds if there is an opening, and half of these are in the opening.
     assert 0.05 < inside / (8 * 40) < 0.2
 
 

@@ -1,4 +1,4 @@
-"""Synthetic scenes on disk in Structured3D's layout: what is in the files, and how they come to be there."""
+"""Synthetic scenes on disk in Structured3D's layout: contents of the files, and writing them."""
 
 from __future__ import annotations
 

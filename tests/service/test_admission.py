@@ -119,7 +119,7 @@ def test_slot_queue_is_bounded_and_round_robin() -> None:
             slots.check("c")
         with pytest.raises(OverloadedError):
             await query("c")
-        # A place to wait in comes free when whoever has it leaves, or has waited long enough.
+        # A place in the queue becomes free when its request leaves or times out.
         others[1].cancel()
         await asyncio.sleep(0)
         assert slots.waiting == 3

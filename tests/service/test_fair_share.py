@@ -57,7 +57,7 @@ def test_greedy_clients_get_equal_shares(limit: int, clients: int) -> None:
     shares, names = Shares(limit), range(clients)
     while shares.may_take(0):
         shares.take(0)
-    # Work ends in the order in which it began, and the place goes to whoever may have it.
+    # The busiest client gives back a unit, and the permitted clients with the fewest units take units.
     for _ in range(20 * limit):
         busiest = max(names, key=shares.held_by)
         shares.give_back(busiest)
@@ -198,13 +198,13 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
 @pytest.mark.one_replica
 def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_reads=8, max_plan_bytes=32 * 2**20) as client, ExitStack() as attack:
-        # White space is kept, and no socket holds as much.
+        # White space is kept, and the body is larger than the socket buffers.
         content = httpx.Request("POST", "http://x", json=FLAT).read() + b" " * (30 * 2**20)
         created = client.post("/floorplans", content=content, headers={"Content-Type": "application/json"})
         path = f"{created.headers['location']}/original"
         for _ in range(10):
             attack.enter_context(_sent(client, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n"))
-        # As many as the address may have, which is more than compute at a time.
+        # The limit of the address, which is more than the reads that run at a time.
         wait_for(lambda: _gauge(client, "lalaloc_reads_in_flight") == 6)
         sleep(0.2)
         assert client.get(path).content == content

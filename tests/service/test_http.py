@@ -132,7 +132,7 @@ def test_unexpected_error_reveals_only_the_request_id() -> None:
     def broken() -> Runtime:
         raise RuntimeError("secret detail")
 
-    # The app is never started: nothing is there to answer with, as after a programming error.
+    # The app is never started, so every route fails as after a programming error.
     app.dependency_overrides[get_runtime] = broken
     app.router.lifespan_context = _no_lifespan
     with serve(app) as base_url:

@@ -49,7 +49,7 @@ def test_only_the_key_is_printed(data_dir: Path, capsys: pytest.CaptureFixture[s
         printed = capsys.readouterr().out
         assert key_id in printed
         assert secret not in printed
-        # Nor what is stored of it.
+        # The stored hash is not printed either.
         assert not re.search(r"[0-9a-f]{64}", printed)
     stored = [path for path in data_dir.rglob("*") if path.is_file()]
     assert not any(secret.encode() in path.read_bytes() for path in stored)

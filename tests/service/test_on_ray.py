@@ -96,9 +96,9 @@ def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -
     plans = [upload(on_ray, FLAT | {"name": f"flat {number}"}) for number in range(8)]
     revisions = {localise(on_ray, plan, panorama, refine="none").json()["floorplan_revision"] for plan in plans * 2}
     search = serve.get_deployment_handle("search", NAME)
-    # Enough to come across both.
+    # Enough requests to reach both replicas.
     kept = {search.options(session_id=str(number)).revisions.remote().result(timeout_s=30) for number in range(16)}
-    shares = [of_one & revisions for of_one in kept]
+    shares = [replica_revisions & revisions for replica_revisions in kept]
     assert len(shares) == 2
     assert all(shares)
     assert sum(len(share) for share in shares) == len(revisions) == len(plans)

@@ -186,7 +186,7 @@ def test_invalid_setting_stops_the_start(
     environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
     command = [sys.executable, "-m", "service", "--port", "0"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    # Nor does it say where it could be reached.
+    # The address is not printed either.
     assert (done.returncode, done.stdout) == (1, "")
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

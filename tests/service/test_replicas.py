@@ -43,7 +43,7 @@ def nginx(
     text = text.replace("listen 8080;", f"listen 127.0.0.1:{port};").replace("/tmp/", f"{folder}/")
     path = folder / "nginx.conf"
     path.write_text(text, encoding="utf-8")
-    # Started by root it would go on as another user, who may not write here.
+    # As root, nginx would switch to another user, who cannot write to this folder.
     options = "daemon off; user root;" if os.geteuid() == 0 else "daemon off;"
     process = subprocess.Popen([program, "-c", str(path), "-g", options])
     try:

@@ -24,7 +24,7 @@ class Part:
     """A mesh with one surface.
 
     Attributes:
-        surface: name of the material.
+        surface: kind of surface, such as `floor`, which selects the material.
         smooth: whether light sees its vertices' normals and not its facets'.
     """
 

@@ -130,7 +130,7 @@ class _Evaluation:
 
 
 def _evaluate(job: SequenceJob, unknowns: Float[np.ndarray, "m u"]) -> _Evaluation:
-    """Unknowns are x, y and heading of every picture, from where it began, and δ."""
+    """Evaluate paths; unknowns are the changes of x, y and heading of every picture, and δ."""
     count, pictures = job.heading.shape
     by_pose = unknowns[:, :-1].reshape(count, pictures, 3)
     position_m, heading = job.position_m + by_pose[:, :, :2], job.heading + by_pose[:, :, 2]
