@@ -196,7 +196,7 @@ def test_failed_insert_stores_nothing(store: Store, broken: str) -> None:
 def test_plan_limit_is_per_tenant(store: Store) -> None:
     _add(store, tenant="one")
     store.plans.add("two", "b", PLAN, original=Original(b"{}"), limit=1)
-    with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
+    with pytest.raises(TooManyFloorPlansError, match="1 stored floor plans"):
         store.plans.add("two", "c", PLAN, original=Original(b"{}"), limit=1)
     assert [summary.id for summary in store.plans.list_plans("two", limit=10)] == ["b"]
 
