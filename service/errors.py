@@ -188,7 +188,7 @@ class TooManyFloorPlansError(ServiceError):
     """The tenant's quota of floor plans is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} stored floor plans is reached (LALALOC_MAX_FLOORPLANS); delete some first")
+        super().__init__(f"the limit of {limit} stored floor plans is reached (LALALOC_MAX_FLOORPLANS); delete one")
 
 
 class TooManyVenuesError(ServiceError):
