@@ -51,10 +51,8 @@ def accuracy_table() -> str:
 
 
 def speed_table() -> str:
-    """Return latency, memory and throughput of the parts as a Markdown table."""
-    bench = _bench()
-    rendering, service = bench["rendering"], bench["service"]
-    methods, datasets = bench["methods"], bench["datasets"]
+    """Return latency and memory of the service as a Markdown table."""
+    service = _bench()["service"]
     memory = ", ".join(f"{size:.0f} MB" for size in service["workers_resident_mb"])
     rows = [
         "| what | measured |",
@@ -62,20 +60,6 @@ def speed_table() -> str:
         *(_latency(heading, service) for heading in ("known", "unknown")),
         _row("memory: service with one plan; its LPO worker", f"{service['service_resident_mb']:.0f} MB; {memory}"),
         _row("model bundle", f"{_bundle_mb():.1f} MB"),
-        _row(
-            f"pose grid of {rendering['grid_area_m2']:.0f} m², {rendering['grid_poses']} poses",
-            f"{rendering['grid_seconds']:.2f} s",
-        ),
-        _row(
-            "layout depth, 128 × 256, per pose: closed form; trimesh with embree",
-            f"{rendering['layout_depth_128x256_ms_per_pose']:.2f} ms; {rendering['oracle_128x256_ms_per_pose']:.1f} ms",
-        ),
-        _row(
-            "one query, one thread: 2D ICP; LaLaLoc (paper, GPU: 20.1 s; 4.65 s)",
-            f"{methods['icp_seconds']:.1f} s; {methods['lalaloc_seconds']:.2f} s",
-        ),
-        _row("reading scenes in Structured3D's layout", f"{datasets['scenes_read_per_second']:.0f} scenes/s"),
-        _row("rendering panoramas, 256 × 512", f"{datasets['panoramas_written_per_second']:.0f} panoramas/s"),
     ]
     return "\n".join(rows)
 
