@@ -195,7 +195,7 @@ class TooManyVenuesError(ServiceError):
     """The tenant's quota of venues is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} stored venues is reached (max_venues); delete some first")
+        super().__init__(f"the limit of {limit} stored venues is reached (LALALOC_MAX_VENUES); delete one")
 
 
 class VenueUnsearchableError(ServiceError):
