@@ -187,12 +187,7 @@ class LoadResult:
 def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, *, pause_s: float = 1.0) -> LoadResult:
     """Localise with several clients at once.
 
-    Args:
-        url: the service.
-        plan_ids: plans, which the clients take in turns.
-        clients: number of clients.
-        seconds: duration of the test, rounded up to whole seconds.
-        pause_s: pause of a client after a refusal.
+    The clients take the plans in turns and pause for `pause_s` after a refusal. `seconds` is rounded up.
     """
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report"
@@ -206,12 +201,7 @@ def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, *,
 def busy_tenant(url: str, plan_id: str, picture: Path, clients: int, address: str) -> Iterator[None]:
     """Send a picture with several clients of another tenant until the block ends.
 
-    Args:
-        url: the service.
-        plan_id: the plan to localise in.
-        picture: the file to send.
-        clients: number of clients.
-        address: local address of the clients, their tenant without API keys.
+    Without API keys the clients' local `address` is their tenant.
     """
     options = ["--picture", str(picture), "--source-address", address]
     with _locust("BusyUser", url, [plan_id], clients, options):

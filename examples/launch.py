@@ -34,11 +34,9 @@ class RunningService:
 
 @contextmanager
 def running_service(port: int, environment: Mapping[str, str]) -> Iterator[RunningService]:
-    """Run the service at 127.0.0.1 until the block ends. It logs to standard error.
+    """Run the service at 127.0.0.1 until the block ends, on `port`, 0 for a free one. It logs to standard error.
 
-    Args:
-        port: port to listen on, 0 for a free port.
-        environment: environment variables of the service, in addition to those of this process.
+    `environment` adds to the variables of this process.
 
     Raises:
         ServiceFailedError: the service ended, or was not ready in time.

@@ -51,11 +51,8 @@ class RetryPolicy:
     def wait_s(self, attempt: int, spent_s: float, after_s: float | None, chance: float) -> float | None:
         """Return the wait after a failed attempt, None after the last one.
 
-        Args:
-            attempt: number of the failed attempt, from 1.
-            spent_s: time since the start of the first attempt.
-            after_s: wait that the service asks for with Retry-After; the minimum.
-            chance: random number from 0 to 1, which spreads clients that failed together.
+        Attempts count from 1; `spent_s` is the time since the first began. `after_s`, the wait that the service asks
+        for with Retry-After, is the minimum. `chance`, from 0 to 1, spreads clients that failed together.
         """
         if attempt >= self.attempts:
             return None
@@ -67,11 +64,8 @@ class RetryPolicy:
 def may_retry(safety: Safety, status: int | None, *, sent: bool, has_retry_after: bool = False) -> bool:
     """Return whether repeating a failed request is safe and can help.
 
-    Args:
-        safety: effect of sending the request twice.
-        status: status code of the answer, None without an answer.
-        sent: a part of the request may have reached the service.
-        has_retry_after: the answer has a Retry-After header.
+    `safety` is the effect of sending the request twice; `status` is None without an answer; `sent` means that a part of
+    the request may have reached the service.
     """
     if status is None:
         return safety is Safety.ANY or not sent
@@ -82,10 +76,8 @@ def may_retry(safety: Safety, status: int | None, *, sent: bool, has_retry_after
 def retry_after_s(value: str | None, date: str | None, now: datetime) -> float | None:
     """Return the seconds that a Retry-After header asks for, None if it cannot be read.
 
-    Args:
-        value: the header: a number of seconds or an HTTP date.
-        date: the answer's Date header, from which a date counts, so that the clocks need not agree.
-        now: start of the wait if there is no Date header.
+    `value` is a number of seconds or an HTTP date, counted from the answer's Date header so that the clocks need not
+    agree, or from `now` without one.
     """
     if value is None:
         return None

@@ -21,10 +21,7 @@ _Kind = TypeVar("_Kind")
 def build_config(kind: type[_Kind], raw: Any, *, path: str = "config") -> _Kind:
     """Build a dataclass from plain data: the types of JSON, and tuples.
 
-    Args:
-        kind: the dataclass.
-        raw: the plain data.
-        path: name of `raw` in error messages.
+    `path` is the name of `raw` in error messages.
 
     Raises:
         ConfigError: names the path of the wrong key, its value and the expected value.

@@ -12,12 +12,7 @@ class AsyncConcurrencyLimit:
     """Limit on concurrent queries, fetched from the service when a second query starts beside the first."""
 
     def __init__(self, max_queries: int | None, fetch: FetchLimit) -> None:
-        """Create a limit.
-
-        Args:
-            max_queries: maximum number of concurrent queries; None: fetch it.
-            fetch: return the service's limit, at least 1.
-        """
+        """Create a limit of `max_queries` concurrent queries; None fetches the service's limit, at least 1."""
         self._slots = Semaphore(max_queries or 1)
         self._known = max_queries is not None
         self._fetch = fetch

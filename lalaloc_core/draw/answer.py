@@ -95,13 +95,7 @@ def drawn_answer(
 ) -> DrawnAnswer:
     """Collect the contents of the picture of a localisation.
 
-    Args:
-        plan: the plan.
-        grid: pose grid of the plan.
-        found: result of the localisation.
-        model: confidence model; None leaves out probabilities.
-        heading_source: origin of the heading, one or two words.
-        truth: true pose, if known.
+    `heading_source` states the origin of the heading in one or two words. Without a model, probabilities are left out.
     """
     confidence = found.confidence(model)
     best, *rival_candidates = found.candidates
@@ -147,12 +141,8 @@ def draw_answer(
 ) -> str:
     """Draw an answer as an SVG document, 1600 pixels wide.
 
-    Args:
-        answer: contents of the picture.
-        photograph: levelled full sphere from `panorama.images.open_panorama`; required unless `picture` is "plan".
-        picture: parts to draw.
-        title: heading of the picture; default: the room.
-        rooms: cached result of `draw_rooms` for the plan.
+    The photograph is a levelled full sphere from `panorama.images.open_panorama`, required unless `picture` is "plan".
+    The default title is the room. `rooms` is a cached result of `draw_rooms` for the plan.
     """
     room = answer.plan.rooms[answer.room_index].name
     parts = [_header(answer, title or room, None if title is None else room)]

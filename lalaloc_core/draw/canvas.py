@@ -43,11 +43,8 @@ def document(width: Number, height: Number, title: str, parts: Iterable[str]) ->
 def rasterise(svg: str, *, width: int | None = None) -> bytes:
     """Rasterise a drawing as PNG.
 
-    The bundled fonts cover Latin, Greek, Cyrillic and a few more scripts; other characters are drawn as boxes.
-
-    Args:
-        svg: a drawing of this package; external references are not loaded.
-        width: pixels; default: the width of the drawing.
+    The bundled fonts cover Latin, Greek, Cyrillic and a few more scripts; other characters are drawn as boxes. External
+    references are not loaded. The default width is that of the drawing.
     """
     return resvg_py.svg_to_bytes(
         svg_string=svg, width=width, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"

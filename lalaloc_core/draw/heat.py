@@ -95,10 +95,7 @@ def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> 
 def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> HeatMap:
     """Return a map of probabilities relative to the most probable position.
 
-    Args:
-        plan: the plan.
-        places: positions and their probabilities.
-        step_m: step of the pose grid; each position represents a part of its room this wide.
+    Each position represents a part of its room as wide as the pose grid's step.
     """
     cells = Cells.cover(plan)
     left, _, bottom, _ = cells.extent_m

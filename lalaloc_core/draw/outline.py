@@ -60,12 +60,8 @@ def layout_outline(
 ) -> LayoutOutline:
     """Return the outline of a room as seen by a camera in it.
 
-    Args:
-        plan: the plan.
-        position_m: (2,) position of the camera.
-        room_index: room of the camera.
-        heading: azimuth (radians) of the panorama's centre column.
-        camera_height_m: height over the floor; a camera above the ceiling is drawn just below it.
+    `heading` is the azimuth (radians) of the panorama's centre column. A camera above the ceiling is drawn just below
+    it.
     """
     walls_m = plan.rooms[room_index].walls_m
     ends = np.concatenate([walls_m[:, :2], walls_m[:, 2:]]) - position_m
@@ -102,10 +98,8 @@ def project_points(
 ) -> Line:
     """Project points into a panorama, as shares (x, y) of its width and height.
 
-    Args:
-        azimuth: (n,) radians, relative to the heading, in [-π, π].
-        distance_m: (n,) horizontal distances.
-        rise_m: heights above the camera.
+    Azimuths are radians relative to the heading, in [-π, π]; distances are horizontal, and `rise_m` is above the
+    camera.
     """
     return np.stack([azimuth / TWO_PI + 0.5, 0.5 - np.arctan2(rise_m, distance_m) / math.pi], axis=-1)
 

@@ -56,11 +56,8 @@ def wall_stroke(
 def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box) -> str:
     """Draw a photograph with a layout over it as a part of a larger drawing.
 
-    Args:
-        content: the encoded picture, as many pixels as the box.
-        kind: "jpeg" or "png".
-        outline: the layout.
-        box: x, y, width and height.
+    `content` is the encoded picture, of kind "jpeg" or "png", with as many pixels as the box; `box` is x, y, width and
+    height.
     """
     x, y, width, height = box
     size = np.array([width, height])

@@ -44,12 +44,7 @@ def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None
     """Draw the plan with names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
     The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
-    is drawn at (x, -y).
-
-    Args:
-        plan: the plan.
-        marker: camera to draw.
-        rooms: cached result of `draw_rooms` for the plan.
+    is drawn at (x, -y). `rooms` is a cached result of `draw_rooms` for the plan.
     """
     left, top, width, height = _view_box(plan, [] if marker is None else [(marker.x_m, marker.y_m)])
     scale = 1000.0 / max(width, height)
@@ -76,13 +71,9 @@ def plan_part(
 ) -> str:
     """Draw the plan as a part of a larger drawing, fitted and centred in a box.
 
-    Args:
-        plan: the plan.
-        box: x, y, width and height.
-        over: SVG drawn over the plan, in metres, y pointing down.
-        seen_m: positions to include, even outside the plan.
-        heat: heat map, drawn on the floors.
-        rooms: cached result of `draw_rooms` for the plan.
+    `box` is x, y, width and height. `over` is SVG drawn over the plan, in metres, y pointing down; `heat` is drawn on
+    the floors. Positions `seen_m` are included even outside the plan. `rooms` is a cached result of `draw_rooms` for
+    the plan.
     """
     x, y, box_width, box_height = box
     left, top, width, height = _view_box(plan, seen_m)

@@ -28,10 +28,7 @@ _SAME_NORTH_DEG, _SAME_DIRECTION_DEG = 1e-6, 1.0
 def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anchor | None:
     """Read the anchor of a plan, None if it has none.
 
-    Args:
-        raw: value of the document's `anchor`.
-        north_deg: the plan's own `north_deg`, None if it has none.
-        rooms: rooms of the plan.
+    `raw` is the value of the document's `anchor`, and `north_deg` the plan's own, None if it has none.
 
     Raises:
         InvalidFloorPlanError: an invalid value, control points that do not fit, or a plan far from its origin.

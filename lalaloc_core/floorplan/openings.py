@@ -128,11 +128,7 @@ def place_openings(
 ) -> tuple[tuple[OpeningFace, ...], tuple[int, ...]]:
     """Project openings onto the walls that they lie on.
 
-    Args:
-        openings: openings of the plan.
-        rooms: rooms of the plan.
-        tolerance_m: largest distance between an opening's line and a wall: at least the thickness of a wall.
-        limits: limits of the plan.
+    `tolerance_m`, the largest distance between an opening's line and a wall, is at least the thickness of a wall.
 
     Returns:
         faces of the openings, and the indices of openings that lie on no wall.

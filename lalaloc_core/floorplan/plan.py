@@ -109,9 +109,7 @@ class FloorPlan:
     def from_stored(cls, text: str, warnings: Sequence[str] | None) -> FloorPlan:
         """Read a stored plan, which was valid when its `to_dict` was written as JSON, without size limits.
 
-        Args:
-            text: JSON of `to_dict`.
-            warnings: warnings of the first validation; None computes them again, which is slow for large plans.
+        Without the warnings of the first validation they are computed again, which is slow for large plans.
 
         Raises:
             InvalidFloorPlanError: `text` is not the JSON of a plan.

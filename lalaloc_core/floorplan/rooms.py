@@ -93,9 +93,6 @@ def interior_point(floor: BaseGeometry) -> tuple[Float[np.ndarray, "2"], float]:
 
     In ordinary rooms this is the centre of the largest inscribed circle, to a centimetre. In a floor narrower than a
     twentieth of its extent it is any point inside. The time is bounded for any shape.
-
-    Args:
-        floor: polygon or multipolygon, not empty.
     """
     shapely.prepare(floor)
     x_min, y_min, x_max, y_max = floor.bounds

@@ -99,10 +99,7 @@ def import_if_native(
 def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> bytes:
     """Return a plan as a file; the bytes depend only on the plan, except for DXF, which contains the time.
 
-    Args:
-        plan: plan to export.
-        format: one of `EXPORT_FORMATS`.
-        anchor: place of the plan's origin on Earth, for IMDF and GeoJSON; by default the plan's own.
+    `anchor` places the plan's origin on Earth for IMDF and GeoJSON; by default it is the plan's own.
 
     Raises:
         InvalidFloorPlanError: unknown format, or a missing anchor.

@@ -107,12 +107,8 @@ def measure_azimuths(
 ) -> AzimuthMeasures:
     """Compare a prediction with an annotation.
 
-    Args:
-        profiles_m: true wall profile (m) of each annotated outline.
-        log_profile: predicted log wall profile (m).
-        log_scale: predicted log scale.
-        true_classes: code of every azimuth; required with `class_scores`.
-        class_scores: predicted log probabilities, or any score that is largest for the likeliest class.
+    `profiles_m` are the true wall profiles, one per annotated outline. `class_scores` are log probabilities, or any
+    score that is largest for the likeliest class, and need `true_classes`.
     """
     errors = [np.nan_to_num(log_profile - np.log(profile), nan=np.inf) for profile in profiles_m]
     outline = int(np.argmin([np.median(np.abs(error)) for error in errors]))
@@ -127,9 +123,7 @@ def measure_azimuths(
 def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[str]) -> AzimuthSummary:
     """Summarise photographs with equal weight.
 
-    Args:
-        measures: one per photograph, at least one.
-        classes: names of the classes by code.
+    `measures` has one item per photograph, at least one; `classes` are names by code.
     """
     within = np.mean([measure.within for measure in measures], axis=0)
     confusions = [measure.confusion for measure in measures if measure.confusion is not None]

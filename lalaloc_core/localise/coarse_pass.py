@@ -100,14 +100,8 @@ def likeliest(
 ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
     """Return the coarse costs, rising, and the pairs (pose times number of hypotheses, plus hypothesis) of the best.
 
-    The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow.
-
-    Args:
-        binned: layouts of the n poses.
-        matching_cost: of the plan and the query.
-        room_index: (n,) rooms of the poses.
-        limits: number of pairs.
-        hint_cost: (n,) added to the costs of every pose; infinite excludes it.
+    The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow. `hint_cost` is added to
+    the costs of every pose; infinite excludes it.
     """
     table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
     shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)

@@ -111,13 +111,7 @@ def cost_by_chance(
 ) -> float | None:
     """Return the cost of a fit by chance; None without a cohort, or if poses are compared by their latents.
 
-    Args:
-        cohort: poses of other homes.
-        plan: the plan that is searched, which determines the openings that count.
-        query: the encoded panorama.
-        reach_m: reach (m) of the poses of the plan's grid.
-        weights: weights of the matching cost.
-        config: settings of the matching cost.
+    The plan determines the openings that count; `reach_m` is the reach of the poses of its grid.
     """
     if cohort is None or not config.compares_profiles(query):
         return None

@@ -68,12 +68,8 @@ def signals_of(
 ) -> Signals:
     """Return the signals of an answer.
 
-    Args:
-        query: the encoded panorama.
-        answer: the first candidate of the posterior.
-        posterior: the posterior with the answer's probability.
-        grid_cost: cost of the best pose of the plan's grid.
-        by_chance: cost of a fit by chance, see `localise.cohort`.
+    The answer is the posterior's first candidate; `grid_cost` is the cost of the best pose of the plan's grid, and
+    `by_chance` that of a fit by chance (`localise.cohort`).
     """
     mass = min(max(posterior.position, 1e-9), 1.0 - 1e-9)
     log_odds = math.log(mass / (1.0 - mass))
@@ -98,13 +94,8 @@ def confidence_of(
 ) -> Confidence | None:
     """Return the confidence of an answer; None without a model, or if the model was not fitted on the stage.
 
-    Args:
-        model: fitted model of the bundle.
-        stage: last stage that ran ("retrieval", "vdr" or "lpo").
-        signals: signals of the answer after that stage.
-        posterior: posterior with the probabilities of the answer's candidates.
-        heading_known: whether the heading was given exactly.
-        share: probability that the place is among those that were searched.
+    `signals` are the answer's after `stage`; `heading_known` states that the heading was given exactly; `share` is the
+    probability that the place is among those that were searched.
     """
     fit = None if model is None else model.fit_probability(stage, asdict(signals), heading_known=heading_known)
     if fit is None:

@@ -63,10 +63,8 @@ def marginal_information(
 ) -> tuple[Float[np.ndarray, "2 2"], float | None]:
     """Return the information about the position with the heading integrated out, and about the heading likewise.
 
-    Both are inverses of blocks of the inverse (Schur complements), and exist where that does not.
-
-    Args:
-        information: by x, y (m) and, if it was searched, the heading (radians).
+    Both are inverses of blocks of the inverse (Schur complements), and exist where that does not. The information is by
+    x, y (m) and, if it was searched, the heading (radians).
     """
     full = np.asarray(information, dtype=np.float64)
     by_position = full[:2, :2]

@@ -51,9 +51,7 @@ class Encoders:
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
         """Create the onnxruntime sessions.
 
-        Args:
-            bundle: the model bundle.
-            threads: intra-op threads per session, 0 for one per core.
+        `threads` is the number of intra-op threads per session, 0 for one per core.
 
         Raises:
             BundleError: a file is missing or altered, or the model has other opening classes or room types.
@@ -183,11 +181,8 @@ class Encoders:
     ) -> Query:
         """Return a query with one hypothesis for each shift, its heading unknown.
 
-        Args:
-            outputs: outputs of the image encoder (`_outputs`).
-            shifts: numbers of sectors by which the ring and the predictions are rolled to the right.
-            frame_roll: angle (radians) by which the image was rolled before it was encoded.
-            camera_height: stated camera height.
+        The ring and the predictions in `outputs` (see `_outputs`) are rolled to the right by `shifts` sectors; the
+        image was rolled by `frame_roll` (radians) before it was encoded.
         """
         assert self._head is not None
         sectors = outputs["ring"].shape[1]

@@ -196,10 +196,8 @@ NO_HINTS = Hints()
 def log_factor(inside: Float[np.ndarray, "n"], share: float, *, strict: bool) -> Float[np.ndarray, "n"]:
     """Return the log of f, the factor of the prior; 0 without a hint.
 
-    Args:
-        inside: (n,) g of each place or region.
-        share: share of the whole area that is inside the hint's region.
-        strict: exclude every place outside.
+    `inside` is g of each place or region, and `share` the share of the whole area inside the hint's region; `strict`
+    excludes every place outside.
     """
     share = max(share, _MIN_SHARE)
     doubt = 0.0 if strict else _DOUBT

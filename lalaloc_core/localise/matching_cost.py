@@ -368,11 +368,8 @@ def class_losses(
 ) -> Float[np.ndarray, "*n c"]:
     """Return `-log q` of every opening class; classes outside `claimed` cost what walls do.
 
-    Args:
-        probability: predicted probabilities, merged (`merged_into_walls`).
-        prior: frequencies of the classes, merged likewise.
-        claimed: codes of the classes that the plan shows completely.
-        floor: ε.
+    `probability` and `prior` are merged (`merged_into_walls`); `claimed` are the codes of the classes that the plan
+    shows completely; `floor` is ε.
     """
     loss = -np.log(floor + (1.0 - floor) * probability / prior)
     unclaimed = [code for code in range(len(OPENING_CLASSES)) if code not in claimed]
@@ -390,10 +387,8 @@ def mean_log(
 ) -> Float[np.ndarray, "n"]:
     """Return the mean logarithm of each row.
 
-    Args:
-        factor: values from 1 upwards; overwritten.
-        factors: number of factors multiplied before the logarithm, if it divides the number of columns.
-        max_factor: larger values count as this, so that products stay finite.
+    Values of `factor`, from 1 upwards, are overwritten. So many `factors` are multiplied before the logarithm if they
+    divide the number of columns; values above `max_factor` count as that, so that products stay finite.
     """
     columns = factor.shape[1]
     if columns % factors:

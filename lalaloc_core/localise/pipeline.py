@@ -120,9 +120,7 @@ class Localisation:
     def confidence(self, model: ConfidenceModel | None, share: float = 1.0) -> Confidence | None:
         """Return the answer's confidence; None without a model, or if the model was not fitted on the last stage.
 
-        Args:
-            model: fitted model of the bundle.
-            share: probability that the place is among those that were searched.
+        `share` is the probability that the place is among those that were searched.
         """
         known = self.query.heading_known
         signals = self.signals[self.stage]
@@ -135,9 +133,7 @@ Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
 def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | None) -> JobT | FoundT:
     """Continue a search; return its next job or its result.
 
-    Args:
-        steps: the search.
-        result: result of the last job; None at first, and if there is no result (in time).
+    `result` is the last job's; None at first, and if there is no result (in time).
     """
     try:
         return steps.send(result)
@@ -150,9 +146,7 @@ def run_steps(
 ) -> FoundT:
     """Run a whole search in this process.
 
-    Args:
-        steps: the search.
-        refiner: runs a job; returns None if it has no result (in time). It can be None for searches without jobs.
+    `refiner` runs a job; it returns None if it has no result (in time). Searches without jobs need none.
     """
     result: ResultT | None = None
     while True:

@@ -142,15 +142,9 @@ def posterior_of(
 ) -> Posterior:
     """Return the posterior after some modes of the grid were refined.
 
-    Args:
-        grid: costs of the grid's pairs.
-        prior: (n,) log prior of every pose of the grid, up to a constant.
-        query: the encoded panorama.
-        starts: the modes that were refined, as the grid has them.
-        ends: the same after refinement, in the same order.
-        candidates: the candidates whose probability is wanted, the answer first.
-        temperature: T.
-        separation_m: radius (m) of a mode.
+    `prior` is the log prior of every pose of the grid, up to a constant. `starts` are the modes that were refined, as
+    the grid has them, and `ends` the same after refinement, in the same order. `candidates` are those whose probability
+    is wanted, the answer first. `temperature` is T, and `separation_m` the radius of a mode.
     """
     lowest = float(grid.total.min())
     gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
@@ -227,12 +221,7 @@ def _width_corrections(
     """Return log factors that give all refined modes the width of the deepest; of tied modes, of the widest.
 
     The number of grid poses that fit a mode depends on where the lattice lies, and differs between copies of one room.
-
-    Args:
-        log_weight: (m,) log weight of each pair.
-        mode: (m,) refined candidate of each pair, -1 for none.
-        depth: (r,) cost of each refined candidate.
-        temperature: T.
+    `mode` is the refined candidate of each pair, -1 for none, and `depth` the cost of each refined candidate.
     """
     correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(depth))]
     width = {

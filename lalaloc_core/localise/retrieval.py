@@ -123,13 +123,8 @@ def _choose(
 ) -> _Chosen:
     """Choose the pairs to compare in full and to estimate.
 
-    Args:
-        plan: the plan.
-        grid: its pose grid.
-        matching_cost: of the plan and the query.
-        temperature: T.
-        hint_cost: (n,) cost of the hints at every pose.
-        relaxed: (n,) the same if strict hints were not; the best pairs by that are compared as well.
+    `hint_cost` is the cost of the hints at every pose, and `relaxed` the same if strict hints were not; the best pairs
+    by that are compared as well.
     """
     pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:
@@ -187,14 +182,7 @@ def retrieve(
 ) -> list[Candidate]:
     """Return the `top_k` best grid poses, best first, no two closer than `separation_m` at about one heading.
 
-    Args:
-        costs: costs of the grid's pairs.
-        grid: the pose grid.
-        query: the encoded panorama.
-        top_k: number of candidates.
-        separation_m: smallest distance (m) between candidates at one heading.
-        margin: up to `limit` candidates are returned if they cost less than this more than the best.
-        limit: see `margin`.
+    Up to `limit` candidates are returned if they cost less than `margin` more than the best.
     """
     total = costs.total[: costs.compared]
     ranked, ranks = np.argsort(total, kind="stable"), max(_FIRST_RANKED, top_k)

@@ -33,12 +33,8 @@ def known_heading(
 ) -> KnownHeading:
     """Return the given heading, else the panorama's if north is known, else none.
 
-    Args:
-        north: azimuth of true north (radians) in the plan; None if unknown.
-        heading_deg: given heading (degrees).
-        tolerance_deg: largest error (degrees) of the given heading.
-        compass_heading: heading in the panorama's metadata, clockwise from true north (radians).
-        compass_tolerance_deg: largest error (degrees) of the compass heading.
+    `heading_deg` is given with the largest error `tolerance_deg`. `compass_heading` is in the panorama's metadata,
+    clockwise from true north (radians); `north` is the azimuth of true north in the plan (radians).
     """
     if heading_deg is not None:
         return KnownHeading(heading_from_degrees(heading_deg), math.radians(tolerance_deg), "given")

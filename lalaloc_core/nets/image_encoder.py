@@ -103,10 +103,7 @@ class TrunkImageEncoder(nn.Module):
     ) -> ImageFeatures:
         """Encode panoramas.
 
-        Args:
-            image: (b, h, w, 3) pixels, values 0 to 255 of any type.
-            camera_height_m: (b,) camera heights.
-            styles: style mixing; for training only.
+        Pixels are 0 to 255 of any type, (b, h, w, 3); `styles` is for training only.
         """
         mixed = self._mixed(image, styles)
         log_height = torch.log(camera_height_m)

@@ -17,13 +17,8 @@ def layout_depth(
 ) -> Float[Array, "b {rows} w"]:
     """Return the range (m) along each pixel's ray to the nearest of wall, floor and ceiling.
 
-    `range = min(wall / cos e, camera / -sin e below the horizon, (ceiling - camera) / sin e above it)`.
-
-    Args:
-        profile_m: (b, w) wall profile, see `render.profile`.
-        camera_height_m: (b,) height of the camera over the floor.
-        ceiling_height_m: (b,) height of the ceiling over the floor, above the camera.
-        rows: height of the depth image; its rows cover elevation +90° to -90°.
+    `range = min(wall / cos e, camera / -sin e below the horizon, (ceiling - camera) / sin e above it)`. Heights are
+    over the floor, the ceiling's above the camera's. The image's `rows` cover elevation +90° to -90°.
     """
     xp = array_namespace(profile_m, camera_height_m, ceiling_height_m)
     elevation = row_elevations(rows)

@@ -44,11 +44,8 @@ def log_profile_gradient(
 ) -> ProfileJacobian:
     """Return `log(wall_profile(...))` with its derivatives, at little more than the cost of the profile.
 
-    Args:
-        position_m: (b, 2) camera positions, inside the room that `walls_m` closes.
-        heading: (b,) azimuth of the centre column, radians.
-        walls_m: (b, n, 4) wall segments (x0, y0, x1, y1) of each pose's own room; repeat a segment to pad.
-        columns: number of azimuth columns.
+    Positions are inside the room that `walls_m` closes, segments (x0, y0, x1, y1) of each pose's own room; repeat a
+    segment to pad. `heading` is the azimuth of the centre column, radians.
     """
     xp = array_namespace(position_m, heading, walls_m)
     relative = xp.asarray(column_azimuths(columns), dtype=position_m.dtype, device=device(position_m))

@@ -41,15 +41,9 @@ def layout_view(
 ) -> LayoutView:
     """Render the layout view of each pose, one value per azimuth column of a panorama with that heading.
 
-    The distances are differentiable in position and heading almost everywhere.
-
-    Args:
-        position_m: (b, 2) camera positions, inside their rooms; use double precision far from the plan's origin.
-        heading: (b,) azimuth of the centre column, radians.
-        room_index: (b,) each pose's room.
-        geometry: `FloorPlan.geometry` of the plan.
-        columns: number of azimuth columns.
-        camera_height_m: eye height; an opening is visible if its sill is below the eye and its head above.
+    The distances are differentiable in position and heading almost everywhere. Positions are inside their rooms; use
+    double precision far from the plan's origin. `heading` is the azimuth of the centre column, radians. An opening is
+    visible if its sill is below the camera and its head above.
     """
     xp = array_namespace(position_m, heading)
     like_positions = {"dtype": position_m.dtype, "device": device(position_m)}

@@ -28,13 +28,8 @@ def cast_rays(
 ) -> Float[Array, "b c"]:
     """Return the distance (m) from each origin along each azimuth to the nearest of its wall segments.
 
-    Args:
-        origin_m: (b, 2) ray origins in the plan frame.
-        azimuth: (b, c) directions, radians clockwise from +y.
-        walls_m: (b, n, 4) segments (x0, y0, x1, y1) of each origin; repeat a segment to pad.
-
-    Returns:
-        (b, c) distances; inf for a ray that meets no wall, which happens only outside a closed room.
+    Azimuths are radians clockwise from +y. `walls_m` has segments (x0, y0, x1, y1) of each origin; repeat a segment to
+    pad. The distance is inf for a ray that meets no wall, which happens only outside a closed room.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
     return _distance(xp.max(inverse_crossings(origin_m, azimuth, walls_m).inverse_m, axis=1))
@@ -115,10 +110,8 @@ class Crossings(NamedTuple):
 def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], edge_m: tuple[Array, Array]) -> Crossings:
     """Intersect rays with walls.
 
-    Args:
-        direction: (x, y) components of the rays' unit vectors; all components broadcast against each other.
-        start_m: (x, y) components from the ray's origin to the wall's start.
-        edge_m: (x, y) components from the wall's start to its end.
+    All arguments are (x, y) components that broadcast against each other: the rays' unit vectors, from the rays'
+    origins to the walls' starts, and from the walls' starts to their ends.
     """
     (direction_x, direction_y), (start_x, start_y), (edge_x, edge_y) = direction, start_m, edge_m
     xp = array_namespace(direction_x, start_x)
@@ -141,11 +134,8 @@ def wall_profile(
 ) -> Float[Array, "b {columns}"]:
     """Return the wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
 
-    Args:
-        position_m: (b, 2) camera positions, inside the room that `walls_m` closes.
-        heading: (b,) azimuth of the centre column, radians.
-        walls_m: (b, n, 4) wall segments of each pose's own room.
-        columns: number of azimuth columns.
+    Positions are inside the room that `walls_m` closes, segments (x0, y0, x1, y1) of each pose's own room. `heading` is
+    the azimuth of the centre column, radians.
     """
     xp = array_namespace(position_m, heading, walls_m)
     relative = xp.asarray(column_azimuths(columns), dtype=position_m.dtype, device=device(position_m))

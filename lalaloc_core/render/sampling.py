@@ -41,12 +41,8 @@ def grid_size(plan: FloorPlan, step_m: float) -> int:
 def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = lambda: None) -> PoseSet:
     """Return the poses on the lattice of multiples of `step_m` that lie in rooms.
 
-    A room too small or narrow for any lattice point gets one interior pose, so that no room is missing.
-
-    Args:
-        plan: the plan.
-        step_m: distance of neighbouring poses.
-        after_room: called after each room; an exception that it raises ends the computation.
+    A room too small or narrow for any lattice point gets one interior pose, so that no room is missing. `after_room` is
+    called after each room; an exception that it raises ends the computation.
 
     Raises:
         InvalidInputError: `step_m` is not positive.
@@ -150,12 +146,7 @@ def sample_neighbours(
 ) -> PoseSet | None:
     """Draw the positives, then the negatives, of a given pose.
 
-    Args:
-        plan: the plan.
-        anchor: the pose.
-        sampling: numbers and radii of positives and negatives.
-        rng: source of randomness.
-        lowest_ceiling_m: rooms with a lower ceiling are excluded, since a camera cannot stand in them.
+    Rooms with a ceiling below `lowest_ceiling_m` are excluded, since a camera cannot stand in them.
 
     Returns:
         `sampling.positives` + `sampling.negatives` poses; None if too little of the plan is far enough.

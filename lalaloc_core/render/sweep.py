@@ -50,13 +50,8 @@ def swept_views(
 ) -> SweptViews:
     """Render the layout views of poses of a plan.
 
-    Args:
-        position_m: (n, 2) camera positions, inside their rooms.
-        heading: (n,) azimuth of the centre column, radians.
-        room_index: (n,) each pose's room.
-        walls: `FloorPlan.wall_table` of the plan.
-        columns: number of azimuth columns.
-        eye_m: eye height; an opening is visible if its sill is below the eye and its head above.
+    Positions are inside their rooms; `heading` is the azimuth of the centre column, radians. An opening is visible if
+    its sill is below the eye and its head above.
     """
     distance_m = np.empty((len(position_m), columns), np.float32)
     kind = np.full((len(position_m), columns), WALL_CODE, np.uint8)
@@ -91,13 +86,7 @@ def profiles_at(
 ) -> Float[np.ndarray, "n {columns}"]:
     """Return the wall profiles (m) of poses, each within its own room.
 
-    Args:
-        plan: the plan.
-        position_m: (n, 2) camera positions, inside their rooms.
-        room_index: (n,) each pose's room.
-        heading: (n,) azimuth of the centre column, radians.
-        columns: number of azimuth columns.
-        dtype: float type of the result.
+    Positions are inside their rooms; `heading` is the azimuth of the centre column, radians.
     """
     walls = plan.wall_table
     distance_m = np.empty((len(position_m), columns), dtype)

@@ -23,11 +23,7 @@ from lalaloc_core.localise.bundle import Bundle
 def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:
     """Measure groups of figures with one bundle.
 
-    Args:
-        bundle_folder: folder of the bundle.
-        groups: names of the groups.
-        homes: number of test homes.
-        textures: folder of textures for the renderer.
+    `homes` is the number of test homes, and `textures` the folder of textures for the renderer.
     """
     bundle = Bundle.open(bundle_folder)
     measure: Mapping[str, Callable[[], dict[str, Any]]] = {

@@ -22,11 +22,8 @@ class DepthAligner:
     def __init__(self, *, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> None:
         """Set the size of the compared images.
 
-        Args:
-            rows: rows of the images.
-            columns: columns of the rendered wall profiles.
-            thinning: the images keep every n-th of these columns.
-            config: margins and Adam's schedule.
+        `columns` are those of the rendered wall profiles, of which the images keep every `thinning`-th. `config` has
+        the margins and Adam's schedule.
         """
 
         def depth(

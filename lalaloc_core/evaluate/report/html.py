@@ -24,10 +24,7 @@ GALLERY_BYTES = 3_400_000
 def write_report(runs: Sequence[Path], out: Path, *, pictures: Path | None = None) -> None:
     """Write the report on some runs.
 
-    Args:
-        runs: folders of runs.
-        out: file of the page.
-        pictures: folder for the page's pictures as files; None for none.
+    `pictures` is a folder for the page's pictures as files, None for none.
 
     Raises:
         RunError: a folder holds no run.

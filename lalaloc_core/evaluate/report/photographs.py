@@ -182,13 +182,8 @@ def evaluate_photographs(
 ) -> PhotographResults:
     """Evaluate a model on annotated photographs and write the results to a folder; existing gallery runs resume.
 
-    Args:
-        data: folder of `AnnotatedPhotographs`.
-        bundle: folder of the model.
-        out: folder of the results.
-        galleries: number of galleries of every photograph, for each heading.
-        workers: processes, as in `run_evaluation`.
-        command: command that repeats the evaluation.
+    `galleries` is the number of galleries of every photograph, for each heading; `workers` is as in `run_evaluation`,
+    and `command` repeats the evaluation.
 
     Raises:
         DatasetError: the photographs cannot be used.

@@ -30,10 +30,7 @@ class Thumbnail:
 def draw_sheet(title: str, key: Mapping[str, str], thumbnails: Sequence[Thumbnail]) -> Image.Image:
     """Draw one page.
 
-    Args:
-        title: title of the page.
-        key: meaning of the lines' colours, by colour.
-        thumbnails: pictures of one size, row by row.
+    `key` gives the meaning of the lines by colour. The thumbnails are of one size and drawn row by row.
     """
     width, height = thumbnails[0].picture.size if thumbnails else (PICTURE_WIDTH, PICTURE_HEIGHT)
     assert all(item.picture.size == (width, height) for item in thumbnails), "pictures differ in size"

@@ -107,15 +107,9 @@ class WorstQuery:
 
 
 def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
-    """Draw the worst queries of a run and summarise their common features.
+    """Draw the worst queries of a run and return `SUMMARY_FILE`'s content without the queries: their common features.
 
-    Args:
-        run: folder of the run.
-        out: folder of the sheets and the summary.
-        count: number of queries; those without an answer come first, then by error.
-
-    Returns:
-        the content of `SUMMARY_FILE`, without the queries.
+    Queries without an answer come first, then by error.
 
     Raises:
         RunError: the folder holds no run, or one without predictions.
@@ -161,13 +155,7 @@ def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Predicti
 def summarise(
     predictions: Sequence[Prediction], chosen: Sequence[Prediction], examined: Sequence[WorstQuery]
 ) -> dict[str, Any]:
-    """Return the common features of the worst queries as plain data.
-
-    Args:
-        predictions: all predictions of the run.
-        chosen: the worst of them.
-        examined: the queries of `chosen` whose data could be opened.
-    """
+    """Return the common features of the worst queries as plain data."""
     errors_m = position_errors_m(chosen)
     answered = errors_m[~np.isnan(errors_m)]
     misaligned = [query for query in examined if query.outcome is Outcome.WRONG_ALIGNMENT]

@@ -105,11 +105,7 @@ class Scores:
 
 
 def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
-    """Score the predictions of one run.
-
-    Args:
-        predictions: predictions of the run, at least one.
-        seed: seed of the bootstrap.
+    """Score the predictions of one run; `seed` is that of the bootstrap.
 
     Raises:
         InvalidInputError: there are no predictions.

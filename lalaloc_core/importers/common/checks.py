@@ -23,10 +23,9 @@ _UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "i
 
 
 def check_document(document: Mapping[str, Any]) -> list[str]:
-    """Return warnings about a plan in the native format. `FloorPlan` itself warns of overlaps.
+    """Return warnings about a plan as `FloorPlan.from_dict` expects it, except overlaps, of which `FloorPlan` warns.
 
-    Args:
-        document: plan in the structure that `FloorPlan.from_dict` expects; its values may be out of range.
+    Values of the document may be out of range.
     """
     rooms = [shapely.Polygon(room["polygon"]) for room in document["rooms"]]
     names = [room.get("name", f"room {index + 1}") for index, room in enumerate(document["rooms"])]

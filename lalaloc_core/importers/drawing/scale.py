@@ -23,12 +23,8 @@ def drawing_scale(
 ) -> tuple[float, str]:
     """Return metres per unit of a drawing, and the source of that value.
 
-    Args:
-        options: options; they take precedence.
-        subject: the file, for the error message.
-        paper_m_per_unit: length of a unit on paper (m), None if the drawing has no size.
-        own: metres per unit given by the file, and their source; None if it gives none.
-        texts: texts in the drawing, which can contain "1:100".
+    The options take precedence, then the file's `own` value with its source, then `texts`, which can contain "1:100" if
+    a unit has a length on paper. `subject` names the file in the error message.
 
     Raises:
         InvalidFloorPlanError: neither the options nor the file give a scale.

@@ -97,13 +97,9 @@ def enclose(
 ) -> Enclosed:
     """Find the rooms between walls.
 
-    Args:
-        bodies: walls drawn as areas.
-        lines: walls drawn as lines.
-        closers: doors and windows drawn as areas in the walls.
-        config: dimensions of walls and openings.
-        check_time: called between steps; raises an exception to stop.
-        rank: rank of a gap, lowest first; None if it is not an opening and stays open.
+    `bodies` and `lines` are walls drawn as areas and as lines; `closers` are doors and windows drawn as areas in the
+    walls. `check_time` is called between steps and raises an exception to stop. `rank` ranks a gap, lowest first; a gap
+    of rank None is not an opening and stays open.
     """
     faces, loose = _faces(lines, config, check_time) if lines else ([], [])
     thin = [face for face in faces if _is_thin(face, config)]

@@ -196,10 +196,7 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
 def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterator[tuple[DXFGraphic, _Context]]:
     """Yield entities with their contexts. Blocks are expanded, except for windows, passages and obstacles.
 
-    Args:
-        entities: entities of the model space or of a block.
-        block: context of the block that contains them, None for the model space.
-        depth: nesting depth of the block.
+    `block` is the context of the block that contains the entities, None for the model space.
     """
     for entity in entities:
         if not isinstance(entity, DXFGraphic) or depth > _MAX_BLOCK_DEPTH:

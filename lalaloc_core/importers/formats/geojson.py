@@ -89,13 +89,8 @@ def import_features(
 ) -> tuple[ImportedPlan, ...]:
     """Make one plan per level.
 
-    Args:
-        features: features of all levels.
-        crs: code of their coordinate reference system, None for WGS84.
-        format: name of the file's format.
-        options: import options.
-        budget: entities and time left.
-        levels: known levels by id.
+    `crs` is the code of the features' coordinate reference system, None for WGS84, and `format` the name of the file's
+    format.
 
     Raises:
         InvalidFloorPlanError: there are no features, or their coordinates cannot be converted.

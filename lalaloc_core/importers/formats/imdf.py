@@ -32,12 +32,7 @@ _CATEGORIES = {"corridor": "walkway", "bathroom": "restroom", "stairs": "stairs"
 
 
 def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """Unpack a zip archive in memory. Archives inside the archive are not opened.
-
-    Args:
-        content: bytes of the archive.
-        limits: limits on the number of files and their total size.
-        suffixes: suffixes of the files to unpack, in lower case.
+    """Unpack the files with these suffixes (lower case) from a zip archive, in memory, without archives inside it.
 
     Returns:
         The files by name.

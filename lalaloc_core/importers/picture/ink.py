@@ -65,10 +65,7 @@ def read_ink(
 ) -> Ink:
     """Even out the lighting, straighten the picture, and threshold it.
 
-    Args:
-        gray: rows from the top; 255 is white.
-        metres_per_pixel: length of a pixel.
-        warmth: see `Ink`.
+    Rows of `gray` are from the top, and 255 is white; for `warmth` see `Ink`.
     """
     if metres_per_pixel < FINEST_M:
         factor = metres_per_pixel / FINEST_M

@@ -61,14 +61,8 @@ def sketch_picture(
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
     Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used. The
-    sketch claims no kind of opening as complete: a reviewer of the draft has to set `opening_kinds`.
-
-    Args:
-        gray: rows from the top; 255 is white.
-        metres_per_pixel: length of a pixel.
-        builder: report.
-        budget: time left.
-        warmth: 128 without colour, higher towards red, lower towards blue; None for a grey picture.
+    sketch claims no kind of opening as complete: a reviewer of the draft has to set `opening_kinds`. Rows of `gray` are
+    from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards blue.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.

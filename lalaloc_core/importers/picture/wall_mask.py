@@ -119,11 +119,7 @@ def _without_furniture(
 ) -> Bool[np.ndarray, "h w"]:
     """Drop small pieces that are not as thick as a wall. Corners between two windows are kept.
 
-    Args:
-        mask: possible walls.
-        thickness: usual thickness of a wall (pixels).
-        metres_per_pixel: length of a pixel.
-        thickness_range: smallest and largest thickness of a piece, relative to `thickness`.
+    `thickness` is the usual thickness of a wall (pixels); `thickness_range` is that of a kept piece, relative to it.
     """
     count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     labels = np.asarray(found, dtype=np.int32)

@@ -54,15 +54,9 @@ def assemble_plan(
     """Build a validated plan of a scene's rooms.
 
     Rooms below the minimum area and stray parts of outlines are left out with a warning in the plan, because large data
-    sets contain some and they hold no camera.
-
-    Args:
-        scene: name of the scene.
-        outlines: the rooms, with different names.
-        path: file of the outlines, for errors.
-        units: of the file's numbers, for errors about sizes: "coordinates are read as millimetres".
-        openings: of the rooms; impossible ones are left out with a warning.
-        opening_kinds: kinds that the data set draws completely.
+    sets contain some and they hold no camera. Impossible openings are left out with a warning too. `path` and `units`
+    ("coordinates are read as millimetres") are for error messages; `opening_kinds` are those that the data set draws
+    completely.
 
     Raises:
         DatasetError: the rooms are not a valid plan.

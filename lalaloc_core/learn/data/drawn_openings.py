@@ -39,11 +39,8 @@ class DrawnOpening:
 def opening_entries(drawn: Sequence[DrawnOpening], ids: dict[str, str]) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the entries of a plan's `openings`, each opening once, and warnings about those left out.
 
-    The first of two overlapping openings is kept. The far side of the same door causes no warning.
-
-    Args:
-        drawn: the openings of all rooms.
-        ids: of the plan's rooms by name.
+    The first of two overlapping openings is kept. The far side of the same door causes no warning. `ids` maps the names
+    of the plan's rooms to their ids.
     """
     kept: list[DrawnOpening] = []
     warnings = []

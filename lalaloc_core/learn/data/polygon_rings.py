@@ -15,13 +15,7 @@ class OpenRingError(ValueError):
 
 
 def chain_rings(lines: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Chain lines into closed rings.
-
-    Args:
-        lines: junctions at both ends of each line, in any order and direction.
-
-    Returns:
-        Junctions of every ring in order, the first not repeated at the end.
+    """Chain lines, pairs of junctions in any order and direction, into closed rings without repeated ends.
 
     Raises:
         OpenRingError: a junction does not join exactly two lines, or a ring has fewer than three junctions.

@@ -52,13 +52,9 @@ def build_gallery(
 ) -> RoomGallery:
     """Place a room among similar ones, all aligned with the axes and randomly rotated by quarter turns.
 
-    Args:
-        own: room with the camera at its origin, looking along +y.
-        others: annotated rooms; the most similar in size and shape are used, up to `_MAX_DRAWN`, rescaled within
-            `_RESCALED`. The rest are generated rooms of similar shape, scaled to the size within the same range.
-        camera_height_m: of the plan.
-        rng: of all random draws.
-        like: room that the others must resemble; None uses `own`.
+    `own` has the camera at its origin, looking along +y. Of the `others`, those most similar to `like` (default: `own`)
+    in size and shape are used, up to `_MAX_DRAWN`, rescaled within `_RESCALED`; the rest are generated rooms of similar
+    shape, scaled to the size within the same range.
     """
     like = like or own
     drawn = sorted(others, key=lambda room: _dissimilarity(like, room))[:_MAX_DRAWN]

@@ -62,15 +62,8 @@ def export_bundle(
 ) -> Bundle:
     """Write a bundle; networks are put into evaluation mode and their weights are rounded in place.
 
-    Args:
-        folder: of the bundle; created, or its bundle files are replaced.
-        config: configuration of the run.
-        layout_encoder: trained layout encoder.
-        image_encoder: trained image encoder; without it the bundle answers layout queries only.
-        decoder: trained decoder, if any.
-        name: of the model.
-        version: of the model.
-        training: entries of the manifest's `training`.
+    The folder is created, or its bundle files are replaced. A bundle without an image encoder answers layout queries
+    only. `training` has entries of the manifest's `training`.
 
     Raises:
         ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is unchanged.

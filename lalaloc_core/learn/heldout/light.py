@@ -97,14 +97,7 @@ class Lights:
     ) -> Float[np.ndarray, "n 3"]:
         """Return the light on each point from lamps, windows and surfaces, with one random ray to each kind.
 
-        Args:
-            tracer: the home's mesh.
-            materials: its surfaces.
-            number: material per face.
-            room: room of each point.
-            point_m: (n, 3) points.
-            normal: (n, 3) unit normals.
-            rng: random generator of the rays.
+        `number` is the material of each face of the home's mesh; `room` and the unit `normal` are those of each point.
         """
         start = point_m + OFFSET_M * normal
         return (

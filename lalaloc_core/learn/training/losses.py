@@ -25,13 +25,8 @@ def log_ratio(
     `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is the
     distance of latents and R the Chamfer distance. The variants for panoramas (section A.1.5) measure D from the
     panorama's latent; R is the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
-    distillation).
-
-    Args:
-        latent_distance: D of each neighbour to its anchor; the first `positives` columns are the positives.
-        reference: R of the same pairs, in any unit.
-        positives: number of positives per anchor.
-        all_pairs: use every pair of neighbours instead of each positive with each negative (the paper).
+    distillation). The first `positives` columns are the positives; `all_pairs` uses every pair of neighbours instead of
+    each positive with each negative (the paper).
     """
     excess = _safe_log(latent_distance) - _safe_log(reference)
     if all_pairs:

@@ -13,11 +13,7 @@ class ReplayBuffer(Generic[T]):
     """Buffer that returns every item `uses` times in total, with repeats far apart.
 
     New items are used immediately. Repeats start when the buffer is filled; from then on every new item comes with
-    `uses - 1` random repeats, and the buffer holds about `limit` items, never more.
-
-    Args:
-        uses: number of uses of every item; 1 stores nothing.
-        limit: maximum number of waiting items.
+    `uses - 1` random repeats, and the buffer holds about `limit` items, never more. With `uses` 1 it stores nothing.
     """
 
     def __init__(self, uses: int, limit: int) -> None:

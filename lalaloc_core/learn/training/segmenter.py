@@ -92,10 +92,8 @@ def _walls(kind: Int[np.ndarray, "r w"], elevation_deg: Float[np.ndarray, "r"]) 
 def _line_distance(surface: Bool[np.ndarray, "r w"], wall: Bool[np.ndarray, "r w"]) -> Float[np.ndarray, "w"]:
     """Return the log of 1 / tan of the angle from the horizon at which a floor ends at a wall; NaN without a line.
 
-    Args:
-        surface: floor pixels from 45 degrees below the horizon upwards, or ceiling pixels from 45 degrees above it
-            downwards.
-        wall: wall pixels in the same order.
+    `surface` has floor pixels from 45 degrees below the horizon upwards, or ceiling pixels from 45 degrees above it
+    downwards, and `wall` the wall pixels in the same order.
     """
     clear = round(_CLEAR_DEG / _STEP_DEG)
     end = np.argmin(surface, axis=0)

@@ -320,11 +320,8 @@ def cached_pictures(
 ) -> UInt8[np.ndarray, "n h w 3"]:
     """Return pictures from a file; make and write them if it is missing, damaged or holds other pictures.
 
-    Args:
-        path: npz file; None caches nothing.
-        identity: distinguishes these pictures from others, such as their poses. It does not cover the renderer: delete
-            the file after changing that.
-        make: makes the pictures.
+    `path` is an npz file; None caches nothing. `identity` distinguishes these pictures from others, such as their
+    poses. It does not cover the renderer: delete the file after changing that.
     """
     if path is None:
         return make()

@@ -33,12 +33,8 @@ class PoseOptimiser:
     ) -> None:
         """Set the embedding and the norm.
 
-        Args:
-            embedding: function of layouts that is compared with a job's targets; None: the log wall profile itself.
-            columns: azimuth columns of the wall profiles that the embedding takes.
-            norm: distance that is minimised.
-            config: settings.
-            device: device of the computation; default: the CPU.
+        `embedding` maps layouts with this many azimuth `columns` to what is compared with a job's targets (None: the
+        log wall profile itself); `norm` is the distance that is minimised. The default device is the CPU.
 
         Raises:
             ConfigError: Levenberg-Marquardt with absolute differences.

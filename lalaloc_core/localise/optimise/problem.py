@@ -117,12 +117,7 @@ class Problem:
     ) -> None:
         """Set up the problem.
 
-        Args:
-            embedding: function of layouts; None compares the log wall profiles themselves.
-            columns: azimuth columns of the wall profiles.
-            norm: distance that is minimised.
-            job: the refinement job.
-            device: device of the computation.
+        The arguments are those of `PoseOptimiser`, and the refinement job.
         """
 
         def tensor(array: np.ndarray) -> Tensor:

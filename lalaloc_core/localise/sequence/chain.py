@@ -41,10 +41,8 @@ def forward_backward(
 ) -> Marginals:
     """Sum over all paths.
 
-    Args:
-        log_likelihood: for every picture the log likelihood by height and state.
-        transitions: transitions between neighbours.
-        log_prior: (j,) log prior of the heights.
+    `log_likelihood` is by height and state for every picture; `transitions` are between neighbours, and `log_prior` is
+    that of the heights.
     """
     peak = [float(values.max()) for values in log_likelihood]
     likelihood = [np.exp(values - top) for values, top in zip(log_likelihood, peak, strict=True)]

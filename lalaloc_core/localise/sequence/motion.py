@@ -149,11 +149,7 @@ def _states(poses: np.ndarray, headings: int) -> np.ndarray:
 def transition(motion: Motion, first: States, second: States, step_m: float) -> Transition:
     """Return the transition of a motion between pictures whose states are grid poses.
 
-    Args:
-        motion: the motion.
-        first: states of the first picture.
-        second: states of the second picture.
-        step_m: step (m) of the grid.
+    `step_m` is the step of the grid.
     """
     sizes = len(first.position_m), len(first.heading), len(second.position_m), len(second.heading)
     turns = None

@@ -95,15 +95,9 @@ def path_posterior(
 ) -> PathPosterior:
     """Return the posterior over paths.
 
-    Args:
-        pictures: the pictures.
-        transitions: transitions between neighbours.
-        paths: the best paths.
-        poses: poses of the grid.
-        log_heights: (j,) log prior of the heights.
-        whole: marginals of the chain over all states.
-        candidates: for each picture the candidates whose probability is wanted, the answer first.
-        separation_m: radius (m) of a basin.
+    `log_heights` is the log prior of the heights, `whole` the marginals of the chain over all states, and
+    `separation_m` the radius of a basin. `candidates` are, for each picture, those whose probability is wanted, the
+    answer first.
     """
     basins = [_basin(pictures, transitions, log_heights, path, separation_m) for path in paths]
     log_mass = np.array([basin.marginals.log_evidence for basin in basins])

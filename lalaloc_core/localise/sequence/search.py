@@ -88,15 +88,8 @@ def localise_sequence(
 ) -> SequenceLocalisation:
     """Localise several encoded panoramas of one visit in a plan.
 
-    Args:
-        plan: the floor plan.
-        grid: the plan's pose grid.
-        encoders: networks of the model.
-        queries: encoded panoramas in the order in which they were taken, all with the same stated camera height.
-        motions: motions between neighbours.
-        refiner: refines paths; None ends at the grid.
-        top_k: maximum number of candidates of each picture.
-        config: settings of the search.
+    The queries are in the order in which they were taken, all with the same stated camera height, and `motions` are
+    between neighbours. `refiner` refines paths; None ends at the grid. `top_k` limits the candidates of each picture.
 
     Raises:
         InvalidMotionError: the number of motions is not one less than that of the pictures.

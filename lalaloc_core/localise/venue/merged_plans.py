@@ -44,12 +44,8 @@ class MergedPlans:
     def of(cls, plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], camera_height_m: float) -> MergedPlans:
         """Merge plans, laid out in a square of cells.
 
-        A single row would be so long that coordinates lose precision in single precision.
-
-        Args:
-            plans: the plans.
-            grids: pose grid of each plan, all with the same step and for the same model.
-            camera_height_m: camera height (m) of the query.
+        A single row would be so long that coordinates lose precision in single precision. All grids have the same step
+        and are for the same model; the camera height (m) is the query's.
         """
         shift_m = _shifts(plans)
         plan = FloorPlan(

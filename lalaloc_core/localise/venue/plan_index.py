@@ -78,12 +78,8 @@ class PlanIndex:
     ) -> PlanIndex:
         """Return the index of plans whose prototypes are in `rows`.
 
-        Args:
-            rows: records of type `prototypes.ROW`, with their cells.
-            begin: number of the first record of each plan.
-            count: number of records of each plan.
-            step_m: step of the pose grids of the prototypes.
-            cells: coarse quantiser that assigned the cells.
+        `rows` are records of type `prototypes.ROW` with the cells that `cells`, the coarse quantiser, assigned; `begin`
+        and `count` are the number of each plan's first record and the number of its records.
         """
         owner = np.repeat(np.arange(len(count), dtype=np.int32), count)
         ends = np.cumsum(count)
@@ -138,12 +134,8 @@ class PlanIndex:
     ) -> Float[np.ndarray, "p"]:
         """Return the log of each plan's mass (see `prototypes`); -inf if none of its prototypes was compared exactly.
 
-        Args:
-            query: the encoded panorama.
-            weights: weights of the matching cost.
-            config: settings of the matching cost.
-            compared: maximum number of pairs that are compared exactly.
-            scanned: approximate number of pairs in the code scan; the last probed cell is scanned whole.
+        At most `compared` pairs are compared exactly. About `scanned` pairs are in the code scan, as the last probed
+        cell is scanned whole.
         """
         costs = PrototypeCosts(query, self.step_m, weights, config)
         k, j = costs.shape

@@ -67,9 +67,7 @@ class CodeScan:
     def __init__(self, code: UInt8[np.ndarray, "n b"], begin: Int[np.ndarray, "w"]) -> None:
         """Build the faiss index.
 
-        Args:
-            code: codes, list by list.
-            begin: begin of each list in `code`, and the end of the last list.
+        `begin` is the begin of each list in `code`, and the end of the last list.
         """
         dimensions = _PARTS * _VALUES
         lists = len(begin) - 1
@@ -95,12 +93,9 @@ class CodeScan:
     ) -> tuple[Int[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
         """Return the numbers of the cheapest codes of each of q queries, and their costs.
 
-        Fewer codes than `count` are filled up with the number -1 and infinite costs.
-
-        Args:
-            tables: lookup table of each query: the 16 values of the 50 parts, see `lookup_tables`.
-            lists: whether each list is probed for each query.
-            count: number of codes for each query.
+        Fewer codes than `count` are filled up with the number -1 and infinite costs. `tables` holds a lookup table per
+        query, the 16 values of the 50 parts (see `lookup_tables`); `lists` tells whether each list is probed for each
+        query.
         """
         # Queries of several callers run on threads of their own; by default faiss takes all cores for each.
         faiss.omp_set_num_threads(1)
@@ -113,9 +108,7 @@ class CodeScan:
 def lookup_tables(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j p c"]:
     """Return the cost of each value of each part of a code under every heading and height.
 
-    Args:
-        costs: costs for the query.
-        claims: opening classes that the plans claim, as in `prototypes.ROW`.
+    `claims` are the opening classes that the plans claim, as in `prototypes.ROW`.
     """
     (k, j), azimuth = costs.shape, np.arange(AZIMUTHS)
     tables = np.zeros((k, j, _PARTS, _VALUES), np.float32)

@@ -75,10 +75,8 @@ class PrototypeCosts:
     ) -> Float[np.ndarray, "n"]:
         """Return the cost of prototypes, each under one hypothesis.
 
-        Args:
-            rows: records of type `prototypes.ROW`.
-            hypothesis: number of each prototype's heading hypothesis.
-            offset: number of each prototype's height hypothesis.
+        `rows` are records of type `prototypes.ROW`; `hypothesis` and `offset` are numbers of heading and height
+        hypotheses.
         """
         cost = np.empty(len(rows), np.float32)
         for begin in range(0, len(rows), _CHUNK):

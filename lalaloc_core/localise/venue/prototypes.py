@@ -114,11 +114,7 @@ def most_probable(
 ) -> Int[np.ndarray, "m"]:
     """Return the plans to search in full, most probable first: at least one, and none without mass.
 
-    Args:
-        log_mass: log mass of each plan.
-        poses: number of grid poses of each plan.
-        max_plans: maximum number of plans.
-        max_poses: maximum number of poses of their grids in total.
+    `poses` is the number of grid poses of each plan, and `max_poses` limits their sum.
     """
     order = np.argsort(-log_mass, kind="stable")[:max_plans]
     order = order[np.isfinite(log_mass[order])]
@@ -133,12 +129,8 @@ def share_searched(
 
     A full search replaces a plan's mass by a posterior probability. For plans that were left out, the ratio of the two
     is estimated by the median ratio of the searched plans, most of which are wrong ones as well. If some copies of a
-    plan were searched and others left out, these get the median ratio of the searched copies.
-
-    Args:
-        log_mass: log mass of each plan.
-        searched: numbers of the plans that were searched.
-        probability: probability of each searched plan, given that the right one was searched.
+    plan were searched and others left out, these get the median ratio of the searched copies. `probability` is that of
+    each searched plan, given that the right one was searched.
     """
     left_out = np.delete(log_mass, searched)
     if not len(left_out):

@@ -90,10 +90,7 @@ class Synthesis:
 def share_out(scenes: int, split: Split | Literal["all"]) -> dict[Split, tuple[int, ...]]:
     """Choose the numbers of the scenes to write by split: each split's first ones that the paper does not exclude.
 
-    Args:
-        scenes: number of scenes.
-        split: a split, or "all" for the proportions of the official splits; each then gets at least one of three or
-            more scenes.
+    "all" divides them like the official splits; each then gets at least one of three or more scenes.
 
     Raises:
         InvalidInputError: the number of scenes is below 1 or above the size of the splits.
@@ -118,13 +115,8 @@ def share_out(scenes: int, split: Split | Literal["all"]) -> dict[Split, tuple[i
 def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, workers: int = 1) -> int:
     """Write the missing scenes, with a progress bar on standard error.
 
-    Args:
-        settings: of the scenes.
-        numbers: of the scenes, by split.
-        workers: processes; 1 renders in this process.
-
-    Returns:
-        Number of scenes written.
+    `numbers` are those of the scenes by split. One worker renders in this process. The result is the number of scenes
+    written.
 
     Raises:
         InvalidInputError: the number of workers is below 1.
@@ -171,12 +163,7 @@ class _Job:
 def _write_scene(job: _Job, stop: Event | None = None) -> int:
     """Render and write one scene; a failure leaves no files.
 
-    Args:
-        job: the scene.
-        stop: checked between rooms; when set, the scene is abandoned.
-
-    Returns:
-        Number of panoramas written.
+    `stop` is checked between rooms; when set, the scene is abandoned. The result is the number of panoramas written.
 
     Raises:
         DatasetError: the scene cannot be written.

@@ -19,10 +19,7 @@ _JPEG_SHARE = 0.25
 def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
     """Change exposure, colour and noise of panoramas at random.
 
-    Args:
-        image: (b, h, w, 3) pictures, 0 to 255.
-        strength: 0 changes nothing, 1 changes the exposure by about a third.
-        generator: source of randomness, on the pictures' device.
+    `strength` 0 changes nothing, 1 changes the exposure by about a third. The generator is on the pictures' device.
     """
 
     def drawn(spread: float, channels: int = 1) -> Tensor:
@@ -44,12 +41,8 @@ def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Ge
     """Apply random effects of lens, film or file to panoramas.
 
     Blur, vignetting of two lenses and a brightness step between them, clipped highlights, lifted shadows, pale or
-    strong colours, JPEG; each for a share of the pictures.
-
-    Args:
-        image: (b, h, w, 3) pictures, 0 to 255.
-        strength: 0 changes nothing, 1 changes most pictures.
-        generator: source of randomness, on the pictures' device.
+    strong colours, JPEG; each for a share of the pictures. `strength` 0 changes nothing, 1 changes most pictures. The
+    generator is on the pictures' device.
     """
     count, device = len(image), image.device
 

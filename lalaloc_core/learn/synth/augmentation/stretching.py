@@ -20,11 +20,8 @@ def stretched(
 ) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
     """Stretch panoramas and their labels per column about the camera.
 
-    Args:
-        images: (n, h, w, 3) panoramas.
-        openings: (n, w, k) labels of openings per column.
-        log_distance: (n, w) log distances of walls per column.
-        factors: (a, b), across and along the direction of the central column.
+    `openings` and `log_distance` are labels per column; `factors` are (a, b), across and along the direction of the
+    central column.
     """
     width = images.shape[2]
     column, reach = _seen_at(width, factors)

@@ -22,10 +22,7 @@ def develop(
 ) -> UInt8[Tensor, "b h w 3"]:
     """Expose linear radiance and encode it as sRGB-like bytes.
 
-    Args:
-        radiance: (b, h, w, 3) linear light.
-        exposure: camera settings per picture, sampled by `sample_exposure`.
-        noise: unit noise, at least as large as a picture; every picture uses its own rolled part.
+    `noise` is unit noise, at least as large as a picture; every picture uses its own rolled part.
     """
     luma = radiance @ radiance.new_tensor(_LUMA)
     # Like a light meter, the mean of logarithms weighs a dark room more than its bright window.

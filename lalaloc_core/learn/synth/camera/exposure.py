@@ -66,9 +66,7 @@ class Exposure(Records):
 def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:
     """Sample camera settings.
 
-    Args:
-        rng: source of randomness.
-        bright: expose like pictures of homes for sale: light, with compressed contrasts.
+    `bright` exposes like pictures of homes for sale: light, with compressed contrasts.
     """
     exposure = Exposure(np.zeros(Exposure.WIDTH))
     exposure.target = math.exp(rng.normal(math.log(0.42), 0.42))

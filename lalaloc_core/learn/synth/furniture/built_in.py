@@ -55,11 +55,7 @@ def kitchen(
 ) -> list[Placed]:
     """Return a run of units along a wall, sometimes around a corner, with tall units, an island or a peninsula.
 
-    Args:
-        stretches: free stretches of wall.
-        lengths_m: lengths of the room's walls, in order.
-        ceiling_m: height of the ceiling.
-        rng: source of randomness.
+    `stretches` are free stretches of wall, and `lengths_m` the lengths of the room's walls, in order.
     """
     usable = [stretch for stretch in stretches if stretch.length_m > _MIN_RUN_M]
     if not usable:

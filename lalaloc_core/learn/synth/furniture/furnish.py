@@ -162,13 +162,9 @@ def furnish(
 ) -> list[Prism]:
     """Furnish one room.
 
-    Args:
-        room: the room; its name decides its furniture.
-        openings: the openings in its walls; the floor before doors and windows above the sill stay free.
-        level: amount of furniture.
-        rng: source of randomness.
-        camera_m: position that everything keeps `CAMERA_CLEARANCE_M` away from.
-        built_in: build kitchens, bathrooms and wardrobes in where they belong, in empty rooms too.
+    The room's name decides its furniture. The floor before doors and windows above the sill stays free, and everything
+    keeps `CAMERA_CLEARANCE_M` away from `camera_m`. `built_in` builds kitchens, bathrooms and wardrobes in where they
+    belong, in empty rooms too.
     """
     most = _MAX_PIECES[level]
     if most == 0 and not built_in:

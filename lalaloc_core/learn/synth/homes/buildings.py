@@ -48,11 +48,8 @@ class Building:
 def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
     """Return a building with at least this floor area.
 
-    Args:
-        split: split of its homes, see `synth.homes.splits`.
-        seed: seed of its homes.
-        area_m2: minimum floor area.
-        hall_share: share of the floor in halls.
+    `split` and `seed` are those of its homes, see `synth.homes.splits`; `hall_share` is the share of the floor in
+    halls.
     """
     return _Builder(split, seed, area_m2, hall_share).build()
 

@@ -113,14 +113,9 @@ def place_openings(
 ) -> tuple[Opening, ...]:
     """Place doors, openings and windows that do not touch each other.
 
-    Args:
-        names: room names, which decide the places of windows and wide openings.
-        polygons_m: inner outlines, counter-clockwise.
-        ceilings_m: ceiling heights.
-        cells_m: gross cells; everything outside them is outdoors.
-        max_gap_m: maximum distance of two walls that share a door.
-        rng: source of randomness.
-        french_window_share: share of windows that reach down to the floor.
+    Room names decide the places of windows and wide openings. Outlines are counter-clockwise; everything outside
+    `cells_m`, the gross cells, is outdoors. Two walls at most `max_gap_m` apart can share a door. `french_window_share`
+    is the share of windows that reach down to the floor.
     """
     walls = _Walls(polygons_m)
     openings = _connect_rooms(walls, names, ceilings_m, max_gap_m, rng)

@@ -106,10 +106,7 @@ class _ShellHits:
 def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> Hits:
     """Cast the camera's rays.
 
-    Args:
-        batch: the scenes.
-        direction: horizontal unit vector of each column.
-        slope: tangent of each row's elevation.
+    `direction` is a horizontal unit vector per column, and `slope` the tangent of each row's elevation.
     """
     shell = _trace_shell(batch, direction, slope)
     return _before(batch, shell, cross_prisms(batch.prisms, direction, shell.end_m), direction, slope)

@@ -18,11 +18,7 @@ _COLUMNS, _ROWS = 4, 4
 def contact_sheet(path: Path, rng: np.random.Generator, textures: Path | None = None, *, height: int = 256) -> None:
     """Write a sheet of 16 panoramas of 16 homes, from empty to full.
 
-    Args:
-        path: file to write; the suffix decides the format.
-        rng: source of randomness.
-        textures: optional folder of material pictures.
-        height: height of one panorama in pixels.
+    `textures` is a folder of material pictures, and `height` that of one panorama in pixels.
     """
     renderer = PanoramaRenderer(MaterialLibrary.create(rng, textures), height=height, width=2 * height, supersample=2)
     levels: list[FurnitureLevel] = ["empty", "simple", "full", "full"] * _ROWS

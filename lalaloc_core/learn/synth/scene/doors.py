@@ -33,14 +33,8 @@ def add_door(
 ) -> None:
     """Add a door or a wide opening.
 
-    Args:
-        tables: tables of the scene.
-        style: style of the house.
-        home: the home.
-        opening: the opening, not a window.
-        wall: its wall in the tables.
-        slot_behind: slot of the room behind it; None for a closed or dark opening.
-        rng: source of randomness.
+    The opening is not a window; `wall` is its wall in the tables. `slot_behind` is the slot of the room behind it, None
+    for a closed or dark opening.
     """
     room = home.plan.rooms[opening.room]
     s0, s1, head = opening.start_m, opening.end_m, opening.head_m

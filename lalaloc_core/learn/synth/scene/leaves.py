@@ -60,13 +60,8 @@ def hang_leaves(
 ) -> list[Leaf]:
     """Open a door; leaves without space clear of walls and camera, and a random share, are missing.
 
-    Args:
-        opening: the open door.
-        room: room of the opening.
-        neighbour: room behind it.
-        depth_m: thickness of the wall between them.
-        camera_m: position that leaves keep `CAMERA_CLEARANCE_M` away from.
-        rng: source of randomness.
+    `neighbour` is the room behind the opening and `depth_m` the thickness of the wall; leaves keep `CAMERA_CLEARANCE_M`
+    away from `camera_m`.
     """
     if rng.random() < 0.15:
         return []

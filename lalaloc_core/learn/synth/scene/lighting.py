@@ -52,10 +52,8 @@ class RoomLight(NamedTuple):
 class Lighting:
     """Mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
 
-    Args:
-        rng: source of randomness.
-        neutral: lamps are on and nearly white, for a scene that `relit` changes later.
-        bright: strong daylight reflected by pale walls.
+    `neutral` lamps are on and nearly white, for a scene that `relit` changes later; `bright` is strong daylight
+    reflected by pale walls.
     """
 
     def __init__(self, rng: np.random.Generator, *, neutral: bool = False, bright: bool = False) -> None:
@@ -91,18 +89,7 @@ class Lighting:
 def light_room(
     room: Room, openings: Sequence[Opening], origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator
 ) -> tuple[Lights, list[Prism], Sun]:
-    """Return lamps and windows of the camera's room.
-
-    Args:
-        room: the room.
-        openings: its openings.
-        origin_m: camera position in the plan frame.
-        lighting: mood of the scene.
-        rng: source of randomness.
-
-    Returns:
-        the scene's lights, the lamps as prisms, and the sun.
-    """
+    """Return the lights of the camera's room, the lamps as prisms, and the sun; `origin_m` is the camera position."""
     windows = sorted(
         (opening for opening in openings if opening.kind == "window"),
         key=lambda window: -(window.end_m - window.start_m) * (window.head_m - window.sill_m),

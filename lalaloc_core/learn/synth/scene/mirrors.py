@@ -71,14 +71,8 @@ def add_mirror(
 ) -> None:
     """Hang a mirror: build the reflected room behind it, with dark doors.
 
-    Args:
-        tables: tables of the scene, whose first walls are those of the room.
-        style: style of the house.
-        mirror: place of the mirror, see `sample_mirror`.
-        room: the own room.
-        prisms: furniture of the room, rows of `tables.prisms`.
-        lights: lamps and windows; the brightest shines in the reflected room.
-        rng: source of randomness.
+    The tables' first walls are those of `room`, the own one; `prisms` is its furniture, rows of `tables.prisms`. The
+    brightest of its lights shines in the reflected room.
     """
     wall, s0, s1, z0, z1 = mirror
     ends, count, first, slot = tables.walls_m[wall], len(room.walls_m), len(tables.walls_m), len(tables.rooms)
@@ -114,11 +108,7 @@ def _reflected_room(own: Row, lights: Lights, relative: Reflection) -> Row:
 
 
 class Reflection:
-    """Reflection in the vertical plane through a wall.
-
-    Args:
-        wall_m: ends of the wall (x0, y0, x1, y1).
-    """
+    """Reflection in the vertical plane through a wall (x0, y0, x1, y1)."""
 
     def __init__(self, wall_m: Float[np.ndarray, "4"]) -> None:
         along = wall_m[2:] - wall_m[:2]

@@ -23,12 +23,8 @@ _NEW_FLOOR_SHARE = 0.4
 class Shells:
     """Builds the shells of a scene's rooms, one after the other.
 
-    Args:
-        tables: tables that receive them.
-        style: style of the house.
-        streams: source of randomness.
-        is_bright: true for a home for sale: pale, with a plain floor.
-        is_bare: true if most walls have neither pictures nor switches.
+    The home is pale with a plain floor if it `is_bright` (for sale); most walls have neither pictures nor switches if
+    it `is_bare`.
     """
 
     def __init__(

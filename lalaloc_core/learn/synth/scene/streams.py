@@ -43,9 +43,7 @@ class Streams:
     def begin(self, part: ScenePart, *which: int) -> None:
         """Restart the streams for a part, so that in a staged scene it does not depend on the parts before it.
 
-        Args:
-            part: the next part.
-            which: number of the room or opening, if there are several.
+        `which` numbers the room or opening, if there are several.
         """
         if self.is_staged:
             for stream, number in ((self.shapes, ()), (self.materials, (ScenePart.MATERIALS,))):

@@ -64,13 +64,9 @@ class SurfaceTable:
     ) -> int:
         """Add a surface with a random picture of a category, tinted to a mean `colour` if one is given.
 
-        Args:
-            category: category of the picture.
-            colour: mean linear colour; None keeps the picture's own, varied a little.
-            scale: pictures per metre.
-            angle: rotation of the picture, radians.
-            gloss: share of light reflected like a mirror.
-            glow: if positive, the surface emits its colour times this instead of reflecting light.
+        Without `colour` (linear) the picture keeps its own, varied a little. `scale` is in pictures per metre, `angle`
+        in radians, and `gloss` the share of light reflected like a mirror. With a positive `glow` the surface emits its
+        colour times this instead of reflecting light.
         """
         picture = self._materials.sample(category, self._rng)
         if colour is None:

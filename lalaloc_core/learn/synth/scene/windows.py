@@ -93,15 +93,8 @@ def _hang(
 ) -> None:
     """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera.
 
-    Args:
-        tables: tables of the scene.
-        room: the own room.
-        wall: number of its wall.
-        at_m: position of the box's middle along the wall.
-        half_m: half its width.
-        from_wall_m: distance of its middle from the wall.
-        z_m: its lower and upper end above the floor.
-        surface: its surface.
+    `at_m` is the position of the box's middle along the wall, `from_wall_m` its distance from the wall, `half_m` half
+    its width, and `z_m` its lower and upper end above the floor.
     """
     start, along, inwards = wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
