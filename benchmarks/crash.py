@@ -44,11 +44,8 @@ _ORPHANS = {
 class Uploads:
     """Uploads of plans by name, each repeated until it is answered.
 
-    Attributes:
-        url: the service, which changes when it is started again.
-        plan_ids: ids of the answered uploads by name.
-        repeated: number of repeated uploads.
-        refused: number of refusals by status.
+    `url` changes when the service is started again; `plan_ids` are those of the answered uploads by name; `refused`
+    counts refusals by status.
     """
 
     def __init__(self) -> None:

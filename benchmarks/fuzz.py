@@ -44,11 +44,7 @@ _EXCLUDED = r"/events$"
 
 @dataclass
 class Outcome:
-    """Answers by kind of request and status.
-
-    Attributes:
-        bad: answers that show a defect of the service.
-    """
+    """Answers by kind of request and status; `bad` ones show a defect of the service."""
 
     statuses: dict[str, Counter[str]] = field(default_factory=dict)
     bad: list[str] = field(default_factory=list)

@@ -39,13 +39,7 @@ def argument_parser(doc: str | None) -> argparse.ArgumentParser:
 
 @dataclass(frozen=True)
 class Service:
-    """Running service.
-
-    Attributes:
-        plan_id: the example plan, ready.
-        data: data folder.
-        process: the server's process.
-    """
+    """Running service with the example plan, ready, and the server's process."""
 
     url: str
     plan_id: str
@@ -123,9 +117,7 @@ def query_of(pose: TruePose, **target: str) -> dict[str, Any]:
 class Requests:
     """Requests of one kind.
 
-    Attributes:
-        times_ms: number of requests by their duration, which locust rounds to two digits.
-        per_second: mean rate.
+    `times_ms` is the number of requests by their duration, which locust rounds to two digits.
     """
 
     times_ms: Mapping[float, int]
@@ -229,8 +221,7 @@ def _locust(
 class HealthWatch:
     """Health checks on new connections, as a load balancer sends them, while a block runs.
 
-    Attributes:
-        slowest_s: duration of the slowest check; infinite after a failed one.
+    A failed check makes `slowest_s` infinite.
     """
 
     def __init__(self, url: str, pause_s: float = 0.05) -> None:
@@ -261,12 +252,7 @@ class HealthWatch:
 
 
 class MemoryWatch:
-    """Peak resident memory (MB) of a service and its workers while a block runs.
-
-    Attributes:
-        before: memory when the block began.
-        highest: highest memory so far.
-    """
+    """Peak resident memory (MB) of a service and its workers while a block runs."""
 
     def __init__(self, process: psutil.Process) -> None:
         self._process = process

@@ -56,7 +56,6 @@ class Attack:
     """Hostile request.
 
     Attributes:
-        size_bytes: bytes of one request; 0 for requests without a body.
         send: sends it and returns the statuses of all answers, 0 for a broken connection.
         expected: "accepted" for a localisation, "refused" for a status in the 400s, "any" for both.
         is_slow: whether the client itself takes longer than an answer may take.

@@ -21,15 +21,7 @@ _JPEG_QUALITY = 88
 
 @dataclass(frozen=True)
 class Panel:
-    """Results for one panorama.
-
-    Attributes:
-        truth: true pose.
-        known: localisation with the heading given.
-        unknown: localisation without the heading.
-        picture: PNG picture of `known`.
-        size: width and height of the picture.
-    """
+    """Results for one panorama with and without its heading; `picture` is the PNG of `known`."""
 
     truth: TruePose
     known: Localisation

@@ -15,16 +15,7 @@ POSES_PATH = FOLDER / "poses.json"
 
 @dataclass(frozen=True, kw_only=True)
 class TruePose:
-    """True pose of one panorama, with the fields of the file.
-
-    Attributes:
-        file: file name of the picture.
-        plan: file name of the plan.
-        room: name of the room.
-        x_m, y_m: position in plan coordinates.
-        heading_deg: heading of the picture's centre column.
-        camera_height_m: height above the floor.
-    """
+    """True pose of one panorama, with the fields of the file; `heading_deg` is that of the centre column."""
 
     file: str
     plan: str

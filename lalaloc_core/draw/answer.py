@@ -56,15 +56,10 @@ class DrawnAnswer:
     """The contents of an answer's picture.
 
     Attributes:
-        plan: the plan.
         camera: the predicted pose, with its covariance if known.
-        room_index: room of the pose.
-        camera_height_m: height of the camera above the floor.
         heading_source: origin of the heading, one or two words.
         confidence: probability that the position is correct; None if unknown.
-        rivals: other candidates, best first.
         heat: map of the posterior; None leaves the floors white.
-        truth: true pose, if known.
     """
 
     plan: FloorPlan

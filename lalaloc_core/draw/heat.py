@@ -34,10 +34,8 @@ _DECADES = 5
 class Cells:
     """Square cells over a plan.
 
-    Attributes:
-        poses: centres of the cells that lie in rooms.
-        room: (rows, columns) room of each cell, -1 outside; the first row is the lowest.
-        extent_m: (left, right, bottom, top) of all cells.
+    `poses` are the centres of the cells that lie in rooms; `room` is that of each cell, -1 outside, lowest row first;
+    `extent_m` is (left, right, bottom, top).
     """
 
     poses: PoseSet
@@ -68,14 +66,7 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """Shades of cells, with the legend of the colour bar.
-
-    Attributes:
-        cells: the cells.
-        shade: (n,) shade of each of `cells.poses`, 0 (lightest) to 1.
-        title: quantity that the colours show.
-        ticks: shades and their labels on the colour bar.
-    """
+    """Shades (0 lightest, 1) of `cells.poses`, with title and ticks of the colour bar."""
 
     cells: Cells
     shade: Float[np.ndarray, "n"]

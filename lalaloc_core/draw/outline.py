@@ -46,7 +46,6 @@ class LayoutOutline:
     Attributes:
         floor, ceiling: lower and upper edges of the walls, from the left edge of the panorama to the right.
         corners: (k, 2, 2) edges between walls, from the floor to the ceiling.
-        openings: visible doors, windows and passages.
     """
 
     floor: Line

@@ -52,7 +52,6 @@ class Answers:
     """Predictions to fit on.
 
     Attributes:
-        own: for photographs of the plan's home.
         disturbed: for photographs of lower quality, or of rooms whose lengths differ from the plan's.
         mismatched: for photographs of unknown places, all of them wrong.
     """

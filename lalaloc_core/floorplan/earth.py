@@ -19,13 +19,9 @@ _CACHED = 256
 
 @dataclass(frozen=True)
 class Anchor:
-    """Position of a plan's origin on Earth (WGS84) and its orientation.
+    """Position (WGS84, degrees) of a plan's origin on Earth and the azimuth of true north in the plan frame there.
 
-    Attributes:
-        latitude: degrees.
-        longitude: degrees.
-        altitude_m: height of the plan's floor over the ellipsoid; None if unknown.
-        north_deg: azimuth of true north in the plan frame, at the origin.
+    `altitude_m` is the height of the plan's floor over the ellipsoid; None if unknown.
     """
 
     latitude: float

@@ -31,10 +31,6 @@ class CameraHeight:
 
     A deviation of 0 means that the height is exact, infinity that it is unknown: the height is then anywhere in
     `UNKNOWN_RANGE_M`, and predictions are made for `height_m`.
-
-    Attributes:
-        height_m: stated height (m).
-        std_m: standard deviation (m) of its error.
     """
 
     height_m: float

@@ -80,10 +80,7 @@ class LowestCosts:
 class PairLimits:
     """Limits of the number of pairs of a pose and a hypothesis.
 
-    Attributes:
-        at_most: maximum.
-        at_least: minimum, if there are as many.
-        window: pairs beyond the minimum cost at most this more than the best.
+    There are at least `at_least` pairs if so many exist; those beyond cost at most `window` more than the best.
     """
 
     at_most: int

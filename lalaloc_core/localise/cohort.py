@@ -41,9 +41,7 @@ _MIN_COST = 0.01
 class Cohort:
     """Poses of other homes.
 
-    Attributes:
-        log_profile: (n, w) log wall profiles (m), in half precision.
-        kind: (n, w) codes as in `conventions.OPENING_CLASSES`.
+    `log_profile` is in half precision; `kind` has codes as in `conventions.OPENING_CLASSES`.
     """
 
     log_profile: Float[np.ndarray, "n w"]

@@ -30,7 +30,6 @@ class Signals:
 
     Attributes:
         log_odds: of the camera being within 1 m of the answer, by the posterior.
-        cost: the answer's matching cost.
         uncertainty: mean log of the scales that the image encoder predicts; 0 if it predicts none.
         latent_distance: of the answer. Pictures without a room fit anywhere, as their predictions are uncertain, but
             their latents are far from every layout's.

@@ -42,7 +42,6 @@ class Encoders:
     """Both encoders of one bundle, ready to run; safe to share between threads.
 
     Attributes:
-        manifest: the bundle's manifest.
         cohort: poses of other homes; None if the bundle has none.
         predicts_profile: whether the image encoder predicts a wall profile.
         predicts_structure: whether it predicts openings, ceiling and room type.

@@ -40,10 +40,7 @@ _ROOMS_LISTED = 20
 class Near:
     """A point of the plan, and a radius around it within which the camera stands.
 
-    Attributes:
-        x_m, y_m: position (m).
-        radius_m: radius (m).
-        label: the point as it was given, if not by x and y.
+    `label` is the point as it was given, if not by x and y.
     """
 
     x_m: float
@@ -65,11 +62,8 @@ class Near:
 class NearInEach:
     """One place in each of several plans that are searched as one, such as a GPS position in all storeys of a house.
 
-    Attributes:
-        point_m: (r, 2) the place (m) in the frame of each room's plan; NaN if the position of that plan is unknown, for
-            which the hint does not apply.
-        radius_m: radius (m).
-        label: the place as it was given.
+    `point_m` is in the frame of each room's plan; NaN if the position of that plan is unknown, for which the hint does
+    not apply. `label` is the place as it was given.
     """
 
     point_m: Float[np.ndarray, "r 2"]

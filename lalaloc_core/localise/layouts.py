@@ -49,7 +49,6 @@ class Layouts:
 
     Attributes:
         log_profile: (n, w) log wall profiles (m).
-        room_index: (n,) rooms.
         kind: (n, w) codes as in `conventions.OPENING_CLASSES`; None if the plan has no openings.
         seen: views through openings; None without any.
     """

@@ -50,12 +50,10 @@ class LocaliseConfig:
         profile_candidates_turned: the same if the heading is searched, as rooms look alike from several sides.
         alike_margin: candidates that cost less than this more than the best are refined as well, up to
             `max_candidates`, as places that look alike must all be refined to share the probability.
-        max_candidates: maximum number of refined candidates.
         separation_m: smallest distance (m) between candidates at about one heading.
         every_stage: run and record every stage. Otherwise, if wall profiles are compared, refinement begins with the
             grid's candidates, and VDR runs only if LPO has no result.
         by_probability: rank candidates by probability instead of cost, as for places of several plans.
-        matching: settings of the matching cost.
     """
 
     vdr_samples: int = 200
@@ -92,14 +90,11 @@ class Localisation:
 
     Attributes:
         query: the query, with an unknown heading if the picture contradicts the given one.
-        candidates: poses, best first.
         posterior: probability of all places of the grid and of the candidates, given that the picture is of the plan.
-        stage: the last stage that ran.
         signals: signals of the best candidate's confidence after each stage that ran, in order.
         heading_contradicted: whether a heading was given that the picture contradicts.
         hints_missed: hints that do not hold at the answer; of strict hints, those that the picture contradicts.
         best: the best candidate after each stage that ran, in order.
-        timings_ms: milliseconds per stage.
     """
 
     query: Query
@@ -256,7 +251,6 @@ class _Search:
     Attributes:
         query: the query, with an unknown heading if the picture contradicts the given one.
         by_walls: whether poses are compared by their wall profiles.
-        modes: modes of the grid's posterior, best first.
     """
 
     def __init__(

@@ -21,10 +21,8 @@ class PoseGrid:
     """Grid of poses of one plan at heading 0, with wall profiles, and latents for one model and camera height.
 
     Attributes:
-        poses: positions and rooms.
         latents: (n, d) latents of the layouts; None for models that compare wall profiles.
         profile_m: (n, w) wall profiles (m), which serve queries of any camera height.
-        step_m: distance (m) between neighbouring poses.
         camera_height_m: camera height (m) of the latents.
     """
 
@@ -105,12 +103,7 @@ class PoseGrid:
 
 @dataclass(frozen=True, eq=False)
 class PredictedProfile:
-    """Laplace distributions of the log wall profile (m), for every hypothesis of the heading.
-
-    Attributes:
-        log_m: (k, w) centres.
-        log_scale: (k, w) logs of the scales.
-    """
+    """Laplace distributions of the log wall profile (m), with their log scales, for every hypothesis of the heading."""
 
     log_m: Float[np.ndarray, "k w"]
     log_scale: Float[np.ndarray, "k w"]
@@ -153,12 +146,7 @@ class PredictedCeiling:
 
 @dataclass(frozen=True, eq=False)
 class PredictedRoomType:
-    """Type of the room.
-
-    Attributes:
-        log_probability: (t,) by type, in the order of `conventions.ROOM_TYPES`.
-        prior: (t,) frequencies of the types that the probabilities presume.
-    """
+    """Log probability by type, as in `conventions.ROOM_TYPES`, and the frequencies that it presumes."""
 
     log_probability: Float[np.ndarray, "t"]
     prior: Float[np.ndarray, "t"]
@@ -214,11 +202,8 @@ class Candidate:
     """A pose and its cost.
 
     Attributes:
-        x_m, y_m: position (m).
-        room_index: number of the room.
         frame_heading: heading (radians) of the layout in the frame of the hypothesis; the panorama's heading is
             `query.roll[hypothesis] + frame_heading`.
-        hypothesis: number of the query's hypothesis.
         cost: matching cost; the latent distance if the model predicts no wall profile.
         latent_distance: distance of the layout's latent to the query's; NaN until computed, as it is for answers.
         height_offset: log of true over stated camera height that fits best.
@@ -319,13 +304,10 @@ class RefinementResult:
     """Refined poses, inside the rooms of their starts.
 
     Attributes:
-        position_m: (k, 2) positions (m).
         heading: (k,) headings (radians) in the frame.
         cost: (k,) minimised cost: the walls' term of the matching cost, or the distance of the embeddings.
         latent_distance: (k,) distance of the embeddings; None if it is no part of the cost.
         information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
-        converged: (k,) whether the poses converged.
-        evaluations: (k,) number of evaluations.
         height_offset: (k,) log of true over stated camera height; None if it was not solved for.
     """
 

@@ -44,10 +44,6 @@ class GridCosts:
     """Costs of m pairs of a grid pose and a hypothesis; pairs left out are improbable.
 
     Attributes:
-        poses: all poses of the grid.
-        pose: (m,) number of each pair's pose.
-        hypothesis: (m,) number of each pair's hypothesis.
-        cost: (m,) matching cost.
         offset: (m,) the height offset δ that gives it.
         hint_cost: (m,) cost of the hints at the pose; None without hints.
         compared: number of pairs that were compared in full, which come first; candidates are among these. The cost of
@@ -331,11 +327,6 @@ class ProbabilityMap:
 
     Places are the refined ones. Candidates can begin up to a metre from the place where they end, so a map of the
     grid's poses would show the probability beside the answer.
-
-    Attributes:
-        position_m: (k, 2) positions (m).
-        room_index: (k,) rooms.
-        probability: (k,) probabilities; the sum is one.
     """
 
     position_m: Float[np.ndarray, "k 2"]

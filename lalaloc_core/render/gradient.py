@@ -29,7 +29,6 @@ class ProfileJacobian(NamedTuple):
     """Log wall profiles and their derivatives.
 
     Attributes:
-        log_m: (b, c) logarithms of the distances (m) to the nearest walls.
         by_pose: (b, 3, c) derivatives by x and y (m) and by the heading (radians).
         wall: (b, c) index of the wall that each ray meets.
     """

@@ -23,14 +23,8 @@ _MAX_EVIDENCE_HOMES = 50
 class Benchmark:
     """Queries for the model.
 
-    Attributes:
-        kind: kind of the queries.
-        furniture: furniture of the photographs.
-        heading_known: whether the heading is known.
-        heldout: whether the homes are out-of-distribution ones.
-        copies: whether each plan has four copies of a home that differ in their doors.
-        settings: settings of method "lalaloc".
-        minor: whether fewer homes suffice.
+    `heldout` homes are out-of-distribution ones; `copies` makes plans of four copies of a home that differ in their
+    doors; a `minor` benchmark needs fewer homes. `settings` are those of method "lalaloc".
     """
 
     kind: QueryKind = "panorama"

@@ -55,9 +55,7 @@ class IcpConfig:
 class Alignment:
     """Alignments by start: `x_plan = R(turn) x_scan + shift`, turns counter-clockwise.
 
-    Attributes:
-        rms_m: root mean square distance of the scan's points to the plan's cloud.
-        iterations: number of updates.
+    `rms_m` is the root mean square distance of the scan's points to the plan's cloud.
     """
 
     turn: Float[np.ndarray, "k"]

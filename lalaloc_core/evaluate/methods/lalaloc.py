@@ -42,13 +42,7 @@ _TRUE_LAYOUT_LOG_SCALE = -7.0
 
 @dataclass(frozen=True, kw_only=True)
 class StatedHeight:
-    """Camera height as stated to a method.
-
-    Attributes:
-        is_known: whether the height is stated.
-        error_m: error added to the true height.
-        std_m: stated standard deviation.
-    """
+    """Camera height as stated to a method: with `error_m` added to the true one, and a standard deviation."""
 
     is_known: bool = True
     error_m: float = 0.0

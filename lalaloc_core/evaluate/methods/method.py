@@ -24,11 +24,7 @@ class Question:
     """Query for a localisation method.
 
     A method may use the camera's height, its heading if `heading_known`, `photograph`, and, for layout queries,
-    `true_profile`. The rest of the camera is the truth to predict.
-
-    Attributes:
-        grid: poses for retrieval, `grid_step_m` apart.
-        photograph: None for layout queries.
+    `true_profile`. The rest of the camera is the truth to predict. Poses of the grid are `grid_step_m` apart.
     """
 
     plan: FloorPlan
@@ -86,14 +82,11 @@ class Answer:
 
     Attributes:
         stages: the best pose after each stage, in order; the last is the final pose. Empty without an answer.
-        candidates: the candidate poses, best first, if the method ranks any.
         retrieved: index of the retrieved grid pose; None for methods without retrieval.
         signals: inputs of the confidence model by stage; see `localise.confidence`.
         information: curvature of the cost at the final pose; see `localise.poses.Candidate`.
         confidence: probability of a position error below 1 m; None without a confidence model.
         heading_confidence: probability of a heading error below 5°; None without a confidence model.
-        camera_height_m: the estimated camera height, if the method estimates it.
-        timings_ms: wall-clock per stage.
     """
 
     stages: dict[str, FoundPose] = field(default_factory=dict)

@@ -57,11 +57,7 @@ _PNG_DPI = 160
 class Chart:
     """Drawn chart.
 
-    Attributes:
-        name: name of its files.
-        title, description: text for screen readers.
-        figure: matplotlib's figure.
-        svg: the chart as an SVG file, on white.
+    `name` is that of its files, `title` and `description` are for screen readers, and `svg` is on white.
     """
 
     name: str

@@ -78,10 +78,7 @@ _GROUPS = {
 class Part:
     """Section of one run.
 
-    Attributes:
-        run: the run.
-        facts: description of the run, by name.
-        gallery: None if the page would be too large or the run has no predictions.
+    `facts` describe the run by name; `gallery` is None if the page would be too large or the run has no predictions.
     """
 
     run: Run

@@ -108,9 +108,7 @@ _HEADINGS = {"known": True, "unknown": False}
 class PhotographResults:
     """Results of a model on annotated photographs.
 
-    Attributes:
-        read: predictions of walls and openings.
-        answers: results in galleries by heading, "known" or "unknown".
+    `read` are predictions of walls and openings; `answers` are by heading, "known" or "unknown".
     """
 
     read: Sequence[ReadPhotograph]

@@ -19,13 +19,8 @@ _MAX_LABEL = 48
 class Run:
     """Run of a report.
 
-    Attributes:
-        number: position in the report, from 1.
-        name: shortened label, with the number if there are several runs.
-        folder: folder of the run.
-        info: description of the run.
-        predictions: all predictions.
-        scores: None without predictions.
+    Runs count from 1. The shortened name has the number if there are several runs; `scores` is None without
+    predictions.
     """
 
     number: int

@@ -59,12 +59,9 @@ class WorstQuery:
     """One of the worst queries.
 
     Attributes:
-        scene, camera, room: names of the query's scene, camera and room.
         found_room: name of the final pose's room; None without an answer.
-        outcome: kind of failure.
         error_m: position error; None without an answer.
         first_error_m: position error after the first stage.
-        confidence: predicted confidence, if any.
         facts: known difficulties of the photograph.
         symmetric: whether the pose fits the mirrored room; see `failures.is_symmetric`.
         symmetric_by_chance: probability of that for a random wrong position in the room.

@@ -35,13 +35,7 @@ _VALIDATION_SCENES = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Trained variant.
-
-    Attributes:
-        config: configuration by budget.
-        stages: trained stages.
-        layout_from: variant whose layout encoder it uses; None for its own.
-    """
+    """Trained variant; `layout_from` is the variant whose layout encoder it uses, None for its own."""
 
     config: dict[Budget, TrainConfig]
     stages: tuple[Literal["layout", "image", "end-to-end"], ...]

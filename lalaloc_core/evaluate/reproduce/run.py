@@ -38,13 +38,10 @@ class TableMaker:
     """Maker of tables.
 
     Attributes:
-        data: folder of the data set.
         out: folder of models, runs and tables.
         budget: size of networks and schedule of the trained variants.
         shipped: bundle of the rows of the shipped model.
         limit: queries per row; None for the budget's default.
-        workers: processes; None for one per core.
-        skip_bad: whether unusable scenes and cameras are skipped.
         command: command recorded in the tables.
     """
 

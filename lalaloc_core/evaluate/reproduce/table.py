@@ -51,11 +51,7 @@ class RowQuery:
     """Query of a row.
 
     Attributes:
-        method: name of the method.
-        kind: kind of the queries.
         model: `SHIPPED` or the name of a trained variant; None for methods without a model.
-        settings: settings of the method.
-        grid_step_m: step of the pose grid.
         furniture: furniture of the photographs; None for the data set's default.
     """
 
@@ -78,8 +74,6 @@ class Row:
 
     Attributes:
         group: group of rows, such as the kind of query.
-        name: name of the row.
-        query: query of the row.
         stage: stage whose poses are scored; None for the final pose.
         paper: the paper's figures by column, shares from 0 to 1; empty for rows of our own.
     """
@@ -97,11 +91,7 @@ class Table:
 
     Attributes:
         name: name for `lalaloc reproduce --table`.
-        title: title of the table.
         source: label of the paper's table or figure.
-        split: split of the queries.
-        columns: columns of the table.
-        rows: rows of the table.
         form: a "figure" is also drawn; "times" runs one query at a time.
     """
 

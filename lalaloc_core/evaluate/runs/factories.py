@@ -37,15 +37,12 @@ class LaLaLocSettings:
     """Settings of method "lalaloc"; the defaults are the service's.
 
     Attributes:
-        refine: last stage of the search.
-        vdr_samples: poses of the Vogel disc.
         vdr_candidates, lpo_candidates: number of refined candidates.
         evidence: term of the matching cost for walls: the predicted wall profile, the latent, or the sum of both.
         optimiser: method of LPO.
         openings, ceiling, room_type, see_through: whether the matching cost has these terms, if model and plan do.
         heading_doubt: assumed probability that a known heading is wrong.
         camera_height: whether the camera's height is stated, with `camera_height_std_m`, or unknown.
-        camera_height_std_m: stated standard deviation.
         camera_height_error_m: error added to the stated height.
     """
 

@@ -25,15 +25,11 @@ class GalleryAnswer:
     """Result of one photograph in one gallery, for the outline with the better result.
 
     Attributes:
-        photograph: name of the photograph.
-        gallery, outline: numbers of the gallery and of the outline.
         located: whether room and position are right.
         turned: whether it is located with a heading error above 10°.
-        right_room: whether the room is right.
         rank: rank of the best candidate in the right room, from 1; None without one.
         error_m: position error; infinite without an answer.
         within_1m: the event whose probability `confidence` is.
-        confidence: predicted probability of `within_1m`.
     """
 
     photograph: str
@@ -58,10 +54,8 @@ class GalleryScores:
     """Shares over all galleries of all photographs.
 
     Attributes:
-        photographs, galleries: numbers of photographs and of galleries.
         located: share with the right room and position.
         turned: share with the right position and a wrong heading.
-        right_room: share with the right room.
         among_3: share with the right room among the first three candidates.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         by_photograph: share of each photograph's galleries in which it is located.

@@ -19,11 +19,7 @@ from lalaloc_core.localise.encoders import Encoders
 class ReadPhotograph:
     """Photograph with its predicted walls and openings.
 
-    Attributes:
-        photograph: the annotated photograph.
-        profile_m: (w,) predicted wall profile.
-        class_scores: (w, classes) predicted log likelihoods up to a constant; None if the model predicts none.
-        measures: errors against the annotation.
+    `class_scores` are predicted log likelihoods up to a constant; None if the model predicts none.
     """
 
     photograph: AnnotatedPhotograph

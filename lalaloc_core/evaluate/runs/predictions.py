@@ -57,10 +57,6 @@ class Prediction:
     """Query and its predicted pose.
 
     Attributes:
-        scene, camera: names of the query's scene and camera.
-        room: name of the true room.
-        camera_height_m: the true camera height.
-        truth: the true pose.
         stages: the best pose after every stage ("retrieval", "vdr", "lpo", ...), in order; the last is the final
             pose. Empty without an answer, which counts as a miss.
         layout_hit: whether retrieval chose the grid pose with the nearest layout by Chamfer distance (Layout R@1);
@@ -73,7 +69,6 @@ class Prediction:
         confidence: predicted probability of a position error below 1 m.
         heading_confidence: predicted probability of a heading error below 5°.
         found_height_m: the estimated camera height, if the method estimates it.
-        timings_ms: duration of each stage.
         facts: known difficulties of the photograph, in alphabetical order; see `learn.data.dataset.Described`.
     """
 
@@ -110,16 +105,13 @@ class RunInfo:
     """Description of a run, sufficient to repeat it.
 
     Attributes:
-        label: name of the run in tables.
         settings: settings of the method, as plain data.
-        dataset: name of the data set in results, such as "Structured3D".
         data: folder of the data set; None for generated homes.
         data_format: one of `DATASET_FORMATS`; None to detect it.
         generated: arguments of the generator if `data` is None.
         furniture, lighting: appearance of the photographs; None if the data set has no such choice.
         limit: maximum number of queries; None for all.
         bundle: folder of the model; None for methods without one.
-        model: name, version and SHA-256 of the bundle.
         skip_bad: whether unusable scenes and cameras are skipped instead of ending the run.
         command: the command that repeats the run.
         skipped: skipped scenes and cameras, with reasons.

@@ -80,13 +80,9 @@ class Scores:
     """Scores of one run.
 
     Attributes:
-        n: number of queries.
-        unanswered: number of queries without an answer.
         layout_recall, pose_recall: Layout R@1 and Pose R@1; None for methods without retrieval.
         stages: accuracy by stage, in order.
-        final: accuracy of the final poses.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
-        reliability: bins of the reliability diagram.
         median_ms, mean_ms: duration by stage, over the queries that reached it.
         slices: accuracy by fact (`Prediction.facts`), the smallest share within 1 m first.
     """

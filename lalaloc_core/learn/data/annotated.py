@@ -48,9 +48,6 @@ class AnnotatedPhotographs:
 
     A photograph with an alternative outline has each gallery twice, once per outline, with the same other rooms.
     Photographs of poor quality have no gallery, but their rooms occur in galleries of others.
-
-    Attributes:
-        root: the folder.
     """
 
     root: Path

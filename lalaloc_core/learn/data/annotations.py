@@ -55,7 +55,6 @@ class AnnotatedPhotograph:
 
     Attributes:
         name: of the annotation file, without suffix.
-        photograph: the panorama.
         quality: of the photograph; poor ones have no galleries.
         outlines: the room, and an alternative outline if the annotation has one.
         has_flat_ceiling: the ceiling height is annotated; otherwise it is the default.

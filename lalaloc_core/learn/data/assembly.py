@@ -25,15 +25,7 @@ _MIN_SIMPLE_SHARE = 0.9
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoomOutline:
-    """Room as drawn by a data set.
-
-    Attributes:
-        name: unique within the scene.
-        polygon_m: corners in order.
-        ceiling_height_m: above the floor.
-        warnings: oddities of the drawing.
-        type: one of `conventions.ROOM_TYPES`.
-    """
+    """Room as drawn by a data set; its name is unique within the scene."""
 
     name: str
     polygon_m: Float[np.ndarray, "n 2"]

@@ -29,12 +29,7 @@ DATASET_FORMATS = {
 
 @dataclass(frozen=True, order=True)
 class Appearance:
-    """Appearance of a room in a photograph.
-
-    Attributes:
-        furniture: "empty", "simple" or "full"; None if unknown.
-        lighting: "cold", "raw" or "warm"; None if unknown.
-    """
+    """Appearance of a room in a photograph; None if unknown."""
 
     furniture: str | None = None
     lighting: str | None = None

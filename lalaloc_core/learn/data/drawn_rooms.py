@@ -21,12 +21,7 @@ _ON_THE_WALL_M = 0.01
 class DrawnRoom:
     """Room in its own frame.
 
-    Attributes:
-        name: of the room.
-        polygon_m: counter-clockwise, not closed.
-        ceiling_height_m: above the floor.
-        openings: on the outline, without heights.
-        room_type: one of `conventions.ROOM_TYPES`.
+    The polygon is counter-clockwise, not closed; openings lie on it, without heights.
     """
 
     name: str

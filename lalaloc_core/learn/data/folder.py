@@ -40,11 +40,7 @@ _MAX_COORDINATE_M = 100_000.0
 
 @dataclass(frozen=True)
 class OwnData:
-    """Folder of a user's own scenes.
-
-    Attributes:
-        root: the folder.
-    """
+    """Folder of a user's own scenes."""
 
     root: Path
 

@@ -21,7 +21,6 @@ class FilePhotograph:
     """Panorama in a file.
 
     Attributes:
-        path: of the picture.
         scene, room: place of the photograph, for errors.
         depth_path: 16-bit PNG with millimetres along each pixel's ray, 0 without a reading; None for no depth.
         size: required (height, width) of both files; None accepts any whole panorama.

@@ -49,9 +49,6 @@ class Synthetic:
     """Content of `synthetic.json`, which marks generated scenes in Structured3D's layout.
 
     Attributes:
-        format: version of this file.
-        seed: of the generator.
-        height, width: of the panoramas.
         textures: name of the material pictures; None if all materials are procedural.
     """
 
@@ -67,9 +64,6 @@ class Structured3D:
     """Copy of Structured3D or a part of it, or generated scenes in its layout.
 
     Scenes excluded by the paper are not in the splits, see `structured3d_splits`.
-
-    Attributes:
-        root: folder of the scenes.
     """
 
     root: Path

@@ -51,9 +51,7 @@ class Floor:
 class Annotation:
     """Content of a scene's annotation.
 
-    Attributes:
-        plan: floor plan of the scene.
-        floors: by the ID of the room's semantic; a room can have several floors.
+    `floors` are by the ID of the room's semantic; a room can have several.
     """
 
     plan: FloorPlan

@@ -40,11 +40,7 @@ _PARTITION_KEYS: dict[Split, str] = {"train": "train", "validation": "val", "tes
 
 @dataclass(frozen=True)
 class Zind:
-    """Copy of ZInD, or of a part of it.
-
-    Attributes:
-        root: folder of the homes.
-    """
+    """Copy of ZInD, or of a part of it."""
 
     root: Path
     description = "ZInD"

@@ -23,9 +23,8 @@ Number = float | int
 class Part:
     """A mesh with one surface.
 
-    Attributes:
-        surface: kind of surface, such as `floor`, which selects the material.
-        smooth: whether light sees its vertices' normals and not its facets'.
+    `surface` is a kind of surface, such as `floor`, which selects the material. Light sees the vertices' normals of
+    `smooth` meshes, otherwise the facets'.
     """
 
     surface: str

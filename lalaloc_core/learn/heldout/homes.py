@@ -50,11 +50,7 @@ class HeldoutHome:
 
 @dataclass(frozen=True, eq=False)
 class TracedHome:
-    """A home at one furniture level, ready to be photographed.
-
-    Attributes:
-        number: per face of the tracer's mesh, its material.
-    """
+    """A home at one furniture level, ready to be photographed; `number` is the material of each face of the mesh."""
 
     home: HeldoutHome
     tracer: Tracer

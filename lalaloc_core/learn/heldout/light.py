@@ -31,10 +31,7 @@ class Lights:
     Attributes:
         lamp_m, lamp: place and intensity (linear RGB) of each room's lamp.
         window_m, window_u, window_v: centre and half extents of every window, those of room r from `first[r]` on.
-        inward: unit normals of the windows.
-        count: windows per room.
         ambient: light that falls on each room's surfaces after many bounces.
-        sky: the outdoors.
     """
 
     lamp_m: Float[np.ndarray, "r 3"]

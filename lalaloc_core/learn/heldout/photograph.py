@@ -157,7 +157,6 @@ class _Film:
         balance: how much of the light's tint is taken out.
         grain: noise of mid-grey, of 1.
         nadir_rows: share of the picture's height, from below, that the tripod hides.
-        nadir: its brightness.
     """
 
     stops: float

@@ -26,10 +26,8 @@ _KIND_SHARES = (0.32, 0.12, 0.18, 0.14, 0.12, 0.12)
 class HeldoutPlan:
     """A floor plan with the use of each room.
 
-    Attributes:
-        plan: the rooms; no two overlap, and each has a wall in common with another.
-        kinds: per room.
-        wall_m: thickness of the inner walls.
+    No two rooms overlap, and each has a wall in common with another. `kinds` are per room; `wall_m` is the thickness of
+    the inner walls.
     """
 
     plan: FloorPlan

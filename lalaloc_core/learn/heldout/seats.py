@@ -14,12 +14,7 @@ from lalaloc_core.learn.heldout.geometry import Part, blob, crumpled, disc, lath
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A piece of furniture.
-
-    Attributes:
-        parts: its meshes.
-        footprint: the floor it takes, in the local frame; hanging things take none (None).
-    """
+    """A piece of furniture, and the floor it takes in the local frame; hanging things take none (None)."""
 
     parts: tuple[Part, ...]
     footprint: BaseGeometry | None

@@ -13,8 +13,6 @@ class Sky:
     """The outdoors of one photograph; colours are linear RGB.
 
     Attributes:
-        zenith, horizon, ground: colours.
-        sun: unit vector to the sun.
         sunlight: light on a face turned to the sun; zero under clouds or at night.
         waves: (k, 3) frequency, phase and height of the hills' outline.
         blocks: random numbers of the houses' outline.

@@ -34,11 +34,7 @@ class Hits:
 class Tracer:
     """Parts of a home as one mesh.
 
-    Attributes:
-        surfaces: names of surfaces, in order.
-        surface: per face, index into `surfaces`.
-        room: per face, index of the room it belongs to.
-        corner_normals: per face and corner.
+    `surface` (an index into `surfaces`) and `room` are per face, `corner_normals` per face and corner.
     """
 
     def __init__(self, parts: list[tuple[int, Part]]) -> None:

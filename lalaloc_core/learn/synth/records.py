@@ -15,8 +15,7 @@ Row = Float[np.ndarray, "width"]
 class Column:
     """One column of records, or `width` adjacent columns that keep an axis; a view that can be assigned to.
 
-    Attributes:
-        index: position among all columns, in the order in which a class of `Records` names them.
+    `index` is the position among all columns, in the order in which a class of `Records` names them.
     """
 
     index: int | slice

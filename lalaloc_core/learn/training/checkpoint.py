@@ -28,13 +28,8 @@ class Checkpoint:
 
     Attributes:
         stage: "layout", "image" or "end-to-end".
-        config: configuration of the run.
         weights: state dict of the stage's modules by name.
         averaged: averaged weights (EMA) in the same form; empty if averaging is off.
-        optimiser: state of the optimiser.
-        step, seconds: progress so far.
-        metrics: result of the last validation.
-        data: description of the training data.
         begun_from: the model that provided the first weights, and its training time; empty for random weights.
     """
 

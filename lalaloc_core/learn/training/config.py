@@ -28,15 +28,12 @@ class OptimiserConfig:
 
     Attributes:
         kind: AdamW, or SGD with momentum.
-        learning_rate: full rate.
         weight_decay: L2 penalty; AdamW applies it to matrices only.
-        momentum: of SGD.
         schedule: "cosine" decays to 1 % over the whole stage; "steps" multiplies by `gamma` at each milestone;
             "trapezoid" keeps the full rate and decays to 1 % as 1 - √ at the end, so a run can be extended before.
         warmup: share in which the rate rises from 5 %.
         decay: share in which a trapezoid decays.
         milestones: shares at which "steps" lowers the rate.
-        gamma: factor of "steps".
         clip_norm: maximum norm of the gradient; 0 turns clipping off.
         trunk_factor: factor on the learning rate of a pretrained trunk; lower values keep it closer to its weights.
     """
@@ -59,10 +56,8 @@ class LayoutStageConfig:
     """Stage 1: the layout encoder alone, log-ratio and decoding losses (paper, section 3.1).
 
     Attributes:
-        steps: number of updates.
         minutes: wall-clock budget; replaces `steps` as the length of the schedule.
         homes_per_step, anchors_per_home: size of a batch.
-        triplets: sampling of positives and negatives around an anchor.
         all_pairs: compare all pairs of an anchor's neighbours instead of positives with negatives only.
         turned_share: share of the negatives replaced by positions of positives at another heading.
         log_ratio_weight: weight of the log-ratio loss; 0 turns it off.
@@ -72,7 +67,6 @@ class LayoutStageConfig:
             leaves free and which otherwise shrinks.
         latent_per_metre: target latent distance per metre of Chamfer distance.
         cloud_rows, cloud_columns: resolution of the layouts compared by Chamfer distance.
-        optimiser: optimiser and schedule.
     """
 
     steps: int = 6000
@@ -100,9 +94,7 @@ class ImageStageConfig:
     `LayoutStageConfig`.
 
     Attributes:
-        steps: number of updates.
         minutes: wall-clock budget; replaces `steps` as the length of the schedule.
-        batch: panoramas per update.
         shots_per_home: panoramas drawn from one home.
         by_room_share: share of the panoramas drawn uniformly over rooms instead of over the floor area, so that small
             rooms occur often enough.
@@ -131,7 +123,6 @@ class ImageStageConfig:
         style_mixing: share of a batch whose early features take on another picture's style, every other time that of a
             photograph; needs photographs.
         ema_decay: decay per step of the averaged weights, which are validated and shipped; 0 turns averaging off.
-        optimiser: optimiser and schedule.
     """
 
     steps: int = 20000

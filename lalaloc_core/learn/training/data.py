@@ -30,7 +30,6 @@ class TrainingData:
 
     Attributes:
         dataset: data set; None draws homes with the generator, without touching disk.
-        skip_bad: skip files of the data set that cannot be used, logging each once.
         textures: folder of material pictures for the generator; None makes all materials procedural.
         deferred: render the generator's panoramas on the training device instead of in the workers.
         validation_scenes: maximum number of validation scenes, spread evenly over the split.

@@ -46,7 +46,6 @@ class DeferredBatch:
 
     Attributes:
         rest: the batch without `image`.
-        number: scene of each row.
         shift: columns by which each panorama is rolled to the right.
         mirrored: panoramas mirrored after that.
         scenes: scenes used for the first time, by number.

@@ -24,10 +24,8 @@ _MIN_STRETCH, _MAX_STRETCH = 0.5, 1.6
 class Photographs:
     """Photographs with a segmenter's predictions.
 
-    Attributes:
-        images: (n, h, w, 3) RGB bytes.
-        openings: (n, c, 2) probabilities of door and window by column.
-        log_distance: (n, c) log distance of the walls in camera heights; NaN where they are not visible.
+    `openings` are probabilities of door and window by column. `log_distance` is that of the walls in camera heights;
+    NaN where they are not visible.
     """
 
     images: UInt8[Tensor, "n h w 3"]

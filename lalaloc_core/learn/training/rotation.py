@@ -20,7 +20,6 @@ class Rotation:
     Attributes:
         shift: pixels by which its columns move to the right.
         heading: azimuth of the centre column after the shift, radians; layouts are cast at this heading.
-        mirrored: swap left and right of panoramas and profiles after the shift.
     """
 
     shift: int

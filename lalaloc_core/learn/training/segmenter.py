@@ -45,9 +45,8 @@ Segment = Callable[[UInt8[np.ndarray, "h w 3"]], Int[np.ndarray, "h w"]]
 class SegmenterReading:
     """Predictions of a panorama by column.
 
-    Attributes:
-        openings: (w, 2) probabilities of door and window.
-        log_distance: (w,) log distance of the wall in camera heights; NaN where it is not visible.
+    `openings` are probabilities of door and window. `log_distance` is that of the wall in camera heights; NaN where it
+    is not visible.
     """
 
     openings: Float[np.ndarray, "w 2"]

@@ -120,10 +120,8 @@ class Source(Protocol):
 class GeneratedSource:
     """Source of generated homes: a new one for every visit, with anchors and cameras anywhere on the floor.
 
-    Attributes:
-        config: of the run.
-        textures: folder of material pictures; None makes all materials procedural.
-        deferred: panoramas are scenes, to be rendered by `renderer` in another process.
+    With `textures` None all materials are procedural. `deferred` panoramas are scenes, to be rendered by `renderer` in
+    another process.
     """
 
     config: TrainConfig
@@ -224,12 +222,7 @@ class SceneSource:
     """Source of a data set's training scenes in shuffled epochs; each visit draws some of a scene's cameras.
 
     Anchors of stage 1 are the poses of the panoramas; stage 2 draws the appearance for each visit (paper, section 5).
-
-    Attributes:
-        config: of the run.
-        dataset: with training scenes.
-        skip_bad: skip files that cannot be used, and append their errors to `problems`.
-        problems: errors of skipped files.
+    `skip_bad` skips files that cannot be used, and appends their errors to `problems`.
     """
 
     config: TrainConfig

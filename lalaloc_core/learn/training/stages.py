@@ -24,14 +24,7 @@ from lalaloc_core.nets.trunk import Trunk
 
 
 class TrainingStage(ABC):
-    """Networks, data and losses of one stage, run by the training loop.
-
-    Attributes:
-        name: names the stage's checkpoints and log.
-        config: of the run.
-        source: training scenes.
-        modules: trained networks by name.
-    """
+    """Networks, data and losses of one stage, run by the training loop; `name` names its checkpoints and log."""
 
     name: ClassVar[str]
     config: TrainConfig

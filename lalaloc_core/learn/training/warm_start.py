@@ -30,7 +30,6 @@ class WarmStart:
     """Trained weights of one stage.
 
     Attributes:
-        checkpoint: the weights as a checkpoint of the stage that trained them.
         origin: description for checkpoints and manifests, with the total minutes and panoramas spent so far.
     """
 

@@ -26,7 +26,6 @@ class Marginals:
     Attributes:
         log_evidence: log of the sum over all paths and heights.
         state: for every picture the (n, k) probability of its states; the sum is one.
-        height: (j,) probability of every height.
     """
 
     log_evidence: float

@@ -34,12 +34,10 @@ class SequenceJob:
     """`m` paths to be refined, through `t` pictures.
 
     Attributes:
-        position_m: (m, t, 2) positions (m).
         heading: (m, t) headings (radians) in the frames, as in `poses.Query`.
         roll: (m, t) angles (radians) to add for the panoramas' headings.
         turnable: (t,) pictures whose heading is searched.
         walls_m, log_profile, precision: as in `poses.RefinementJob`.
-        motions: motions between neighbours.
         trusted: (m, t - 1) motions that each path follows.
         motion_scale: factor that scales the motions' residuals to those of azimuth columns.
         height_offset: (m,) start of δ.
@@ -68,8 +66,6 @@ class SequenceResult:
     """Refined paths.
 
     Attributes:
-        position_m: (m, t, 2) positions (m).
-        heading: (m, t) headings (radians) in the frames.
         height_offset: (m,) δ.
         information: for every picture the (m, p, p) information about its position and, if it was searched, heading,
             with all other unknowns integrated out.

@@ -31,9 +31,7 @@ class Observation:
     """One picture of the chain.
 
     Attributes:
-        query: the encoded panorama.
         index: (n,) numbers of the grid poses that are its states, under each of k hypotheses.
-        states: their positions and headings.
         cost: (j, n, k) matching cost by height, pose and hypothesis.
         log_likelihood: (j, n, k) log likelihood with the prior of the state.
         doubted: whether a heading was given that the picture contradicts.

@@ -49,9 +49,7 @@ class SequenceLocalisation:
     Attributes:
         pictures: for each picture the candidates, best path first, with the posterior given all pictures.
         path_probability: probability that the answers of all pictures are right, given that they are of the plan.
-        stage: the last stage that ran.
         motions_contradicted: numbers of the motions that the answer contradicts.
-        timings_ms: milliseconds per stage.
     """
 
     pictures: list[Localisation]

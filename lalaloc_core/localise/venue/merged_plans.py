@@ -27,7 +27,6 @@ class MergedPlans:
     """Merged plan of p plans, and its pose grid.
 
     Attributes:
-        plans: the plans, each in its own frame.
         plan: the merged plan. It claims the opening kinds that every plan claims, as a kind that only some plans show
             would make these fit worse than plans without it.
         grid: poses of all plans in the merged frame, in the order of the plans.

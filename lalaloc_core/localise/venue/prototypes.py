@@ -51,12 +51,7 @@ _COPY_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Prototypes:
-    """Prototypes of one plan, or of several plans, concatenated.
-
-    Attributes:
-        rows: (n,) records of type `ROW`.
-        step_m: step of the pose grid that they were taken from.
-    """
+    """Prototypes of one plan, or of several plans, concatenated: records of type `ROW`, from grids with one step."""
 
     rows: np.ndarray
     step_m: float

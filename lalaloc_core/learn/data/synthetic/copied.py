@@ -34,10 +34,6 @@ class CopiedScenes(DerivedScenes):
 
     In the other copies some doors are moved within their room, at least one of those that each camera sees, so every
     photograph identifies its copy. Doors without a free position are removed. Cameras that see no door are left out.
-
-    Attributes:
-        homes: the generated homes.
-        copies: number of copies per home.
     """
 
     copies: int = 4

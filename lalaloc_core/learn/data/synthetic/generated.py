@@ -31,12 +31,8 @@ SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "te
 class GeneratedScenes:
     """Homes of the generator with a few cameras each, at any heading and camera heights of 1.0 to 1.9 m.
 
-    Attributes:
-        homes: number of homes per split.
-        shots_per_home: cameras per home.
-        seed: of the homes.
-        furniture: level of all cameras; None draws a level per camera, and its photograph has no level.
-        textures: folder of material pictures; None makes all materials procedural.
+    `homes` are per split. With `furniture` None each camera has its own level, which its photograph does not state;
+    with `textures` None all materials are procedural.
     """
 
     homes: int

@@ -24,11 +24,8 @@ SPLIT_NUMBERS: dict[Split, int] = {"validation": 1, "test": 2}
 class HeldoutScenes:
     """Homes of the out-of-distribution generator with a few cameras each, at any heading, 1.1 to 1.8 m high.
 
-    Attributes:
-        homes: number of homes per split.
-        shots_per_home: cameras per home, at positions that are free at every furniture level.
-        seed: of the homes.
-        furniture: level of all cameras; None draws a level per camera, and its photograph has no level.
+    `homes` are per split. Camera positions are free at every furniture level. With `furniture` None each camera has its
+    own level, which its photograph does not state.
     """
 
     homes: int

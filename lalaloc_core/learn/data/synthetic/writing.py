@@ -57,11 +57,7 @@ _SCENE = re.compile(r"scene_\d+")
 class Synthesis:
     """Settings of generated scenes on disk.
 
-    Attributes:
-        root: folder of the data set.
-        seed: of the homes and their contents.
-        height: rows of a panorama, even; the width is twice the height.
-        textures: folder of material pictures; None makes all materials procedural.
+    Panoramas are twice as wide as their `height`, which is even. With `textures` None all materials are procedural.
     """
 
     root: Path

@@ -33,10 +33,8 @@ _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**
 class Building:
     """A large building as one plan.
 
-    Attributes:
-        homes: its homes; their photographs are photographs of the building.
-        shift_m: (h, 2) translation of each home.
-        first_room: (h,) index of the first room of each home in the plan.
+    Photographs of its homes are photographs of the building. `shift_m` is the translation of each home, and
+    `first_room` the index of its first room in the plan.
     """
 
     plan: FloorPlan

@@ -27,12 +27,9 @@ class Opening:
     """A hole in one wall of one room, as seen from that room; a door between two rooms is two openings.
 
     Attributes:
-        room: index of the room.
         wall: index of the edge of the room's `polygon_m`.
         start_m: start along the wall, from its first vertex.
         end_m: end along the wall.
-        sill_m: height of its lower edge above the floor.
-        head_m: height of its upper edge.
         kind: kind of opening; open doors, wide openings and windows are see-through.
         neighbour: index of the room behind it, -1 for the outdoors or a room outside the plan.
     """

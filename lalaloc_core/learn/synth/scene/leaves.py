@@ -28,9 +28,7 @@ class Leaf(NamedTuple):
     """A leaf of an open door in the plan frame.
 
     Attributes:
-        centre_m: middle of the leaf.
         axis: unit vector from the hinge to the handle.
-        half_width_m: half its length.
         in_own_room: true if it stands in the room of the opening.
     """
 

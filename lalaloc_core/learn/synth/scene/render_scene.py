@@ -87,10 +87,7 @@ class VisibleRooms(Records):
     """Room of the camera, then rooms seen through its doors.
 
     Attributes:
-        ceiling_m: height of the ceiling.
-        floor_surface, ceiling_surface: rows of the surfaces.
         light_m, light_colour: position, and colour times power, of the one lamp of a room seen through a door.
-        ambient: ambient light.
     """
 
     ceiling_m = Column()
@@ -121,10 +118,8 @@ class Sun(Records):
     """Sunlight through one window; all 0 for none.
 
     Attributes:
-        direction: unit vector to the sun.
         wall_start_m, wall_along: a point of the window's wall and the unit vector along it.
         s0_m, s1_m: start and end of the window along the wall.
-        z0_m, z1_m: its lower and upper edge.
         colour: colour times power.
     """
 
@@ -142,7 +137,6 @@ class Backdrop(Records):
     """The outdoors.
 
     Attributes:
-        sky, ground: colours.
         horizon: slope (tangent of the elevation) of the mean outline before the sky.
         ruggedness: amplitude of the outline, as a slope.
         turn, lift: shifts of outline and mottle as shares of a full turn.
@@ -160,9 +154,7 @@ class Backdrop(Records):
 class SceneRecords:
     """Records of a scene; a batch of scenes has one more axis.
 
-    Attributes:
-        rooms: that of the camera, then those seen through its doors: the row of a room is its slot.
-        sun, backdrop, exposure: a single row.
+    The row of a room is its slot. `sun`, `backdrop` and `exposure` have a single row.
     """
 
     decals: Decals
@@ -180,8 +172,6 @@ class RenderScene(SceneRecords):
     """All contents of one picture.
 
     Attributes:
-        camera_height_m: height of the camera above the floor.
-        heading: azimuth of the centre column, radians.
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
         wall_owner: slot of the wall's room; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.

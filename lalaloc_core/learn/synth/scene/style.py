@@ -15,13 +15,8 @@ class HouseStyle:
     """One style for all rooms of a scene; surfaces are rows of its table.
 
     Attributes:
-        trim: surface of frames, baseboards and mouldings.
-        door: surface of doors.
-        door_panel: surface of the panels on closed doors.
-        handle: surface of metal.
         outdoors: view through windows.
         gloom: surface behind the doors of rooms that are seen through doors, and behind panes.
-        doors_are_glazed: true if doors have panes.
         baseboard_m: height of the baseboards, 0 for none.
         crown_m: height of the mouldings below the ceiling, 0 for none.
     """

@@ -21,10 +21,7 @@ class Surfaces(Records):
     """Appearance of the surfaces of a scene.
 
     Attributes:
-        picture: number of the material's picture.
         scale: pictures per metre.
-        cosine, sine: cosine and sine of the picture's rotation.
-        tint: factor on its colours.
         gloss: share of light reflected like a mirror.
         glow: if positive, the surface emits its colour times this instead of reflecting light.
         is_outdoors: 1 for the view through a window.
