@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
@@ -91,9 +92,7 @@ def _from_control_points(raw: Any, altitude_m: float | None) -> Anchor:
     reach_m = MAX_FROM_ORIGIN_M
     drawn = np.array([[read_number_between(point[key], key, -reach_m, reach_m, " m") for key in "xy"] for point in raw])
     lon_lat = np.array([[longitude, latitude] for latitude, longitude in places])
-    frame = LocalFrame(float(lon_lat[:, 0].mean()), float(lon_lat[:, 1].mean()))
-    on_earth = frame.to_local(lon_lat)
-    (dx, dy), (east, north) = drawn[1] - drawn[0], on_earth[1] - on_earth[0]
+    (dx, dy), (east, north) = drawn[1] - drawn[0], _frame_at(lon_lat[0]).to_local(lon_lat[1:])[0]
     drawn_m, earth_m = math.hypot(dx, dy), math.hypot(east, north)
     if not min(drawn_m, earth_m) >= _MIN_APART_M:
         raise InvalidFloorPlanError(
@@ -104,11 +103,19 @@ def _from_control_points(raw: Any, altitude_m: float | None) -> Anchor:
             f"the control points are {drawn_m:.2f} m apart in the plan and {earth_m:.2f} m on Earth; the limit is "
             f"{_MAX_STRETCH:.0%} difference; check the scale"
         )
+    # Longitudes have no mean at a pole or across the date line, so the midpoint is that of metres.
+    frame = _frame_at(_frame_at(lon_lat[0]).to_earth(np.array([[0.5 * east, 0.5 * north]]))[0])
+    start, end = frame.to_local(lon_lat)
+    east, north = end - start
     # Azimuth of the line in the plan, minus its azimuth from north.
     north_deg = math.degrees(math.atan2(dx, dy) - math.atan2(east, north)) % 360.0
     middle = Anchor(frame.latitude, frame.longitude, altitude_m, north_deg)
     x, y = drawn.mean(axis=0)
     return middle.moved((-float(x), -float(y)))
+
+
+def _frame_at(lon_lat: Float[np.ndarray, "2"]) -> LocalFrame:
+    return LocalFrame(float(lon_lat[0]), float(lon_lat[1]))
 
 
 def _place(raw: Mapping[str, Any], where: str) -> tuple[float, float]:

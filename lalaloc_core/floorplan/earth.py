@@ -85,7 +85,8 @@ class LocalFrame:
         """Return the angle clockwise from true north to the frame's north at a longitude and latitude (degrees)."""
         longitude, latitude = lon_lat
         span = math.radians(float(longitude) - self.longitude)
-        return math.degrees(math.atan(math.tan(span) * math.sin(math.radians(float(latitude)))))
+        # `atan2` also holds beyond a pole, where longitudes differ by more than 90°.
+        return math.degrees(math.atan2(math.sin(span) * math.sin(math.radians(float(latitude))), math.cos(span)))
 
     @property
     def anchor(self) -> Anchor:

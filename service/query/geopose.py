@@ -35,7 +35,8 @@ def geopose_at(
     if anchor is None:
         return None
     ((longitude, latitude),) = anchor.to_earth(np.array([position_m], dtype=float))
-    azimuth_deg = anchor.true_azimuth_deg(position_m, heading_deg)
+    # Rounded first: a yaw of -180° is written as 180°.
+    azimuth_deg = round(anchor.true_azimuth_deg(position_m, heading_deg), 4)
     yaw_deg = round(-azimuth_deg if azimuth_deg < 180.0 else 360.0 - azimuth_deg, 4) + 0.0
     return GeoPose(
         position=GeoPosePosition(

@@ -261,23 +261,34 @@ def _projection(features: Sequence[Feature], crs: str | None, options: ImportOpt
             raise InvalidFloorPlanError(f"the crs '{crs}' cannot be used: {error}; export the file in WGS84") from error
     else:
         convert = _checked(lambda points: points)
-    if not (-180.0 <= low[0] <= high[0] <= 180.0 and -90.0 <= low[1] <= high[1] <= 90.0):
+    if not (np.abs([low, high]) <= [180.0, 90.0]).all():
         raise InvalidFloorPlanError(
             f"coordinates reach ({high[0]:g}, {high[1]:g}), outside longitude ±180 and latitude ±90; "
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
-    frame = LocalFrame(float(round(0.5 * (low[0] + high[0]), 9)), float(round(0.5 * (low[1] + high[1]), 9)))
+    # The box of a plan across the date line or around a pole is as wide as the Earth.
+    is_box = 0.0 <= high[0] - low[0] <= 180.0
+    longitude, latitude = 0.5 * (low + high) if is_box else _middle(convert(points))
+    frame = LocalFrame(float(round(longitude, 9)), float(round(latitude, 9)))
 
     def project(shape: BaseGeometry) -> BaseGeometry:
         return shapely.transform(shape, lambda points: frame.to_local(convert(points)))
 
-    corners = frame.to_local(convert(points[[points[:, 0].argmin(), points[:, 0].argmax()]]))
-    if np.abs(corners).max() > _MAX_REACH_M:
+    reach_m = float(np.abs(frame.to_local(convert(points))).max())
+    if not reach_m <= _MAX_REACH_M:
         raise InvalidFloorPlanError(
-            f"the features span {2.0 * np.abs(corners).max():.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
+            f"the features span {2.0 * reach_m:.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
     return project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs
+
+
+def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
+    """Return the longitude and latitude of the mean of directions from the Earth's centre."""
+    longitude, latitude = np.radians(lon_lat).T
+    directions = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    x, y, z = (float(direction.mean()) for direction in directions)
+    return math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
 
 
 def _checked(convert: Any) -> Any:
