@@ -1,32 +1,31 @@
-"""Command line of the service: `lalaloc-service serve` and `lalaloc-service keys create|list|revoke`.
+"""Command line of the service: `lalaloc-service serve`, `keys create|list|revoke` and `tenants list|limit`.
 
-Keys are in the database of the settings, so these commands also work while the service runs.
+Keys and tenants are in the database of the settings, so these commands also work while the service runs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
 import socket
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from lalaloc_core.localise.bundle import Bundle
+from service.command_parts import configured_store, tenant_name, text_table
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
 from service.settings import Settings
-from service.storage import Store, open_store
+from service.storage import open_store
 from service.storage.records import ApiKey
 from service.telemetry.tracing import otlp_exporter
+from service.tenant_commands import add_tenant_commands
 
 # Connections that the kernel accepts while the service is busy.
 _BACKLOG = 1024
-_TENANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_NAME = 200
 _MAX_RATE = 10**6
 
@@ -101,7 +100,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     create = keys.add_parser("create", help="create a key and print it; it cannot be shown again")
     create.add_argument(
-        "--tenant", required=True, type=_tenant, help="tenant whose floor plans the key gives access to"
+        "--tenant", required=True, type=tenant_name, help="tenant whose floor plans the key gives access to"
     )
     create.add_argument("--name", required=True, type=_name, help="name of the key, for your own records")
     create.add_argument(
@@ -120,19 +119,20 @@ def build_parser() -> argparse.ArgumentParser:
     create.set_defaults(run=_create)
 
     listing = keys.add_parser("list", help="list all keys, including revoked ones, without secrets")
-    listing.add_argument("--tenant", type=_tenant, help="list only the keys of this tenant")
+    listing.add_argument("--tenant", type=tenant_name, help="list only the keys of this tenant")
     listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
 
     revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within LALALOC_KEY_CACHE_S")
     revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
+    add_tenant_commands(commands)
     return parser
 
 
 def _create(arguments: argparse.Namespace) -> int:
     secret = new_secret()
-    with _store() as store:
+    with configured_store() as store:
         key = store.keys.create(
             arguments.tenant,
             arguments.name,
@@ -147,7 +147,7 @@ def _create(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    with _store() as store:
+    with configured_store() as store:
         keys = store.keys.list_keys(arguments.tenant)
     if arguments.json:
         print(json.dumps([asdict(key) | {"scopes": sorted(key.scopes)} for key in keys], default=str, indent=2))
@@ -157,21 +157,12 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
-    with _store() as store:
+    with configured_store() as store:
         if not store.keys.revoke(arguments.id):
             print(f"lalaloc-service: no active key '{arguments.id[:64]}'", file=sys.stderr)
             return 1
     print(f"revoked {arguments.id}")
     return 0
-
-
-@contextmanager
-def _store() -> Iterator[Store]:
-    store = open_store(Settings.load())
-    try:
-        yield store
-    finally:
-        store.close()
 
 
 def _table(keys: Sequence[ApiKey]) -> str:
@@ -189,19 +180,11 @@ def _table(keys: Sequence[ApiKey]) -> str:
         )
         for key in keys
     ]
-    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(len(head))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows))
-    return "\n".join(line.rstrip() for line in lines)
+    return text_table(head, rows)
 
 
 def _moment(moment: datetime | None) -> str:
     return "-" if moment is None else moment.isoformat(timespec="seconds")
-
-
-def _tenant(given: str) -> str:
-    if not _TENANT.fullmatch(given):
-        raise argparse.ArgumentTypeError("1 to 64 letters, digits, '.', '_' and '-', beginning with a letter or digit")
-    return given
 
 
 def _name(given: str) -> str:

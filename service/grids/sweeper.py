@@ -29,7 +29,8 @@ class Sweeper:
         self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
 
     def start(self) -> None:
-        """Clear the failures of earlier runs, so that these grids are tried again, and start the thread."""
+        """Read the limits of tenants, clear the failures of earlier runs to try these grids again, start the thread."""
+        self._store.tenant_limits.refresh()
         self._store.plans.clear_failures()
         self._grids.queue_missing()
         self._thread.start()
@@ -59,6 +60,7 @@ class Sweeper:
                 due = monotonic() >= sweep_at
                 if due:
                     sweep_at = monotonic() + self._sweep_s
+                    self._store.tenant_limits.refresh()
                     self.sweep()
                 # A backlog, as after a new model, continues as soon as the queued grids are done.
                 if due or (more and self._grids.pending == 0):

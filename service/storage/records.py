@@ -217,6 +217,21 @@ class ApiKey:
     last_used_at: datetime | None
 
 
+@dataclass(frozen=True, kw_only=True)
+class OperatorLimits:
+    """Limits that the operator set for a tenant; None for the limit in the settings.
+
+    Attributes:
+        stored_bytes: limit of stored bytes.
+        bytes_in_flight: limit of the bytes of request bodies in memory and on disk.
+        cpu_share: weight of the tenant in queues: with 2.0 its CPU seconds count half. None counts as 1.0.
+    """
+
+    stored_bytes: int | None = None
+    bytes_in_flight: int | None = None
+    cpu_share: float | None = None
+
+
 @dataclass(frozen=True)
 class StoredAnswer:
     """Stored answer to a request with an idempotency key."""

@@ -21,6 +21,7 @@ from service.storage.kept_answers import KeptAnswers
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
 from service.storage.stored_grids import GridLeases, StoredGrids
+from service.storage.tenants import TenantLimits, Tenants
 from service.storage.venues import Venues
 
 # Margin (s) of the lease of an idempotency key over the query timeout.
@@ -44,6 +45,8 @@ class Store:
         idempotency_keys: answers by idempotency key.
         keys: API keys.
         answers: kept answers.
+        tenants: the operator's limits per tenant.
+        tenant_limits: the same limits in memory.
     """
 
     def __init__(
@@ -81,6 +84,8 @@ class Store:
         self.idempotency_keys = IdempotencyKeys(database, claim_s)
         self.keys = ApiKeys(database)
         self.answers = KeptAnswers(database)
+        self.tenants = Tenants(database)
+        self.tenant_limits = TenantLimits(self.tenants)
 
     def answered_since(self, moment_s: float) -> bool:
         """Tell whether the database completed a transaction after a moment (`monotonic`)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from sqlalchemy import (
+    BigInteger,
     Column,
     DateTime,
     Dialect,
@@ -174,6 +175,17 @@ VENUE_PLANS = Table(
     Column("name", Text),
     Index("venue_plans_by_plan", "plan_id"),
     Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
+)
+
+TENANTS = Table(
+    "tenants",
+    METADATA,
+    Column("tenant", String(64), primary_key=True),
+    # Limits set by the operator; NULL for the limit in the settings.
+    Column("max_stored_bytes", BigInteger),
+    Column("max_bytes_in_flight", BigInteger),
+    # Weight of the tenant's CPU seconds in queues; NULL counts as 1.
+    Column("cpu_share", Double),
 )
 
 API_KEYS = Table(

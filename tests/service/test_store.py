@@ -783,6 +783,7 @@ def test_migration_fills_in_places(store: Store, url: str) -> None:
         for table, column in _OF_PLACES:
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         connection.exec_driver_sql("UPDATE revisions SET document = 'damaged' WHERE plan_id = 'r'")
+        connection.exec_driver_sql("DROP TABLE tenants")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0005'")
     store.close()
     moved = Store(url)
@@ -813,7 +814,7 @@ def test_migration_drops_grids_without_digest(store: Store, url: str) -> None:
             *_OF_PLACES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers"):
+        for table in ("venue_plans", "venues", "kept_answers", "tenants"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
     store.close()
@@ -837,7 +838,7 @@ def test_migration_adds_venues(store: Store, url: str) -> None:
         connection.exec_driver_sql("DROP INDEX floorplans_by_place")
         for table, column in (*_OF_VENUES, *_OF_FILES, *_OF_PLACES):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers"):
+        for table in ("venue_plans", "venues", "kept_answers", "tenants"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0002'")
     store.close()
