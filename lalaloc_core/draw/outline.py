@@ -80,8 +80,7 @@ def layout_outline(
     corners = np.stack([low, high], axis=1)
     openings = [
         drawn
-        for face in plan.opening_faces
-        if face.room == room_index
+        for face in plan.room_faces[room_index]
         for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
     ]
     return LayoutOutline(

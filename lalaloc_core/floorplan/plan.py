@@ -191,6 +191,14 @@ class FloorPlan:
         return float(x_min), float(y_min), float(x_max), float(y_max)
 
     @cached_property
+    def room_faces(self) -> tuple[tuple[OpeningFace, ...], ...]:
+        """The opening faces of every room."""
+        faces: list[list[OpeningFace]] = [[] for _ in self.rooms]
+        for face in self.opening_faces:
+            faces[face.room].append(face)
+        return tuple(map(tuple, faces))
+
+    @cached_property
     def geometry(self) -> PlanGeometry:
         """Walls and openings as padded arrays, for the layout renderer."""
         return build_geometry(self.rooms, self.openings, self.opening_faces)

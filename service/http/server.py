@@ -80,8 +80,9 @@ class Server(uvicorn.Server):
         if self._stopping_since is not None:
             os._exit(1)
         self._stopping_since = monotonic()
-        # This ends the process even if a thread or a disk hangs.
-        last_resort = threading.Timer(self._settings.requests.stop_deadline_s, os._exit, [1])
+        # This ends the process even if a thread or a disk hangs. The stop was asked for, and every commit is complete
+        # or undone, so the status is 0. Worker processes end with this one.
+        last_resort = threading.Timer(self._settings.requests.stop_deadline_s, os._exit, [0])
         last_resort.daemon = True
         last_resort.start()
         admission = self._admission

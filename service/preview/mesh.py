@@ -31,11 +31,8 @@ _PANEL_OFFSET_M = 0.005
 def plan_glb(plan: FloorPlan) -> bytes:
     """Return the plan as binary glTF with one node per surface, named `<room number>/<room>/<surface>`."""
     scene = trimesh.Scene()
-    faces: list[list[OpeningFace]] = [[] for _ in plan.rooms]
-    for face in plan.opening_faces:
-        faces[face.room].append(face)
     for index, room in enumerate(plan.rooms):
-        for surface, mesh in (_surfaces(room) | _openings(plan, room, faces[index])).items():
+        for surface, mesh in (_surfaces(room) | _openings(plan, room, plan.room_faces[index])).items():
             material = PBRMaterial(
                 name=surface, baseColorFactor=_COLOURS[surface], metallicFactor=0.0, roughnessFactor=0.9
             )

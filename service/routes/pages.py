@@ -6,6 +6,7 @@ Nothing is inline or loaded from elsewhere. The pages need no API key; they ask 
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from importlib.resources import files
 from mimetypes import guess_type
 
@@ -25,6 +26,7 @@ _HEADERS = {
     # Browsers revalidate each time, because another version can answer next.
     "Cache-Control": "no-cache",
 }
+_MAX_FILES = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
 
 
@@ -58,9 +60,22 @@ def _file(request: Request, name: str) -> Response:
     Raises:
         HTTPException: no such file.
     """
+    if not _NAME.fullmatch(name):
+        raise HTTPException(404)
+    content, media, etag = _built(name)
+    return conditional_answer(request, content, media, etag, _HEADERS)
+
+
+@lru_cache(_MAX_FILES)
+def _built(name: str) -> tuple[bytes, str, str]:
+    """Return content, media type and entity tag of a built file, which never changes while the service runs.
+
+    Raises:
+        HTTPException: no such file.
+    """
     path = files("service") / "web" / name
-    if not _NAME.fullmatch(name) or not path.is_file():
+    if not path.is_file():
         raise HTTPException(404)
     content = path.read_bytes()
     media = "text/javascript" if name.endswith(".js") else guess_type(name)[0] or "application/octet-stream"
-    return conditional_answer(request, content, media, content_etag(content), _HEADERS)
+    return content, media, content_etag(content)

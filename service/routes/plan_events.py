@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.events import EventStream
 from service.http.problems import problem_responses
-from service.routes.dependencies import Running, Tenant, stored_plan
+from service.routes.dependencies import Running, Tenant, plan_summary
 from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
@@ -36,6 +36,6 @@ async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running
     last event. A comment is sent at least every 15 s. The stream also ends after 15 minutes, soon after the API key is
     revoked, and when the service stops; reconnect then.
     """
-    record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
-    add_log_fields(request, plan=record.id, revision=record.revision_id)
-    return runtime.events.event_stream(record.id, partial(runtime.access_control.still_authorised, request))
+    current = await asyncio.to_thread(plan_summary, tenant, floorplan_id, runtime.store.plans)
+    add_log_fields(request, plan=current.id, revision=current.revision_id)
+    return runtime.events.event_stream(current.id, partial(runtime.access_control.still_authorised, request))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError, UnknownRevisionError
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
@@ -64,23 +64,20 @@ def _layout(record: PlanRecord) -> LayoutAnswer:
             polygon=room.polygon_m.tolist(),
             holes=[hole.tolist() for hole in room.holes_m],
             walls_m=room.walls_m.tolist(),
-            openings=_openings(plan, index),
+            openings=[_opening(plan, face) for face in plan.room_faces[index]],
         )
         for index, room in enumerate(plan.rooms)
     ]
     return LayoutAnswer(floorplan_id=record.id, revision=record.revision_id, rooms=rooms)
 
 
-def _openings(plan: FloorPlan, room: int) -> list[OpeningFaceAnswer]:
-    return [
-        OpeningFaceAnswer(
-            kind=plan.openings[face.opening].kind,
-            wall=face.wall,
-            start=face.start,
-            end=face.end,
-            sill_m=plan.openings[face.opening].sill_m,
-            head_m=plan.openings[face.opening].head_m,
-        )
-        for face in plan.opening_faces
-        if face.room == room
-    ]
+def _opening(plan: FloorPlan, face: OpeningFace) -> OpeningFaceAnswer:
+    opening = plan.openings[face.opening]
+    return OpeningFaceAnswer(
+        kind=opening.kind,
+        wall=face.wall,
+        start=face.start,
+        end=face.end,
+        sill_m=opening.sill_m,
+        head_m=opening.head_m,
+    )

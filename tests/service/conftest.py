@@ -170,6 +170,15 @@ def encode_picture(width: int, height: int, picture_format: str, **options: Any)
     return buffer.getvalue()
 
 
+def tiled_plan(side: int, *, openings: bool = False) -> dict[str, Any]:
+    """Return a plan of `side` x `side` square rooms, each with a door and a window if `openings`."""
+    corners = [(4.0 * i, 4.0 * j) for j in range(side) for i in range(side)]
+    rooms = [{"polygon": [[x, y], [x + 4, y], [x + 4, y + 4], [x, y + 4]]} for x, y in corners]
+    doors = [{"kind": "door", "line": [[x + 1, y], [x + 2, y]]} for x, y in corners if openings]
+    windows = [{"kind": "window", "line": [[x, y + 1], [x, y + 2]]} for x, y in corners if openings]
+    return {"name": "tiles", "ceiling_height_m": 2.5, "rooms": rooms, "openings": doors + windows}
+
+
 def upload(client: httpx.Client, plan: dict[str, Any] | None = None, *, wait: bool = True) -> str:
     """Upload a plan, wait until it is ready, return its id."""
     response = client.post("/floorplans", json=plan or FLAT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from time import monotonic, sleep
 
 import httpx
 
-from tests.service.conftest import FLAT, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, assert_problem, tiled_plan, upload, wait_for
 from tests.service.test_process import ROOT, alive, children, environment_of
 
 
@@ -107,6 +108,31 @@ def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
             # An upload may take a minute.
             assert monotonic() - begin < 10.0
         wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
+
+
+def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path) -> None:
+    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="1") as service:
+        workers = children(service.process.pid)
+        body = json.dumps(FLAT).encode()
+        # A writer that does not finish: SQLite lets the upload's thread wait for 5 s.
+        lock = sqlite3.connect(tmp_path / "data" / "lalaloc.sqlite3", isolation_level=None)
+        lock.execute("BEGIN IMMEDIATE")
+        with service.connect(_upload_head(body) + body):
+            wait_for(lambda: _in_flight(service.client))
+            service.process.send_signal(signal.SIGTERM)
+            assert service.process.wait(30.0) == 0
+        lock.close()
+        wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
+
+
+def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) -> None:
+    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
+        plan_id = upload(service.client, tiled_plan(60, openings=True), wait=False)
+        for path in ("", "/layout", "/preview.svg", "/mesh.glb", "/export?format=svg") * 2:
+            with service.connect(f"GET /floorplans/{plan_id}{path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()):
+                pass
+        service.process.send_signal(signal.SIGTERM)
+        assert service.process.wait(30.0) == 0
 
 
 def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
