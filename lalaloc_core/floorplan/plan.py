@@ -121,7 +121,7 @@ class FloorPlan:
         if not isinstance(document, Mapping):
             raise InvalidFloorPlanError(f"a plan must be an object, not {json_kind(document)}")
         check_keys(document, _PLAN_KEYS)
-        name = read_name(document.get("name", "floor plan"), limits, what="the plan's name")
+        name = read_name(document.get("name", "floor plan"), limits, label="the plan's name")
         ceiling = document.get("ceiling_height_m")
         default_ceiling_m = None if ceiling is None else read_ceiling(ceiling, None, limits)
         rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)

@@ -77,7 +77,7 @@ def _count_vertices(raw: Mapping[str, Any]) -> int:
 def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, limits: PlanLimits) -> Room:
     if not isinstance(raw, Mapping):
         raise InvalidFloorPlanError(f"a room must be an object, not {json_kind(raw)}", room=fallback_name)
-    name = read_name(raw.get("name", fallback_name), limits, what=f"the name of {fallback_name}")
+    name = read_name(raw.get("name", fallback_name), limits, label=f"the name of {fallback_name}")
     check_keys(raw, _ROOM_KEYS, room=name)
     key = read_name(raw["id"], limits, "the id", room=name) if raw.get("id") is not None else ""
     kind = read_choice(raw.get("type", ROOM_TYPES[0]), ROOM_TYPES, "the type", room=name)
@@ -109,14 +109,14 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     )
 
 
-def _read_ring(raw: Any, what: str, room: str, limits: PlanLimits, *, is_hole: bool = False) -> np.ndarray:
+def _read_ring(raw: Any, field: str, room: str, limits: PlanLimits, *, is_hole: bool = False) -> np.ndarray:
     """Read a simple polygon: counter-clockwise, or clockwise for a hole; read-only."""
     if not isinstance(raw, list | tuple) or len(raw) < 3:
-        raise InvalidFloorPlanError(f"'{what}' must be a list of at least three [x, y] vertices", room=room)
-    ring = read_points(raw, limits, room, "vertex" if what == "polygon" else f"{what}: vertex")
+        raise InvalidFloorPlanError(f"'{field}' must be a list of at least three [x, y] vertices", room=room)
+    ring = read_points(raw, limits, room, "vertex" if field == "polygon" else f"{field}: vertex")
     # Repeated vertices, such as the closing one of a closed ring, would be walls of length zero.
     ring = ring[np.any(ring != np.roll(ring, -1, axis=0), axis=1)]
-    subject = "the polygon" if what == "polygon" else what
+    subject = "the polygon" if field == "polygon" else field
     if len(ring) < 3:
         raise InvalidFloorPlanError(f"{subject} has fewer than three distinct vertices", room=room)
     if _is_collinear(ring):

@@ -48,53 +48,53 @@ def check_keys(document: Mapping[str, Any], known: Collection[str], room: str | 
         )
 
 
-def read_name(value: Any, limits: PlanLimits, what: str, room: str | None = None) -> str:
+def read_name(value: Any, limits: PlanLimits, label: str, room: str | None = None) -> str:
     """Read a non-empty text for users."""
     if not isinstance(value, str) or not value.strip():
-        raise InvalidFloorPlanError(f"{what} must be a non-empty string", room=room)
+        raise InvalidFloorPlanError(f"{label} must be a non-empty string", room=room)
     if len(value) > limits.max_name_length:
         raise InvalidFloorPlanError(
-            f"{what} has {len(value)} characters; the limit is {limits.max_name_length} (PlanLimits.max_name_length)",
+            f"{label} has {len(value)} characters; the limit is {limits.max_name_length} (PlanLimits.max_name_length)",
             room=room,
         )
     if any(unicodedata.category(character) in _NOT_TEXT for character in value):
-        raise InvalidFloorPlanError(f"{what} has control characters or lone surrogates; remove them", room=room)
+        raise InvalidFloorPlanError(f"{label} has control characters or lone surrogates; remove them", room=room)
     return value
 
 
-def read_choice(value: Any, choices: Collection[str], what: str, room: str | None = None) -> str:
+def read_choice(value: Any, choices: Collection[str], label: str, room: str | None = None) -> str:
     """Read one of the words `choices`."""
     if not isinstance(value, str) or value not in choices:
         shown = f"'{value[:_SHOWN]}'" if isinstance(value, str) else json_kind(value)
-        raise InvalidFloorPlanError(f"{what} is {shown}; it must be one of {', '.join(choices)}", room=room)
+        raise InvalidFloorPlanError(f"{label} is {shown}; it must be one of {', '.join(choices)}", room=room)
     return value
 
 
-def read_number(value: Any, what: str, room: str | None = None, *, above: float) -> float:
+def read_number(value: Any, label: str, room: str | None = None, *, above: float) -> float:
     """Read a finite number above a bound."""
     if not is_number(value):
-        raise InvalidFloorPlanError(f"{what} must be a number, not {json_kind(value)}", room=room)
+        raise InvalidFloorPlanError(f"{label} must be a number, not {json_kind(value)}", room=room)
     if not _is_finite(value) or value <= above:
         raise InvalidFloorPlanError(
-            f"{what} is {str(value)[:_SHOWN]}; it must be finite and above {above:g}", room=room
+            f"{label} is {str(value)[:_SHOWN]}; it must be finite and above {above:g}", room=room
         )
     return float(value)
 
 
-def read_number_between(value: Any, what: str, low: float, high: float, unit: str, room: str | None = None) -> float:
+def read_number_between(value: Any, label: str, low: float, high: float, unit: str, room: str | None = None) -> float:
     """Read a number in a closed range."""
-    number = read_number(value, what, room, above=-sys.float_info.max)
+    number = read_number(value, label, room, above=-sys.float_info.max)
     if not low <= number <= high:
-        raise InvalidFloorPlanError(f"{what} is {number:g}; it must be between {low:g} and {high:g}{unit}", room=room)
+        raise InvalidFloorPlanError(f"{label} is {number:g}; it must be between {low:g} and {high:g}{unit}", room=room)
     return number
 
 
-def read_list(value: Any, what: str, limit: int, limit_name: str, room: str | None = None) -> list[Any]:
+def read_list(value: Any, label: str, limit: int, limit_name: str, room: str | None = None) -> list[Any]:
     """Read a list of at most `limit` entries."""
     if not isinstance(value, list | tuple):
-        raise InvalidFloorPlanError(f"{what} must be a list, not {json_kind(value)}", room=room)
+        raise InvalidFloorPlanError(f"{label} must be a list, not {json_kind(value)}", room=room)
     if len(value) > limit:
-        raise InvalidFloorPlanError(f"{len(value)} {what}; the limit is {limit} ({limit_name})", room=room)
+        raise InvalidFloorPlanError(f"{len(value)} {label}; the limit is {limit} ({limit_name})", room=room)
     return list(value)
 
 
@@ -115,13 +115,13 @@ def read_points(
     return np.array(raw, dtype=np.float64).reshape(-1, 2)
 
 
-def read_segment(raw: Any, what: str, limits: PlanLimits, room: str | None) -> Float[np.ndarray, "2 2"]:
+def read_segment(raw: Any, label: str, limits: PlanLimits, room: str | None) -> Float[np.ndarray, "2 2"]:
     """Read two different points [[x, y], [x, y]]."""
     if not isinstance(raw, list | tuple) or len(raw) != 2:
-        raise InvalidFloorPlanError(f"{what} must be two points [[x, y], [x, y]]", room=room)
-    points = read_points(raw, limits, room, f"{what}: point")
+        raise InvalidFloorPlanError(f"{label} must be two points [[x, y], [x, y]]", room=room)
+    points = read_points(raw, limits, room, f"{label}: point")
     if float(np.hypot(*(points[1] - points[0]))) < _MIN_SEGMENT_M:
-        raise InvalidFloorPlanError(f"{what} is shorter than {_MIN_SEGMENT_M:g} m, the minimum", room=room)
+        raise InvalidFloorPlanError(f"{label} is shorter than {_MIN_SEGMENT_M:g} m, the minimum", room=room)
     return points
 
 

@@ -205,15 +205,15 @@ class _Reader:
             raise self.error(f"openings must be a list of at most {_MAX_OPENINGS} entries")
         spans = []
         for number, entry in enumerate(raw):
-            what = f"opening {number}"
+            label = f"opening {number}"
             if not isinstance(entry, Mapping) or set(entry) != _OPENING_KEYS:
-                raise self.error(f"{what} must be an object with the keys {', '.join(sorted(_OPENING_KEYS))}")
+                raise self.error(f"{label} must be an object with the keys {', '.join(sorted(_OPENING_KEYS))}")
             kind = entry["kind"]
             if kind not in OPENING_CLASSES[1:]:
-                raise self.error(f"{what}: kind is {kind!r}; it must be one of {', '.join(OPENING_CLASSES[1:])}")
-            left, right = self._columns(entry["columns"], what, width)
-            line = self._points(entry["line"], f"{what}: line", 2, 2)
-            self._check_sides(line, (left, right), what, width)
+                raise self.error(f"{label}: kind is {kind!r}; it must be one of {', '.join(OPENING_CLASSES[1:])}")
+            left, right = self._columns(entry["columns"], label, width)
+            line = self._points(entry["line"], f"{label}: line", 2, 2)
+            self._check_sides(line, (left, right), label, width)
             spans.append((kind, left, right))
         return tuple(spans)
 
@@ -228,34 +228,34 @@ class _Reader:
                     f"{_MAX_OFFSET:g}"
                 )
 
-    def _columns(self, raw: Any, what: str, width: int) -> tuple[float, float]:
+    def _columns(self, raw: Any, label: str, width: int) -> tuple[float, float]:
         if (
             not isinstance(raw, list)
             or len(raw) != 2
             or not all(is_number(column) and 0.0 <= column <= width for column in raw)
         ):
-            raise self.error(f"{what}: columns are {raw!r}; they must be two numbers from 0 to the width, {width}")
+            raise self.error(f"{label}: columns are {raw!r}; they must be two numbers from 0 to the width, {width}")
         return raw[0] / width, raw[1] / width
 
-    def _check_sides(self, line: Float[np.ndarray, "2 2"], sides: tuple[float, float], what: str, width: int) -> None:
+    def _check_sides(self, line: Float[np.ndarray, "2 2"], sides: tuple[float, float], label: str, width: int) -> None:
         ends = np.arctan2(line[:, 0], line[:, 1]) / TWO_PI + 0.5
         away = np.abs(wrap_angle(TWO_PI * (ends - np.array(sides)))) / TWO_PI
         if away.max() > _COLUMN_TOLERANCE:
             line_columns, columns = (", ".join(f"{share * width:.0f}" for share in pair) for pair in (ends, sides))
             raise self.error(
-                f"{what}: the ends of its line are at the columns {line_columns}, but its columns are {columns}; the "
+                f"{label}: the ends of its line are at the columns {line_columns}, but its columns are {columns}; the "
                 f"maximum difference is {_COLUMN_TOLERANCE * width:.0f}"
             )
 
-    def _points(self, raw: Any, what: str, low: int, high: int) -> Float[np.ndarray, "n 2"]:
+    def _points(self, raw: Any, label: str, low: int, high: int) -> Float[np.ndarray, "n 2"]:
         if not isinstance(raw, list) or not low <= len(raw) <= high:
-            raise self.error(f"{what} must be a list of {low} to {high} points [x, y]")
+            raise self.error(f"{label} must be a list of {low} to {high} points [x, y]")
         for point in raw:
             if not isinstance(point, list) or len(point) != 2 or not all(map(is_number, point)):
-                raise self.error(f"{what}: a point is {str(point)[:50]}; it must be two numbers [x, y]")
+                raise self.error(f"{label}: a point is {str(point)[:50]}; it must be two numbers [x, y]")
             if max(map(abs, point)) > _MAX_REACH:
                 raise self.error(
-                    f"{what}: a point is {str(point)[:50]}; the limit is {_MAX_REACH:g}, and lengths are in camera "
+                    f"{label}: a point is {str(point)[:50]}; the limit is {_MAX_REACH:g}, and lengths are in camera "
                     "heights"
                 )
         return np.array(raw, dtype=np.float64)

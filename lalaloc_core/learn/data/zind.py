@@ -242,14 +242,14 @@ class _FloorReader:
             raise self._error(f"{key} is {value!r}; it must be {limit}", panorama.name)
         return float(value)
 
-    def _pair(self, value: Any, what: str, panorama: _Panorama) -> tuple[float, float]:
+    def _pair(self, value: Any, key: str, panorama: _Panorama) -> tuple[float, float]:
         if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)):
-            raise self._error(f"{what} is {str(value)[:80]}; it must be two numbers", panorama.name)
+            raise self._error(f"{key} is {str(value)[:80]}; it must be two numbers", panorama.name)
         return float(value[0]), float(value[1])
 
-    def _object(self, value: Any, what: str) -> dict[str, Any]:
+    def _object(self, value: Any, key: str) -> dict[str, Any]:
         if not isinstance(value, dict):
-            raise self._error(f"'{what}' must be an object, not {type(value).__name__}")
+            raise self._error(f"'{key}' must be an object, not {type(value).__name__}")
         return value
 
     def _error(self, reason: str, panorama: str | None = None) -> DatasetError:

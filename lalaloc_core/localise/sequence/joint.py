@@ -149,19 +149,19 @@ def _evaluate(job: SequenceJob, unknowns: Float[np.ndarray, "m u"]) -> _Evaluati
     blocks = weighted @ jacobian.swapaxes(2, 3)
     pulls = (weighted @ residual[..., None])[..., 0]
     for t in range(pictures):
-        at = [3 * t, 3 * t + 1, 3 * t + 2, unknowns.shape[1] - 1]
-        curvature[:, np.array(at)[:, None], at] += blocks[:, t]
-        slope[:, at] += pulls[:, t]
+        block = [3 * t, 3 * t + 1, 3 * t + 2, unknowns.shape[1] - 1]
+        curvature[:, np.array(block)[:, None], block] += blocks[:, t]
+        slope[:, block] += pulls[:, t]
     for s, motion in enumerate(job.motions):
-        at = list(range(3 * s, 3 * s + 6))
+        block = list(range(3 * s, 3 * s + 6))
         off, by_both = motion_residuals(motion, position_m[:, s : s + 2], (heading + job.roll)[:, s : s + 2])
         by_both[:, :, 2] *= job.turnable[s]
         by_both[:, :, 5] *= job.turnable[s + 1]
         scale = job.motion_scale * job.trusted[:, s, None]
         off, by_both = off * scale, by_both * scale[:, :, None]
         cost += 0.5 * np.square(off).sum(axis=1)
-        curvature[:, np.array(at)[:, None], at] += by_both.swapaxes(1, 2) @ by_both
-        slope[:, at] += (by_both.swapaxes(1, 2) @ off[:, :, None])[:, :, 0]
+        curvature[:, np.array(block)[:, None], block] += by_both.swapaxes(1, 2) @ by_both
+        slope[:, block] += (by_both.swapaxes(1, 2) @ off[:, :, None])[:, :, 0]
     held = job.height_stiffness**2
     cost += 0.5 * held * np.square(unknowns[:, -1])
     slope[:, -1] += held * unknowns[:, -1]
@@ -229,8 +229,8 @@ def _information(job: SequenceJob, curvature: Float[np.ndarray, "m u u"]) -> lis
     spread = np.linalg.inv(curvature + _HELD * np.eye(curvature.shape[1]))
     found = []
     for t, turnable in enumerate(job.turnable):
-        at = slice(3 * t, 3 * t + (3 if turnable else 2))
-        found.append(np.linalg.inv(spread[:, at, at]))
+        block = slice(3 * t, 3 * t + (3 if turnable else 2))
+        found.append(np.linalg.inv(spread[:, block, block]))
     return found
 
 

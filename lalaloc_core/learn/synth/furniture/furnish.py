@@ -131,16 +131,16 @@ class _Floor:
         wall = rng.choice(walls, _TRIES)
         # Furniture likes corners.
         share = np.where(rng.random(_TRIES) < 0.5, rng.random(_TRIES), rng.integers(0, 2, _TRIES))
-        at = share * (self._length[wall] - piece.width_m)
+        along_m = share * (self._length[wall] - piece.width_m)
         hides = np.zeros(_TRIES, dtype=bool)
         for window in self._windows:
             if piece.height_m > window.sill_m + 0.15:
-                hides |= (wall == window.wall) & (at < window.end_m) & (at + piece.width_m > window.start_m)
-        wall, at = wall[~hides], at[~hides]
+                hides |= (wall == window.wall) & (along_m < window.end_m) & (along_m + piece.width_m > window.start_m)
+        wall, along_m = wall[~hides], along_m[~hides]
         axis = self._along[wall]
         inwards = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
         from_wall = 0.5 * piece.depth_m + _WALL_GAP_M
-        return self._start[wall] + axis * (at + 0.5 * piece.width_m)[:, None] + inwards * from_wall, axis
+        return self._start[wall] + axis * (along_m + 0.5 * piece.width_m)[:, None] + inwards * from_wall, axis
 
     def _anywhere(self, rng: np.random.Generator) -> Pose:
         """Return poses (n, 2) anywhere on the floor, parallel or perpendicular to a wall."""

@@ -119,10 +119,10 @@ class _Builder:
         columns: list[list[list[float]]] = []
         for column_x in np.arange(_COLUMNS_EVERY_M, width - 1.0, _COLUMNS_EVERY_M):
             for column_y in np.arange(_COLUMNS_EVERY_M, depth - 1.0, _COLUMNS_EVERY_M):
-                at = np.array([column_x, column_y]) + rng.uniform(-0.6, 0.6, 2)
-                # Within the hall, however it falls.
-                at = np.array([x_m, y_m]) + np.minimum(at, np.array([width, depth]) - _COLUMN_M - 0.1)
-                columns.append(_rectangle(float(at[0]), float(at[1]), _COLUMN_M, _COLUMN_M)[::-1])
+                corner = np.array([column_x, column_y]) + rng.uniform(-0.6, 0.6, 2)
+                # Keep the column within the hall.
+                corner = np.array([x_m, y_m]) + np.minimum(corner, np.array([width, depth]) - _COLUMN_M - 0.1)
+                columns.append(_rectangle(float(corner[0]), float(corner[1]), _COLUMN_M, _COLUMN_M)[::-1])
         self._rooms.append(_room(f"hall-{len(self._rooms)}", _rectangle(x_m, y_m, width, depth), columns))
         self._floor_m2 += width * depth
         self._halls_m2 += width * depth

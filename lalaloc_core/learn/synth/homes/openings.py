@@ -90,11 +90,11 @@ class _Walls:
         for i, j in np.argwhere(np.triu(near)):
             if self.owner[i][0] == self.owner[j][0]:
                 continue
-            at = float(offset[i, j] @ self.along[i])
-            low, high = max(0.0, at - float(self.length[j])), min(float(self.length[i]), at)
+            shift = float(offset[i, j] @ self.along[i])
+            low, high = max(0.0, shift - float(self.length[j])), min(float(self.length[i]), shift)
             low, high = low + _CORNER_CLEARANCE_M, high - _CORNER_CLEARANCE_M
             if high - low >= _MIN_DOOR_M:
-                found.append(_Facing(self.owner[i], self.owner[j], (low, high), (at - high, at - low)))
+                found.append(_Facing(self.owner[i], self.owner[j], (low, high), (shift - high, shift - low)))
         return found
 
 

@@ -194,4 +194,4 @@ def _line(opening: Opening, polygon_m: Float[np.ndarray, "n 2"]) -> list[list[fl
     start = polygon_m[opening.wall]
     along = polygon_m[(opening.wall + 1) % len(polygon_m)] - start
     along = along / np.linalg.norm(along)
-    return [(start + at * along).tolist() for at in (opening.start_m, opening.end_m)]
+    return [(start + distance * along).tolist() for distance in (opening.start_m, opening.end_m)]

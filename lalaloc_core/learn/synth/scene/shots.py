@@ -167,9 +167,9 @@ def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Flo
     walls = room.shape.boundary.difference(ends.buffer(1e-3))
     low, high = (_IN_OPENING_M, POSE_MARGIN_M) if rng.random() < 0.5 else (POSE_MARGIN_M, _THRESHOLD_M)
     for _ in range(_TRIES):
-        at = start + along * rng.uniform(opening.start_m, opening.end_m) + inwards * rng.uniform(low, high)
-        if shapely.contains_xy(room.shape, *at) and walls.distance(shapely.Point(at)) >= POSE_MARGIN_M:
-            return at
+        position = start + along * rng.uniform(opening.start_m, opening.end_m) + inwards * rng.uniform(low, high)
+        if shapely.contains_xy(room.shape, *position) and walls.distance(shapely.Point(position)) >= POSE_MARGIN_M:
+            return position
     return None
 
 
