@@ -9,13 +9,16 @@ import pickle
 import struct
 from dataclasses import fields
 from importlib import import_module
+from typing import Any
 
+import numpy as np
 import pytest
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
+from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import (
     EXTERNAL_ENTITY,
     FLAT,
@@ -51,6 +54,24 @@ def test_nested_uses():
     uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
     groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
     _assert_rejected(SVG.format(f'<rect id="g0" width="1" height="1"/>{groups}').encode(), "entities")
+
+
+@pytest.mark.parametrize(
+    ("target", "hidden"),
+    [
+        # svgelements drops the first character of a reference, whatever it is, and finds empty ids.
+        ('href="xg11"', ""),
+        ('xlink:href="#none" href="#g11"', ""),
+        ('href="#"', '<g id=""><use href="#g11"/></g>'),
+        # Patterns are not drawn, so their ids hide no other element.
+        ('href="#g11"', '<pattern><rect id="g11"/></pattern>'),
+    ],
+)
+def test_nested_uses_with_unusual_references(target: str, hidden: str):
+    uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
+    groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
+    drawn = f'<defs><rect id="g0" width="1" height="1"/>{groups}</defs>{hidden}<use {target}/>'
+    _assert_rejected(SVG.format(drawn).encode(), "entities")
 
 
 def test_recursive_use():
@@ -93,6 +114,65 @@ def test_nested_blocks():
             block.add_blockref(f"B{level - 1}", (x, 0))
     document.modelspace().add_blockref("B7", (0, 0), dxfattribs={"row_count": 100, "column_count": 100})
     _assert_rejected(dxf_file(document), "entities")
+
+
+def _dxf_text(*pairs: tuple[int, object]) -> bytes:
+    return "".join(f"{code}\n{value}\n" for code, value in pairs).encode()
+
+
+def _dxf_insert(rows: int, columns: int) -> bytes:
+    """Return a drawing of 130 bytes that repeats an empty block."""
+    blocks = [(0, "SECTION"), (2, "BLOCKS"), (0, "BLOCK"), (2, "A"), (0, "ENDBLK"), (0, "ENDSEC")]
+    array = [(2, "A"), (10, 0), (20, 0), (70, rows), (71, columns), (44, 1), (45, 1)]
+    return _dxf_text(*blocks, (0, "SECTION"), (2, "ENTITIES"), (0, "INSERT"), *array, (0, "ENDSEC"), (0, "EOF"))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(10**9, 1), (1, 10**9), (40_000, 40_000)])
+def test_repeated_empty_block(rows: int, columns: int):
+    content = _dxf_insert(rows, columns)
+    assert len(content) < 241
+    _assert_rejected(content, "more than 300000 entities")
+
+
+def test_nested_empty_blocks():
+    document = new_dxf()
+    document.blocks.new("B0")
+    for level in range(1, 8):
+        block = document.blocks.new(f"B{level}")
+        for x in range(10):
+            block.add_blockref(f"B{level - 1}", (x, 0))
+    document.modelspace().add_blockref("B7", (0, 0))
+    _assert_rejected(dxf_file(document), "more than 300000 entities")
+
+
+def test_time_is_checked_at_every_empty_block():
+    ticks = itertools.count()
+    with pytest.raises(InvalidFloorPlanError, match="takes more than"):
+        import_plans(
+            _dxf_insert(100, 100),
+            ImportOptions(units="m"),
+            ImportLimits(max_import_s=500.0),
+            lambda: float(next(ticks)),
+        )
+
+
+def test_curves_beyond_the_stated_size_have_few_points(monkeypatch: pytest.MonkeyPatch):
+    counts = []
+    whole = dxf._points
+
+    def counted(*arguments: Any) -> np.ndarray:
+        points = whole(*arguments)
+        counts.append(len(points))
+        return points
+
+    monkeypatch.setattr(dxf, "_points", counted)
+    for radius in (1e4, 1e6, 1e9, 1e12):
+        circle = [(0, "CIRCLE"), (8, "WALL"), (10, 0), (20, 0), (40, radius)]
+        content = _dxf_text((0, "SECTION"), (2, "ENTITIES"), *circle, (0, "ENDSEC"), (0, "EOF"))
+        with pytest.raises(InvalidFloorPlanError):
+            import_plans(content, ImportOptions(units="mm"))
+    assert len(counts) == 4
+    assert max(counts) <= 2 * counts[0]
 
 
 def test_picture_with_too_many_pixels():

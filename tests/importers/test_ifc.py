@@ -158,3 +158,31 @@ def test_level_option_selects_a_storey_of_the_duplex(duplex: tuple[ImportedPlan,
     assert DUPLEX is not None
     plan = import_plan(DUPLEX.read_bytes(), ImportOptions(level="Level 2"))
     assert plan.document == duplex[1].document
+
+
+def _mapped(levels: int, copies: int) -> bytes:
+    """Return a model of one space whose shape is repeated `copies` times at each of some levels."""
+    model = _Model()
+    make = model.file.create_entity
+    space = model.prism("IfcSpace", _box(0, 0, 4000, 3000), 0, 2600, LongName="Küche")
+    shape = space.Representation.Representations[0]
+    origin = make("IfcCartesianPoint", [0.0, 0.0, 0.0])
+    unmoved = make("IfcCartesianTransformationOperator3D", None, None, origin, None, None)
+    for _ in range(levels):
+        source = make("IfcRepresentationMap", model.placement((0, 0, 0)), shape)
+        items = [make("IfcMappedItem", source, unmoved) for _ in range(copies)]
+        shape = make("IfcShapeRepresentation", model.context, "Body", "MappedRepresentation", items)
+    space.Representation = make("IfcProductDefinitionShape", None, None, [shape])
+    model.spaces(space)
+    return model.content()
+
+
+def test_mapped_items_are_read():
+    assert [shape.area for shape in shapes(import_plan(_mapped(2, 2)).document)] == pytest.approx([12.0])
+
+
+def test_nested_mapped_items_are_refused():
+    content = _mapped(12, 10)
+    assert len(content) < 10_000
+    with pytest.raises(InvalidFloorPlanError, match="IfcSpace '' has more than 300000 entities"):
+        import_plan(content)

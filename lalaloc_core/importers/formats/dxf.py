@@ -22,6 +22,7 @@ from ezdxf.entities.dxfgfx import DXFGraphic
 from ezdxf.entities.insert import Insert
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
+from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
@@ -151,10 +152,12 @@ def _check_blocks(document: DxfDocument, budget: Budget) -> None:
     def total(entities: Iterable[DXFEntity], depth: int) -> int:
         count = 0
         for entity in entities:
-            count += _weight(entity)
             if isinstance(entity, Insert):
-                rows, columns = max(entity.dxf.row_count, 1), max(entity.dxf.column_count, 1)
-                count += rows * columns * size(entity.dxf.name, depth)
+                # Every copy counts, also of an empty block, with its attributes.
+                copies = max(entity.dxf.row_count, 1) * max(entity.dxf.column_count, 1)
+                count += len(entity.attribs) + copies * (1 + size(entity.dxf.name, depth))
+            else:
+                count += _weight(entity)
             if count > budget.limits.max_entities:
                 break
         return count
@@ -176,14 +179,13 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     drawing = Drawing()
     hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
     sag = _sag(document)
-    for entity, context in _walk(document.modelspace(), None, 0):
-        budget.check_time()
+    for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
         elif context.role == "ignored" or not options.includes_layer(context.layer):
             builder.use(context.layer, "ignored")
         else:
-            _add(entity, context, drawing, builder, sag)
+            _add(entity, context, drawing, builder, sag, budget)
     if options.layers and not drawing.areas and not drawing.strokes:
         available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
@@ -193,7 +195,9 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     return drawing
 
 
-def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterator[tuple[DXFGraphic, _Context]]:
+def _walk(
+    entities: Iterable[Any], block: _Context | None, depth: int, budget: Budget
+) -> Iterator[tuple[DXFGraphic, _Context]]:
     """Yield entities with their contexts. Blocks are expanded, except for windows, passages and obstacles.
 
     `block` is the context of the block that contains the entities, None for the model space.
@@ -214,16 +218,19 @@ def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterat
             for attribute in entity.attribs:
                 yield attribute, _Context(layer, "text")
             for copy in entity.multi_insert() if entity.mcount > 1 else (entity,):
+                budget.check_time()
                 context = _Context(layer, role)
                 if role in ("window", "passage", "obstacle"):
                     yield copy, context
                 else:
-                    yield from _walk(copy.virtual_entities(), context, depth + 1)
+                    yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
         else:
             yield entity, _Context(layer, role)
 
 
-def _add(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
+def _add(
+    entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
+) -> None:
     kind, role = entity.dxftype(), context.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
@@ -237,7 +244,7 @@ def _add(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: Repor
         builder.use(context.layer, "ignored")
         return
     if isinstance(entity, Insert):
-        _add_block(entity, context, drawing, builder, sag)
+        _add_block(entity, context, drawing, builder, sag, budget)
     elif kind in _FILLED:
         shapes = _filled(entity, sag)
         is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
@@ -249,12 +256,14 @@ def _add(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: Repor
         builder.use(context.layer, f"ignored ({kind})")
 
 
-def _add_block(entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
+def _add_block(
+    entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
+) -> None:
     """Add a window, passage or obstacle drawn as a block: the smallest rectangle around its entities."""
     inner = Drawing()
-    for part, _ in _walk(entity.virtual_entities(), context, 1):
+    for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
         if part.dxftype() in _LINES | _FILLED:
-            _add(part, context, inner, ReportBuilder(), sag)
+            _add(part, context, inner, ReportBuilder(), sag, budget)
     shapes = [*(area.shape for area in inner.areas), *(stroke.line for stroke in inner.strokes)]
     if not shapes:
         return
@@ -294,8 +303,7 @@ def _ends_meet(points: np.ndarray) -> bool:
 def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
     """Return the points along a line, in world coordinates seen from above."""
     try:
-        path = dxf_path.make_path(entity)
-        points = np.array([(vertex.x, vertex.y) for vertex in path.flattening(sag, segments=8)])
+        points = _flattened(dxf_path.make_path(entity), sag)
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
     if not len(points) or not np.isfinite(points).all():
@@ -303,12 +311,21 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
     return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
 
 
+def _flattened(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
+    """Return the points along a path; a curve larger than the drawing's stated size has no more than others."""
+    corners = np.array([(vertex.x, vertex.y) for vertex in path.control_vertices()])
+    size = float(np.ptp(corners, axis=0).max(initial=0.0)) if len(corners) else 0.0
+    if not np.isfinite(size):
+        raise ValueError("the path has coordinates that are not finite")
+    return np.array([(vertex.x, vertex.y) for vertex in path.flattening(max(sag, _SAG * size), segments=8)])
+
+
 def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
     """Return the filled area of a hatch, between its outlines."""
     try:
         is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
         paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [np.array([(vertex.x, vertex.y) for vertex in path.flattening(sag, segments=8)]) for path in paths]
+        rings = [_flattened(path, sag) for path in paths]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
     usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]

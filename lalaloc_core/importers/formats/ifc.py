@@ -62,13 +62,14 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
     anchor = _anchor(model)
+    meshes = _Meshes(budget)
     plans = []
     for level, (storey, spaces) in chosen_levels(storeys, options):
         builder = ReportBuilder()
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
-        floor_m = _add_spaces(spaces, sketch, builder, budget)
-        _add_elements(storey, floor_m, sketch, builder, budget)
+        floor_m = _add_spaces(spaces, sketch, builder, meshes)
+        _add_elements(storey, floor_m, sketch, builder, meshes)
         _join_touching(sketch, builder)
         if not sketch.rooms:
             raise InvalidFloorPlanError(
@@ -143,12 +144,11 @@ def _storey_of(element: Any) -> Any:
     return None
 
 
-def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, budget: Budget) -> float:
+def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, meshes: _Meshes) -> float:
     """Add rooms and return the median height of their floors (m)."""
     floors = []
     for space in spaces:
-        budget.check_time()
-        mesh = _mesh(space)
+        mesh = meshes.of(space)
         if mesh is None:
             builder.use("IfcSpace", "ignored (no geometry)")
             continue
@@ -173,19 +173,18 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, b
     return float(np.median(floors)) if floors else 0.0
 
 
-def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
+def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes) -> None:
     """Add the doors, windows and columns of a storey."""
     for relation in getattr(storey, "ContainsElements", None) or ():
         for element in relation.RelatedElements:
-            budget.check_time()
             kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
             if kind is not None:
-                opening = _opening(element, kind, floor_m)  # type: ignore[arg-type]
+                opening = _opening(element, kind, floor_m, meshes)  # type: ignore[arg-type]
                 builder.use(element.is_a(), kind if opening is not None else "ignored (no geometry)")
                 if opening is not None:
                     sketch.openings.append(opening)
             elif element.is_a("IfcColumn"):
-                mesh = _mesh(element)
+                mesh = meshes.of(element)
                 builder.use("IfcColumn", "holes" if mesh is not None else "ignored (no geometry)")
                 if mesh is not None:
                     sketch.obstacles += _projection(*mesh)
@@ -209,10 +208,10 @@ def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
                     builder.use("IfcSpace", "passages between touching spaces")
 
 
-def _opening(element: Any, kind: OpeningKind, floor_m: float) -> SketchedOpening | None:
+def _opening(element: Any, kind: OpeningKind, floor_m: float, meshes: _Meshes) -> SketchedOpening | None:
     """Locate a door or window by the void that it fills; without a void, by its own shape."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
-    mesh = next((found for void in voids if (found := _mesh(void)) is not None), None) or _mesh(element)
+    mesh = next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
     if mesh is None:
         return None
     vertices, _ = mesh
@@ -224,23 +223,57 @@ def _opening(element: Any, kind: OpeningKind, floor_m: float) -> SketchedOpening
     return SketchedOpening(kind, *ends, name, max(sill, 0.0) if kind == "window" else None, head)
 
 
-def _mesh(element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
-    """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
-    import ifcopenshell.geom
+class _Meshes:
+    """Shapes of elements, computed one by one within the budget.
 
-    if getattr(element, "Representation", None) is None:
-        return None
-    settings = ifcopenshell.geom.settings()
-    settings.set("use-world-coords", True)
-    try:
-        shape = ifcopenshell.geom.create_shape(settings, element)
-    except RuntimeError:
-        return None
-    vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
-    triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
-    if not len(triangles) or not np.isfinite(vertices).all():
-        return None
-    return vertices, triangles
+    A mapped item repeats a whole shape, and its shape can have mapped items itself, so a few lines can multiply to
+    billions of faces.
+    """
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._sizes: dict[int, float] = {}
+
+    def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
+
+        Raises:
+            InvalidFloorPlanError: the shape has more than `max_entities` parts, or the time is over.
+        """
+        import ifcopenshell.geom
+
+        self._budget.check_time()
+        if getattr(element, "Representation", None) is None:
+            return None
+        if (limit := self._budget.limits.max_entities) < self._size(element.Representation):
+            raise InvalidFloorPlanError(
+                f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}' has more than {limit} entities "
+                "(max_entities) with those of its mapped items, or contains itself; simplify it"
+            )
+        settings = ifcopenshell.geom.settings()
+        settings.set("use-world-coords", True)
+        try:
+            shape = ifcopenshell.geom.create_shape(settings, element)
+        except RuntimeError:
+            return None
+        vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
+        triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
+        if not len(triangles) or not np.isfinite(vertices).all():
+            return None
+        return vertices, triangles
+
+    def _size(self, value: Any) -> float:
+        """Count an entity and all that it refers to, repeated as often as referred to; infinite for a cycle."""
+        if isinstance(value, tuple):
+            return sum((self._size(part) for part in value), 0.0)
+        if not hasattr(value, "is_a"):
+            return 0.0
+        key = value.id()
+        if key not in self._sizes:
+            self._budget.check_time()
+            self._sizes[key] = math.inf
+            self._sizes[key] = sum((self._size(attribute) for attribute in value), 1.0)
+        return self._sizes[key]
 
 
 def _footprint(vertices: Float[np.ndarray, "n 3"], triangles: Any, low: float) -> list[shapely.Polygon]:

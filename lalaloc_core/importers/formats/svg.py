@@ -93,6 +93,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     root = read_xml(content, budget)
     if root.tag.rpartition("}")[2] != "svg":
         raise InvalidFloorPlanError(f"the root element is <{root.tag.rpartition('}')[2][:50]}>; it must be <svg>")
+    _drop_ignored(root)
     _check_uses(root, budget)
     paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder()
@@ -177,9 +178,17 @@ def read_xml(content: bytes, budget: Budget) -> Element:
     return root
 
 
+def _drop_ignored(root: Element) -> None:
+    for parent in root.iter():
+        parent[:] = [child for child in parent if str(child.tag).rpartition("}")[2] not in _IGNORED_ELEMENTS]
+
+
 def _check_uses(root: Element, budget: Budget) -> None:
-    """Count the elements after `<use>` is expanded: nested uses can multiply to billions."""
-    by_id = {element.get("id"): element for element in root.iter() if element.get("id")}
+    """Count the elements after `<use>` is expanded: nested uses can multiply to billions.
+
+    References are resolved as svgelements does: the last element with an id, and any character before it.
+    """
+    by_id = {element.get("id"): element for element in root.iter() if "id" in element.attrib}
     sizes: dict[Element, int] = {}
     open_elements: set[Element] = set()
 
@@ -192,7 +201,7 @@ def _check_uses(root: Element, budget: Budget) -> None:
         total = 1 + len(element.get("d", "")) // _BYTES_PER_ENTITY + len(element.get("points", "")) // _BYTES_PER_ENTITY
         total += sum(size(child) for child in element)
         if element.tag.rpartition("}")[2] == "use":
-            target = by_id.get((element.get("href") or element.get(_HREF) or "").removeprefix("#"))
+            target = by_id.get(element.get("href", element.get(_HREF, "#"))[1:])
             total += size(target) if target is not None else 0
         open_elements.discard(element)
         sizes[element] = total
@@ -227,10 +236,6 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
     """Return all visible shapes and texts in user units."""
     for key in ("width", "height", "viewBox", "preserveAspectRatio", "transform"):
         root.attrib.pop(key, None)
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if str(child.tag).rpartition("}")[2] in _IGNORED_ELEMENTS:
-                parent.remove(child)
     try:
         tree = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=96.0)
     except (ValueError, TypeError, AttributeError, IndexError, KeyError, ZeroDivisionError, OverflowError) as error:
