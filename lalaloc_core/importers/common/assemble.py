@@ -168,7 +168,7 @@ def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[lis
         return rooms, (0.0, 0.0)
     dx, dy = -math.floor(x0), -math.floor(y0)
     builder.notes.append(f"the plan was moved by ({dx}, {dy}) m to lie near its origin")
-    return [replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in rooms], (dx, dy)
+    return [replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in rooms], (float(dx), float(dy))
 
 
 def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
