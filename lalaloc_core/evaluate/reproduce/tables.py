@@ -6,6 +6,7 @@ Shares are fractions. Rows of our own have no figure.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from lalaloc_core.evaluate.methods.method import QueryKind
@@ -16,7 +17,13 @@ _ACCURACY = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m"
 _RECALL = ("layout_recall", "pose_recall")
 _RETRIEVAL = (*_RECALL, "median_cm")
 _LAYOUT, _PANORAMA = "Layout", "Panorama"
-_NO_REFINEMENT = {"refine": "none"}
+_TIMES: tuple[Column, ...] = ("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds")
+_ORACLE, _ICP_DEPTH = "Oracle (nearest layout by Chamfer)", "2D ICP on furnished depth"
+_PAPER, _OURS = "LaLaLoc `paper`", "LaLaLoc, shipped model"
+_HORIZON_NET = "Explicit layout + localisation (paper: HorizonNet)"
+_ORACLE_QUERY = RowQuery(method="oracle", kind="layout")
+_ICP, _ICP_LAYOUT = RowQuery(method="icp"), RowQuery(method="icp", kind="layout")
+_WITHOUT_VDR = {"vdr_candidates": 0}
 
 
 def _paper(columns: Sequence[Column], *figures: float | None) -> dict[Column, float]:
@@ -27,113 +34,55 @@ def _lalaloc(model: str, kind: QueryKind = "panorama", **query: Any) -> RowQuery
     return RowQuery(method="lalaloc", model=model, kind=kind, **query)
 
 
+def _row(group: str, name: str, query: RowQuery, columns: Sequence[Column] = (), *figures: float | None) -> Row:
+    """Return a row with the paper's figures by column, none for rows of our own."""
+    return Row(group=group, name=name, query=query, paper=_paper(columns, *figures))
+
+
 def _localisation() -> Table:
     columns = (*_RECALL, *_ACCURACY)
-    rows = [
-        Row(
-            group="",
-            name="Oracle (nearest layout by Chamfer)",
-            query=RowQuery(method="oracle", kind="layout"),
-            paper=_paper(columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="2D ICP",
-            query=RowQuery(method="icp", kind="layout"),
-            paper=_paper(columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="Explicit layout + localisation",
-            query=RowQuery(method="explicit", kind="layout", model=SHIPPED),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="VDR + decode, shipped model",
-            query=RowQuery(method="decode", kind="layout", model=SHIPPED),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="LaLaLoc `paper`",
-            query=_lalaloc("paper", "layout"),
-            paper=_paper(columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
-        ),
-        Row(group=_LAYOUT, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, "layout")),
-        Row(
-            group=_PANORAMA,
-            name="2D ICP on furnished depth",
-            query=RowQuery(method="icp"),
-            paper=_paper(columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
-        ),
-        Row(
-            group=_PANORAMA,
-            name="Explicit layout + localisation (paper: HorizonNet)",
-            query=RowQuery(method="explicit", model=SHIPPED),
-            paper=_paper(columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
-        ),
-        Row(group=_PANORAMA, name="VDR + decode, shipped model", query=RowQuery(method="decode", model=SHIPPED)),
-        Row(
-            group=_PANORAMA,
-            name="LaLaLoc `paper`",
-            query=_lalaloc("paper"),
-            paper=_paper(columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
-        ),
-        Row(group=_PANORAMA, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED)),
-    ]
+    explicit, decode = (RowQuery(method=method, model=SHIPPED) for method in ("explicit", "decode"))
+    explicit_layout, decode_layout = (replace(query, kind="layout") for query in (explicit, decode))
     return Table(
         name="localisation",
         title="Localisation with a floor plan prior",
         source="tab:localisation",
         split="test",
         columns=columns,
-        rows=tuple(rows),
+        rows=(
+            _row("", _ORACLE, _ORACLE_QUERY, columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
+            _row(_LAYOUT, "2D ICP", _ICP_LAYOUT, columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
+            _row(_LAYOUT, "Explicit layout + localisation", explicit_layout),
+            _row(_LAYOUT, "VDR + decode, shipped model", decode_layout),
+            _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
+            _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
+            _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
+            _row(_PANORAMA, _HORIZON_NET, explicit, columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
+            _row(_PANORAMA, "VDR + decode, shipped model", decode),
+            _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
+            _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
+        ),
     )
 
 
 def _coarse_grid() -> Table:
-    columns = ("median_cm", "within_1cm", "within_10cm", "within_1m")
-    coarse: dict[str, Any] = {"grid_step_m": 1.0}
-    rows = [
-        Row(
-            group="",
-            name="Retrieval oracle",
-            query=RowQuery(method="oracle", kind="layout", **coarse),
-            paper=_paper(columns, 42.7, 0.0, 0.029, 0.757),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="2D ICP",
-            query=RowQuery(method="icp", kind="layout", **coarse),
-            paper=_paper(columns, 0.7, 0.769, 0.994, 0.996),
-        ),
-        Row(
-            group=_LAYOUT,
-            name="LaLaLoc `paper`",
-            query=_lalaloc("paper", "layout", **coarse),
-            paper=_paper(columns, 0.5, 0.561, 0.705, 0.843),
-        ),
-        Row(group=_LAYOUT, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, "layout", **coarse)),
-        Row(
-            group=_PANORAMA,
-            name="2D ICP on furnished depth",
-            query=RowQuery(method="icp", **coarse),
-            paper=_paper(columns, 21.7, 0.073, 0.347, 0.694),
-        ),
-        Row(
-            group=_PANORAMA,
-            name="LaLaLoc `paper`",
-            query=_lalaloc("paper", **coarse),
-            paper=_paper(columns, 11.5, 0.026, 0.461, 0.795),
-        ),
-        Row(group=_PANORAMA, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, **coarse)),
-    ]
+    columns: tuple[Column, ...] = ("median_cm", "within_1cm", "within_10cm", "within_1m")
+    rows = (
+        _row("", "Retrieval oracle", _ORACLE_QUERY, columns, 42.7, 0.0, 0.029, 0.757),
+        _row(_LAYOUT, "2D ICP", _ICP_LAYOUT, columns, 0.7, 0.769, 0.994, 0.996),
+        _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.5, 0.561, 0.705, 0.843),
+        _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
+        _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, 21.7, 0.073, 0.347, 0.694),
+        _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 11.5, 0.026, 0.461, 0.795),
+        _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
+    )
     return Table(
         name="coarse-grid",
         title="Localisation on a 1 m grid",
         source="tab:1m_refinement",
         split="test",
         columns=columns,
-        rows=tuple(rows),
+        rows=tuple(replace(row, query=replace(row.query, grid_step_m=1.0)) for row in rows),
     )
 
 
@@ -147,19 +96,9 @@ def _furniture() -> Table:
     for level, (icp, lalaloc) in figures.items():
         group = level.capitalize()
         rows += [
-            Row(
-                group=group,
-                name="2D ICP on furnished depth",
-                query=RowQuery(method="icp", furniture=level),
-                paper={"median_cm": icp},
-            ),
-            Row(
-                group=group,
-                name="LaLaLoc `paper`",
-                query=_lalaloc("paper", furniture=level),
-                paper=_paper(_RETRIEVAL, *lalaloc),
-            ),
-            Row(group=group, name="LaLaLoc, shipped model", query=_lalaloc(SHIPPED, furniture=level)),
+            _row(group, _ICP_DEPTH, RowQuery(method="icp", furniture=level), ("median_cm",), icp),
+            _row(group, _PAPER, _lalaloc("paper", furniture=level), _RETRIEVAL, *lalaloc),
+            _row(group, _OURS, _lalaloc(SHIPPED, furniture=level)),
         ]
     return Table(
         name="furniture",
@@ -176,7 +115,7 @@ def _refinement() -> Table:
     figures: list[tuple[str, str | None, MethodName, dict[str, Any], tuple[float, ...]]] = [
         ("Retrieval", "retrieval", "lalaloc", {}, (22.5, 0.003, 0.0319, 0.118)),
         ("VDR only", "vdr", "lalaloc", {}, (11.0, 0.008, 0.151, 0.453)),
-        ("LPO only", None, "lalaloc", {"vdr_candidates": 0}, (10.5, 0.020, 0.274, 0.484)),
+        ("LPO only", None, "lalaloc", _WITHOUT_VDR, (10.5, 0.020, 0.274, 0.484)),
         ("VDR + decode", None, "decode", {}, (12.2, 0.005, 0.132, 0.397)),
         ("VDR + LPO", None, "lalaloc", {}, (8.3, 0.036, 0.320, 0.580)),
     ]
@@ -203,8 +142,10 @@ def _refinement() -> Table:
 
 def _vogel_samples() -> Table:
     columns = ("median_cm", "within_10cm")
-    rows = [Row(group="without VDR", name="Retrieval", query=_lalaloc(SHIPPED), stage="retrieval")]
-    rows += [Row(group="without VDR", name="LPO", query=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}))]
+    rows = [
+        replace(_row("without VDR", "Retrieval", _lalaloc(SHIPPED)), stage="retrieval"),
+        _row("without VDR", "LPO", _lalaloc(SHIPPED, settings=_WITHOUT_VDR)),
+    ]
     for samples in (10, 25, 50, 100, 200):
         settings = {} if samples == 200 else {"vdr_samples": samples}
         for name, stage in (("VDR", "vdr"), ("VDR + LPO", None)):
@@ -225,23 +166,10 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
     columns = ("pose_recall", "median_cm", "correct_room")
     titles = {"edges": "Edges", "depth": "Depth", "relative-depth": "Relative depth", "chamfer": "Chamfer *"}
     common: dict[str, Any] = {"kind": "layout", "grid_step_m": grid_step_m}
-    rows = [
-        Row(
-            group="",
-            name="Pose (nearest grid pose)",
-            query=RowQuery(method="pose-oracle", **common),
-            paper=_paper(columns, *figures["pose"]),
-        )
-    ]
-    rows += [
-        Row(
-            group="",
-            name=title,
-            query=RowQuery(method="similarity", settings={"metric": metric}, **common),
-            paper=_paper(columns, *figures[metric]),
-        )
-        for metric, title in titles.items()
-    ]
+    rows = [_row("", "Pose (nearest grid pose)", RowQuery(method="pose-oracle", **common), columns, *figures["pose"])]
+    for metric, title in titles.items():
+        query = RowQuery(method="similarity", settings={"metric": metric}, **common)
+        rows.append(_row("", title, query, columns, *figures[metric]))
     return Table(
         name=name,
         title=f"Layout-similarity metric, {grid_step_m:g} m grid",
@@ -252,26 +180,16 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
     )
 
 
-def _oracle(paper: tuple[float, float, float]) -> Row:
-    return Row(
-        group="",
-        name="Oracle (nearest layout by Chamfer)",
-        query=RowQuery(method="oracle", kind="layout"),
-        paper=_paper(_RETRIEVAL, *paper),
-    )
-
-
 def _trained(group: str, name: str, model: str, kind: QueryKind, *paper: float) -> Row:
     """Return a row that compares trained models by retrieval alone, as the paper's ablations do."""
-    query = _lalaloc(model, kind, settings=_NO_REFINEMENT)
-    return Row(group=group, name=name, query=query, paper=_paper(_RETRIEVAL, *paper))
+    return _row(group, name, _lalaloc(model, kind, settings={"refine": "none"}), _RETRIEVAL, *paper)
 
 
 def _ablation(name: str, title: str, source: str, *rows: Row) -> Table:
     return Table(name=name, title=title, source=source, split="validation", columns=_RETRIEVAL, rows=rows)
 
 
-_ORACLE_ON_VALIDATION = (1.0, 0.908, 20.0)
+_ORACLE_ON_VALIDATION = _row("", _ORACLE, _ORACLE_QUERY, _RETRIEVAL, 1.0, 0.908, 20.0)
 
 TABLES: tuple[Table, ...] = (
     _localisation(),
@@ -316,7 +234,7 @@ TABLES: tuple[Table, ...] = (
         "layout-losses",
         "Losses of the layout branch",
         "tab:lalalearning",
-        _oracle(_ORACLE_ON_VALIDATION),
+        _ORACLE_ON_VALIDATION,
         _trained(_LAYOUT, "log-ratio", "layout-log-ratio", "layout", 0.788, 0.773, 20.5),
         _trained(_LAYOUT, "decode", "layout-decode", "layout", 0.909, 0.846, 20.1),
         _trained(_LAYOUT, "log-ratio + decode *", "paper", "layout", 0.893, 0.876, 19.9),
@@ -333,7 +251,7 @@ TABLES: tuple[Table, ...] = (
         "image-losses",
         "Losses of the image branch",
         "tab:rgblearning",
-        _oracle(_ORACLE_ON_VALIDATION),
+        _ORACLE_ON_VALIDATION,
         _trained(_PANORAMA, "L2 *", "paper", "panorama", 0.707, 0.705, 21.7),
         _trained(_PANORAMA, "log-ratio′", "image-log-ratio", "panorama", 0.596, 0.569, 25.1),
         _trained(_PANORAMA, "L2 + log-ratio′", "image-l2-log-ratio", "panorama", 0.607, 0.599, 24.6),
@@ -344,27 +262,22 @@ TABLES: tuple[Table, ...] = (
         title="Time per stage",
         source="tab:time",
         split="test",
-        columns=("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds"),
+        columns=_TIMES,
         rows=(
-            Row(group="", name="2D ICP on furnished depth", query=RowQuery(method="icp"), paper={"seconds": 20.1}),
-            Row(
-                group="`paper`",
-                name="LaLaLoc without VDR",
-                query=_lalaloc("paper", settings={"vdr_candidates": 0}),
-                paper={"seconds:retrieve": 0.05, "seconds:lpo": 2.33, "seconds": 2.38},
+            _row("", _ICP_DEPTH, _ICP, ("seconds",), 20.1),
+            _row(
+                "`paper`",
+                "LaLaLoc without VDR",
+                _lalaloc("paper", settings=_WITHOUT_VDR),
+                _TIMES,
+                0.05,
+                None,
+                2.33,
+                2.38,
             ),
-            Row(
-                group="`paper`",
-                name="LaLaLoc",
-                query=_lalaloc("paper"),
-                paper={"seconds:retrieve": 0.05, "seconds:vdr": 2.87, "seconds:lpo": 1.73, "seconds": 4.65},
-            ),
-            Row(
-                group="shipped model",
-                name="LaLaLoc without VDR",
-                query=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}),
-            ),
-            Row(group="shipped model", name="LaLaLoc", query=_lalaloc(SHIPPED)),
+            _row("`paper`", "LaLaLoc", _lalaloc("paper"), _TIMES, 0.05, 2.87, 1.73, 4.65),
+            _row("shipped model", "LaLaLoc without VDR", _lalaloc(SHIPPED, settings=_WITHOUT_VDR)),
+            _row("shipped model", "LaLaLoc", _lalaloc(SHIPPED)),
         ),
         form="times",
     ),
