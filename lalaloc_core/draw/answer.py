@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
-from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, draw_cross, jpeg, shortened, words
+from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
 from lalaloc_core.draw.outline import LayoutOutline, layout_outline
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
@@ -26,7 +25,6 @@ from lalaloc_core.localise.posterior import probability_map
 from lalaloc_core.localise.ranking import panorama_heading
 
 Picture = Literal["both", "plan", "photograph"]
-PICTURES: tuple[Picture, ...] = get_args(Picture)
 
 _WIDTH, _PAD = 1600.0, 36.0
 # Size of the drawn photograph; a photograph of this size is not scaled.
@@ -70,7 +68,6 @@ class DrawnAnswer:
     confidence: float | None
     rivals: tuple[DrawnCandidate, ...] = ()
     heat: HeatMap | None = None
-    truth: Marker | None = None
 
     @property
     def outline(self) -> LayoutOutline:
@@ -81,12 +78,7 @@ class DrawnAnswer:
 
 
 def drawn_answer(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    found: Localisation,
-    model: ConfidenceModel | None,
-    heading_source: str,
-    truth: Marker | None = None,
+    plan: FloorPlan, grid: PoseGrid, found: Localisation, model: ConfidenceModel | None, heading_source: str
 ) -> DrawnAnswer:
     """Collect the contents of the picture of a localisation.
 
@@ -122,7 +114,6 @@ def drawn_answer(
         confidence=None if confidence is None else confidence.position,
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
-        truth=truth,
     )
 
 
@@ -151,7 +142,7 @@ def draw_answer(
         parts.append(photograph_key(outline, _PAD, y + 32))
         y += _KEY
     if picture != "photograph":
-        seen = [(marker.x_m, marker.y_m) for marker in (answer.camera, answer.truth) if marker is not None]
+        seen = [(answer.camera.x_m, answer.camera.y_m)]
         width = _WIDTH - 3 * _PAD - _LEGEND
         height = min(max(width / shape_of(answer.plan, seen), _MIN_PLAN), _MAX_PLAN)
         heat = "" if answer.heat is None else heat_image(answer.heat, answer.plan)
@@ -192,7 +183,7 @@ def _header(answer: DrawnAnswer, title: str, room: str | None) -> str:
 
 
 def _marks(answer: DrawnAnswer) -> str:
-    """Draw rivals, true pose and predicted pose over the plan."""
+    """Draw rivals and the predicted pose over the plan."""
     extent = extent_m(answer.plan)
     size = extent / 60.0
     parts = []
@@ -204,8 +195,6 @@ def _marks(answer: DrawnAnswer) -> str:
             f'transform="rotate({rival.heading_deg:.2f})"/>'
             f'<text y="{0.36 * size:.4f}" font-size="{size:.4f}" fill="{INK}">{number}</text></g>'
         )
-    if answer.truth is not None:
-        parts.append(draw_cross(answer.truth.x_m, -answer.truth.y_m, 1.3 * size))
     return "".join([*parts, draw_camera(answer.camera, extent)])
 
 
@@ -221,10 +210,6 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
         major, minor = ellipse_m(answer.camera.covariance_m2)
         row += 28
         parts.append(words(x + 32, row, f"95 % within ± {_length(major)} by ± {_length(minor)}", 16, fill=MUTED))
-    if answer.truth is not None:
-        row += 34
-        off_m = math.hypot(answer.truth.x_m - answer.camera.x_m, answer.truth.y_m - answer.camera.y_m)
-        parts.append(draw_cross(x + 11, row - 6, 12.0) + words(x + 32, row, f"true, {_length(off_m)} away", 18))
     rivals = _shown(answer.rivals)
     row += 48
     parts.append(words(x, row, "Other candidates" if rivals else "No other candidate", 18, more='font-weight="bold"'))

@@ -40,14 +40,14 @@ def document(width: Number, height: Number, title: str, parts: Iterable[str]) ->
     )
 
 
-def rasterise(svg: str, *, width: int | None = None) -> bytes:
+def rasterise(svg: str) -> bytes:
     """Rasterise a drawing as PNG.
 
     The bundled fonts cover Latin, Greek, Cyrillic and a few more scripts; other characters are drawn as boxes. External
-    references are not loaded. The default width is that of the drawing.
+    references are not loaded.
     """
     return resvg_py.svg_to_bytes(
-        svg_string=svg, width=width, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"
+        svg_string=svg, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"
     )
 
 

@@ -123,7 +123,7 @@ def draw_rooms(plan: FloorPlan) -> str:
     return "\n".join(lines)
 
 
-def draw_camera(marker: Marker, extent: float, colour: str = FOUND) -> str:
+def draw_camera(marker: Marker, extent: float) -> str:
     """Draw a dot, a wedge towards the heading, and the 95 % ellipse of the covariance."""
     radius = extent / _CAMERAS_PER_EXTENT
     wedge = ""
@@ -136,8 +136,8 @@ def draw_camera(marker: Marker, extent: float, colour: str = FOUND) -> str:
             f'stroke-width="{0.1 * radius:.4f}"/>'
         )
     return (
-        f'<g class="camera" transform="translate({marker.x_m:.4f} {-marker.y_m:.4f})" fill="{colour}">'
-        f"{_ellipse(marker.covariance_m2, extent, colour)}{wedge}"
+        f'<g class="camera" transform="translate({marker.x_m:.4f} {-marker.y_m:.4f})" fill="{FOUND}">'
+        f"{_ellipse(marker.covariance_m2, extent)}{wedge}"
         f'<circle r="{radius:.4f}" stroke="#fff" stroke-width="{0.25 * radius:.4f}"/></g>'
     )
 
@@ -246,7 +246,7 @@ def _scale_bar(x_min: float, y_min: float, width_m: float, extent_m: float) -> s
     )
 
 
-def _ellipse(covariance_m2: tuple[float, float, float] | None, extent: float, colour: str) -> str:
+def _ellipse(covariance_m2: tuple[float, float, float] | None, extent: float) -> str:
     if covariance_m2 is None:
         return ""
     xx, xy, yy = covariance_m2
@@ -256,5 +256,5 @@ def _ellipse(covariance_m2: tuple[float, float, float] | None, extent: float, co
     angle_deg = -math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
     return (
         f'<ellipse rx="{major_m:.4f}" ry="{minor_m:.4f}" transform="rotate({angle_deg:.3f})" fill-opacity="0.2" '
-        f'stroke="{colour}" stroke-width="{extent / 500:.4f}"/>'
+        f'stroke="{FOUND}" stroke-width="{extent / 500:.4f}"/>'
     )

@@ -61,7 +61,6 @@ def import_plan(
     content: bytes,
     options: ImportOptions = DEFAULT_OPTIONS,
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
-    clock: Callable[[], float] = time.monotonic,
 ) -> ImportedPlan:
     """Return the only plan in a file.
 
@@ -70,7 +69,7 @@ def import_plan(
         MissingExtraError: a library of its format is not installed.
         SeveralLevelsError: the file has several storeys and the option `level` is not set.
     """
-    plans = import_plans(content, options, limits, clock)
+    plans = import_plans(content, options, limits)
     if len(plans) > 1:
         raise SeveralLevelsError([plan.level.name for plan in plans if plan.level is not None])
     return next(iter(plans))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
-from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import Bundle
@@ -89,7 +89,7 @@ class TestAligner:
         rng = np.random.default_rng(seed)
         moved = scene.poses.position_m + rng.uniform(-0.1, 0.1, (3, 2))
         starts = np.where((scene.plan.room_index_at(moved) == 0)[:, None], moved, scene.poses.position_m)
-        result = DepthAligner(rows=ROWS, columns=64).refine(depth_job(scene, starts, scene.poses.position_m, 64))
+        result = depth_aligner(rows=ROWS, columns=64).refine(depth_job(scene, starts, scene.poses.position_m, 64))
         assert np.linalg.norm(result.position_m - scene.poses.position_m, axis=1).max() < 0.01
 
     @given(polygon=room_polygons(), seed=seeds())
@@ -98,7 +98,7 @@ class TestAligner:
         scene = scene_of(plan_of(polygon), 3, seed, margin_m=0.05)
         starts = scene.poses.position_m
         job = depth_job(scene, starts, starts[::-1], 32)
-        result = DepthAligner(rows=ROWS, columns=32, config=LpoConfig(adam_steps=40)).refine(job)
+        result = depth_aligner(rows=ROWS, columns=32, config=LpoConfig(adam_steps=40)).refine(job)
         assert shapely.contains(scene.plan.rooms[0].shape, shapely.points(result.position_m)).all()
         profile = wall_profile(starts, np.zeros(3), scene.walls_m, 32)
         depth = layout_depth(profile, np.full(3, CAMERA_M), scene.ceiling_height_m, ROWS).reshape(3, -1)
@@ -108,7 +108,7 @@ class TestAligner:
         scene = scene_of(plan_of([[0, 0], [4, 0], [4, 3], [0, 3.5]]), 2, 0)
         job = depth_job(scene, scene.poses.position_m, scene.poses.position_m, 64)
         thinned = job.targets.reshape(2, ROWS, 64)[:, :, ::4].reshape(2, -1)
-        aligner = DepthAligner(rows=ROWS, columns=64, thinning=4, config=LpoConfig(adam_steps=1))
+        aligner = depth_aligner(rows=ROWS, columns=64, thinning=4, config=LpoConfig(adam_steps=1))
         job = RefinementJob(**{**vars(job), "targets": thinned})
         np.testing.assert_allclose(aligner.refine(job).cost, 0.0, atol=1e-5)
 

@@ -58,10 +58,9 @@ def median_ms(call: Callable[[], object], repeats: int = 9) -> float:
 _GRID_STEP_M = 0.5
 
 
-def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
+def bench_rendering(bundle: Bundle) -> dict[str, float]:
     """Measure layout depth in closed form and by ray casting, and the pose grid of a 100 m² home."""
-    home = home_of_area(100.0)
-    plan = home.plan
+    poses, plan = 200, home_of_area(100.0).plan
     sampled = random_poses(plan, poses, np.random.default_rng(0))
     camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[sampled.room_index]
     arrays = (sampled.position_m, np.zeros(poses), plan.walls_m[sampled.room_index], camera, ceiling)

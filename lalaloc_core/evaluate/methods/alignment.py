@@ -12,31 +12,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lalaloc_core.localise.optimise import LpoConfig, PoseOptimiser
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.render.depth import layout_depth
 
 
-class DepthAligner:
-    """Optimiser that moves poses within their rooms until their layout depths match target images."""
+def depth_aligner(*, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> PoseOptimiser:
+    """Return an optimiser that moves poses within their rooms until their layout depths match target images.
 
-    def __init__(self, *, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> None:
-        """Set the size of the compared images.
+    The targets of its jobs are flattened depth images (m), rows first; its costs are mean absolute differences (m).
+    `columns` are those of the rendered wall profiles, of which the images keep every `thinning`-th. `config` has the
+    margins and Adam's schedule.
+    """
 
-        `columns` are those of the rendered wall profiles, of which the images keep every `thinning`-th. `config` has
-        the margins and Adam's schedule.
-        """
+    def depth(
+        profile_m: Float[Tensor, "k w"], camera_height_m: Float[Tensor, "k"], ceiling_height_m: Float[Tensor, "k"]
+    ) -> Float[Tensor, "k d"]:
+        return layout_depth(profile_m[:, ::thinning], camera_height_m, ceiling_height_m, rows).flatten(1)
 
-        def depth(
-            profile_m: Float[Tensor, "k w"], camera_height_m: Float[Tensor, "k"], ceiling_height_m: Float[Tensor, "k"]
-        ) -> Float[Tensor, "k d"]:
-            return layout_depth(profile_m[:, ::thinning], camera_height_m, ceiling_height_m, rows).flatten(1)
-
-        self._optimiser = PoseOptimiser(depth, columns, norm="l1", config=replace(config or LpoConfig(), method="adam"))
-
-    def refine(self, job: RefinementJob) -> RefinementResult:
-        """Align the starting poses of a job whose targets are flattened depth images (m), rows first.
-
-        Returns:
-            poses with mean absolute differences of depth (m) as their distances.
-        """
-        return self._optimiser.refine(job)
+    return PoseOptimiser(depth, columns, norm="l1", config=replace(config or LpoConfig(), method="adam"))

@@ -13,12 +13,11 @@ import torch
 from jaxtyping import Float
 from torch.nn import functional
 
-from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.evaluate.methods.method import Answer, Question
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import LpoConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
 from lalaloc_core.localise.refinement import refinement_job
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
@@ -27,23 +26,16 @@ from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecod
 class VdrDecode:
     """Method with a bundle and the decoder that its layout encoder was trained with."""
 
-    def __init__(
-        self,
-        encoders: Encoders,
-        decoder: LayoutDecoder,
-        *,
-        config: LocaliseConfig | None = None,
-        schedule: LpoConfig | None = None,
-    ) -> None:
+    def __init__(self, encoders: Encoders, decoder: LayoutDecoder) -> None:
         self._lalaloc = LaLaLoc(encoders, refine="vdr")
         # The paper compares latents only.
-        self._config = replace(config or LocaliseConfig(), matching=MatchingConfig(use_profile=False))
+        self._config = LocaliseConfig(matching=MatchingConfig(use_profile=False))
         self._decoder = decoder.eval().requires_grad_(False)
         # Training shows the decoder every n-th column of the encoder's wall profile.
         columns = encoders.manifest.profile_columns
         thinning = max(columns // DECODED_WIDTH, 1)
         self._width = len(range(0, columns, thinning))
-        self._aligner = DepthAligner(rows=DECODED_HEIGHT, columns=columns, thinning=thinning, config=schedule)
+        self._aligner = depth_aligner(rows=DECODED_HEIGHT, columns=columns, thinning=thinning)
 
     def locate(self, question: Question) -> Answer:
         """Retrieve, re-sample with VDR, decode the query's latent and align."""

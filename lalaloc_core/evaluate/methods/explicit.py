@@ -16,12 +16,11 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import read_image
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LpoConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
 from lalaloc_core.localise.poses import RefinementJob
 from lalaloc_core.localise.vogel import disc_poses
@@ -34,13 +33,11 @@ _ROWS = 32
 class ExplicitLayout:
     """Method with the wall profile that a `ring` bundle predicts; layout queries use the true one."""
 
-    def __init__(
-        self, encoders: Encoders, *, config: LocaliseConfig | None = None, schedule: LpoConfig | None = None
-    ) -> None:
+    def __init__(self, encoders: Encoders) -> None:
         self._encoders = encoders
-        self._config = config or LocaliseConfig()
+        self._config = LocaliseConfig()
         self._columns = encoders.manifest.profile_columns
-        self._aligner = DepthAligner(rows=_ROWS, columns=self._columns, config=schedule)
+        self._aligner = depth_aligner(rows=_ROWS, columns=self._columns)
         self._grids: LRUCache[Any, _RenderedPoses] = LRUCache(GRIDS_CACHED)
 
     def locate(self, question: Question) -> Answer:

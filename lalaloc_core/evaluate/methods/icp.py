@@ -67,8 +67,8 @@ class Alignment:
 class Icp:
     """Method that aligns the scan of a question: the true layout or the furnished room's depth."""
 
-    def __init__(self, config: IcpConfig | None = None) -> None:
-        self.config = config or IcpConfig()
+    def __init__(self) -> None:
+        self.config = IcpConfig()
         self._trees: LRUCache[Any, KDTree] = LRUCache(GRIDS_CACHED)
 
     @cachedmethod(attrgetter("_trees"), key=plan_key)

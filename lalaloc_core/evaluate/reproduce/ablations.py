@@ -123,23 +123,14 @@ def train_ablation(
     *,
     device: torch.device,
     workers: int = 1,
-    resume: bool = True,
-    skip_bad: bool = False,
 ) -> Bundle:
     """Train a variant on a data set and export it to `out/<name>/bundle`.
 
     Finished stages are skipped and interrupted ones resume. Variants of the image branch use the layout encoder of
     another variant, whose stage 1 is trained first if needed.
 
-    Args:
-        name: a key of `ABLATIONS`.
-        budget: size of networks and schedule.
-        dataset: training scenes to learn from, validation scenes to monitor.
-        out: folder of all variants of one data set and budget.
-        device: device of the training.
-        workers: processes that make batches; 0 for this process.
-        resume: False trains this variant's own stages anew.
-        skip_bad: skip unusable files, naming each once.
+    `out` is the folder of all variants of one data set and budget. The validation scenes of `dataset` monitor the
+    training. `workers` processes make batches; 0 for this process.
 
     Raises:
         ConfigError: the variant is unknown.
@@ -150,20 +141,20 @@ def train_ablation(
     if ablation is None:
         raise ConfigError(f"unknown variant '{name}'; choose one of: {', '.join(ABLATIONS)}")
     config, folder = ablation.config[budget], out / name
-    data = TrainingData(dataset=dataset, skip_bad=skip_bad, validation_scenes=_VALIDATION_SCENES)
+    data = TrainingData(dataset=dataset, validation_scenes=_VALIDATION_SCENES)
     common: dict[str, Any] = {"data": data, "device": device, "workers": workers}
     teacher = folder
     if ablation.layout_from is not None:
         teacher = out / ablation.layout_from
-        _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, True, train_layout, common)
+        _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, train_layout, common)
     trained = False
     for stage in ablation.stages:
         if stage == "layout":
-            trained |= _finish(stage, config, folder, resume, train_layout, common)
+            trained |= _finish(stage, config, folder, train_layout, common)
         elif stage == "image":
-            trained |= _finish(stage, config, folder, resume, train_image, {**common, "teacher": teacher})
+            trained |= _finish(stage, config, folder, train_image, {**common, "teacher": teacher})
         else:
-            trained |= _finish(stage, config, folder, resume, train_end_to_end, common)
+            trained |= _finish(stage, config, folder, train_end_to_end, common)
     bundle = folder / _BUNDLE
     if not trained and (bundle / MANIFEST_NAME).exists():
         return Bundle.open(bundle)
@@ -181,16 +172,11 @@ def train_ablation(
 
 
 def _finish(
-    stage: str,
-    config: TrainConfig,
-    folder: Path,
-    resume: bool,
-    train: Callable[..., Checkpoint],
-    arguments: dict[str, Any],
+    stage: str, config: TrainConfig, folder: Path, train: Callable[..., Checkpoint], arguments: dict[str, Any]
 ) -> bool:
     """Train a stage to its end; return False if it already was."""
     path = folder / f"{stage}.pt"
-    exists = resume and path.exists()
+    exists = path.exists()
     if exists:
         checkpoint = Checkpoint.load(path, stage=stage)
         steps = config.layout.steps if stage == "layout" else config.image.steps

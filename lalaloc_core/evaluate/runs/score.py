@@ -186,11 +186,9 @@ def reliability_bins(
     )
 
 
-def expected_calibration_error(
-    confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
-) -> float:
+def expected_calibration_error(confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"]) -> float:
     """Return the mean gap between confidence and frequency over the bins, weighted by queries."""
-    diagram = reliability_bins(confidence, correct, bins)
+    diagram = reliability_bins(confidence, correct)
     return sum(part.count * abs(part.confidence - part.frequency) for part in diagram) / len(confidence)
 
 

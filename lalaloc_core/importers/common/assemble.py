@@ -113,12 +113,12 @@ def assemble(
     return ImportedPlan(document, report, sketch.level, anchor, checked)
 
 
-def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) -> str | None:
-    """Return a name without control characters, cut to `limit`; None if nothing is left."""
+def clean_name(name: str | None) -> str | None:
+    """Return a name without control characters, cut to the limit; None if nothing is left."""
     if name is None:
         return None
     spaced = "".join(" " if unicodedata.category(c) in {"Cc", "Cs", "Zl", "Zp"} else c for c in name)
-    return " ".join(spaced.split())[:limit] or None
+    return " ".join(spaced.split())[: DEFAULT_LIMITS.max_name_length] or None
 
 
 def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: ReportBuilder) -> list[SketchedRoom]:

@@ -22,7 +22,7 @@ from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
-from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
 
 _MIN_ROOM_M2 = 0.6
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
@@ -41,9 +41,7 @@ _OFF_WALL_M = 0.03
 _MAX_SEGMENTS = 60_000
 
 
-def sketch_drawing(
-    drawing: Drawing, builder: ReportBuilder, budget: Budget, config: WallConfig = DEFAULT_WALLS
-) -> Sketch:
+def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:
     """Find the rooms and openings of a drawing in metres, y up.
 
     Raises:
@@ -58,11 +56,11 @@ def sketch_drawing(
         sketch.inner_walls = _free_standing(drawing, shapes)
         builder.notes.append("rooms are the areas that the file marks as rooms")
     else:
-        enclosed, source = _enclosed(drawing, budget, config)
+        enclosed, source = _enclosed(drawing, budget)
         gaps = enclosed.gaps
         shapes = [Area(shape, "", "room") for shape in enclosed.rooms]
         builder.notes.append(
-            f"rooms are the areas enclosed by {source}; gaps up to {config.widest_gap:g} m were closed"
+            f"rooms are the areas enclosed by {source}; gaps up to {DEFAULT_WALLS.widest_gap:g} m were closed"
         )
     sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
     sketch.openings = [*_symbols(drawing), *_swings(drawing.swings, gaps, shapes)]
@@ -108,29 +106,29 @@ def _covers(outer: shapely.Polygon, inner: shapely.Polygon) -> bool:
     return outer.area >= 0.98 * inner.area and shapely.intersection(outer, inner).area > 0.95 * inner.area
 
 
-def _enclosed(drawing: Drawing, budget: Budget, config: WallConfig) -> tuple[Enclosed, str]:
+def _enclosed(drawing: Drawing, budget: Budget) -> tuple[Enclosed, str]:
     """Return the enclosed areas, and a description of what was taken for walls."""
     named_bodies = [area.shape for area in drawing.areas if area.role == "wall"]
     named_lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
     closers = _closers(drawing)
     if named_bodies or named_lines:
-        outlines = [shape.exterior for shape in named_bodies if _is_outline(shape, config)]
-        bodies = [shape for shape in named_bodies if not _is_outline(shape, config)]
-        return enclose(bodies, _pieces([*named_lines, *outlines]), closers, config, budget.check_time), "the walls"
+        outlines = [shape.exterior for shape in named_bodies if _is_outline(shape)]
+        bodies = [shape for shape in named_bodies if not _is_outline(shape)]
+        return enclose(bodies, _pieces([*named_lines, *outlines]), closers, check_time=budget.check_time), "the walls"
     dark = [area.shape for area in drawing.areas if area.is_dark and area.role is None]
-    dark = [shape for shape in dark if not _is_outline(shape, config)]
+    dark = [shape for shape in dark if not _is_outline(shape)]
     thick = [stroke for stroke in drawing.strokes if stroke.role is None and _THICK_M[0] <= stroke.width <= _THICK_M[1]]
     dark += [stroke.line.buffer(0.5 * stroke.width, cap_style="square", join_style="mitre") for stroke in thick]
-    if dark and (found := enclose(dark, [], closers, config, budget.check_time)).rooms:
+    if dark and (found := enclose(dark, [], closers, check_time=budget.check_time)).rooms:
         return found, "the dark areas and thick lines"
     unnamed = [stroke.line for stroke in drawing.strokes if stroke.role is None]
     unnamed += [area.shape.exterior for area in drawing.areas if area.role is None]
-    return enclose([], _pieces(unnamed), closers, config, budget.check_time), "all lines"
+    return enclose([], _pieces(unnamed), closers, check_time=budget.check_time), "all lines"
 
 
-def _is_outline(shape: shapely.Polygon, config: WallConfig) -> bool:
+def _is_outline(shape: shapely.Polygon) -> bool:
     """Return whether a closed wall polyline runs along the faces of a room, and is not the body of a wall."""
-    return not shape.buffer(-0.5 * config.thickest).is_empty
+    return not shape.buffer(-0.5 * DEFAULT_WALLS.thickest).is_empty
 
 
 def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:

@@ -147,19 +147,12 @@ def crumpled(part: Part, depth: Number, rng: np.random.Generator) -> Part:
 
 
 def folded_sheet(
-    surface: str,
-    *,
-    width_m: Number,
-    low_m: Number,
-    high_m: Number,
-    folds: Number,
-    depth_m: Number,
-    phase: Number = 0.0,
+    surface: str, *, width_m: Number, low_m: Number, high_m: Number, folds: Number, depth_m: Number
 ) -> Part:
     """Return a hanging cloth along x with sinusoidal folds."""
     columns = max(int(folds * 10), 4)
     x = np.linspace(0.0, width_m, columns + 1)
-    y = depth_m * np.sin(x / width_m * folds * 2 * np.pi + phase)
+    y = depth_m * np.sin(x / width_m * folds * 2 * np.pi)
     bottom = np.stack([x, y * 1.2, np.full_like(x, low_m)], axis=1)
     top = np.stack([x, y * 0.7, np.full_like(x, high_m)], axis=1)
     a = np.arange(columns)
