@@ -102,11 +102,8 @@ class AsyncClient(AsyncTransport):
     ) -> FloorPlan:
         """Store a new revision of a plan.
 
-        Args:
-            floorplan_id: id of the plan.
-            document: the new plan, as for `upload_floorplan`.
-            options: import options, as for `upload_floorplan`.
-            if_match: `etag` of the revision to replace. If it is not the latest one: ConflictError.
+        `document` and `options` are as for `upload_floorplan`. If `if_match`, the `etag` of the revision to replace, is
+        not that of the latest one: ConflictError.
         """
         path = resource_path("floorplans", floorplan_id)
         request = await run_blocking(plan_request, "PUT", path, document, options, if_match=if_match)
@@ -117,12 +114,7 @@ class AsyncClient(AsyncTransport):
         return await self._stored(FloorPlan, Request("GET", resource_path("floorplans", floorplan_id)))
 
     async def floorplans(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[FloorPlanSummary]:
-        """Yield the stored plans, newest first, requested page by page.
-
-        Args:
-            name: yield only plans with this text in their name.
-            page_size: number of plans per request.
-        """
+        """Yield the stored plans, newest first, page by page; with `name`, those with this text in their name."""
         async for page in self._pages(FloorPlanPage, "/floorplans", name=name, limit=page_size):
             for plan in page.floorplans:
                 yield plan
@@ -146,12 +138,8 @@ class AsyncClient(AsyncTransport):
     ) -> str:
         """Return a plan as an SVG drawing in which one unit is one metre.
 
-        Args:
-            floorplan_id: id of the plan.
-            x_m: x of a camera to draw.
-            y_m: y of the camera.
-            heading_deg: heading of the camera, as in `Localisation`.
-            covariance_m2: covariance of its position, as in `Localisation`, drawn as the ellipse that contains 95 %.
+        `x_m`, `y_m` and `heading_deg` are the pose of a camera to draw, and `covariance_m2`, as in `Localisation`, is
+        drawn as the ellipse that contains 95 % of its positions.
         """
         params = preview_params(x_m, y_m, heading_deg, covariance_m2)
         path = f"{resource_path('floorplans', floorplan_id)}/preview.svg"
@@ -165,9 +153,7 @@ class AsyncClient(AsyncTransport):
     async def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
         """Return the walls and openings of a plan, room by room, from which a camera's view can be drawn.
 
-        Args:
-            floorplan_id: id of the plan.
-            revision: an older revision, while the service keeps it. Default: the current one.
+        `revision` is an older revision, while the service keeps it. Default: the current one.
         """
         path = f"{resource_path('floorplans', floorplan_id)}/layout"
         return parse(Layout, await self._content(Request("GET", path, text_values({"revision": revision}))))
@@ -248,11 +234,7 @@ class AsyncClient(AsyncTransport):
     ) -> Venue:
         """Group stored plans in a venue; `localise_in_venue` searches all of them.
 
-        Args:
-            plans: the plans with their levels.
-            name: name of the venue.
-            anchor: location of the plans' common origin on Earth.
-            idempotency_key: as for `upload_floorplan`.
+        The anchor is the location of the plans' common origin on Earth; `idempotency_key` is as for `upload_floorplan`.
         """
         key = idempotency_key or uuid.uuid4().hex
         document = _venue_document(plans, name, anchor)
@@ -284,13 +266,9 @@ class AsyncClient(AsyncTransport):
     ) -> Venue:
         """Change parts of a venue.
 
-        Args:
-            venue_id: id of the venue.
-            name: new name. Default: keep the name.
-            anchor: new anchor; None removes it. Default: keep it.
-            plans: plans to add, or to give another level or name.
-            remove: ids of plans to remove.
-            if_match: `etag` of the revision to change. If it is not the latest one: ConflictError.
+        Parts that are left out are kept; the anchor None removes it. `plans` are added, or get another level or name;
+        `remove` has ids of plans. If `if_match`, the `etag` of the revision to change, is not that of the latest one:
+        ConflictError.
         """
         change: dict[str, Any] = {} if name is None else {"name": name}
         if anchor != "unchanged":
@@ -309,12 +287,7 @@ class AsyncClient(AsyncTransport):
         return await self._stored(Venue, Request("GET", resource_path("venues", venue_id)))
 
     async def venues(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Venue]:
-        """Yield the stored venues, newest first, requested page by page.
-
-        Args:
-            name: yield only venues with this text in their name.
-            page_size: number of venues per request.
-        """
+        """Yield the stored venues, newest first, page by page; with `name`, those with this text in their name."""
         async for page in self._pages(VenuePage, "/venues", name=name, limit=page_size):
             for venue in page.venues:
                 yield venue
@@ -322,13 +295,7 @@ class AsyncClient(AsyncTransport):
     async def venue_plans(
         self, venue_id: str, *, level: float | None = None, page_size: int = 100
     ) -> AsyncIterator[VenuePlan]:
-        """Yield the plans of a venue from the lowest level up, requested page by page.
-
-        Args:
-            venue_id: id of the venue.
-            level: yield only the plans of this level.
-            page_size: number of plans per request.
-        """
+        """Yield the plans of a venue, or of one of its levels, from the lowest level up, page by page."""
         path = f"{resource_path('venues', venue_id)}/plans"
         async for page in self._pages(VenuePlanPage, path, level=level, limit=page_size):
             for plan in page.plans:

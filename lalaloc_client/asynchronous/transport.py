@@ -106,12 +106,7 @@ class AsyncTransport:
     async def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:
         """Send a request, repeatedly if necessary and safe.
 
-        Args:
-            request: request to send.
-            retry: policy instead of the client's own.
-
-        Returns:
-            The answer, read completely unless the request is streamed.
+        `retry` replaces the client's own policy. The answer is read completely unless the request is streamed.
 
         Raises:
             ConnectionFailedError: no attempt was answered.

@@ -60,18 +60,14 @@ class FloorPlan:
     """A validated floor plan; build one with `FloorPlan.from_dict` or `FloorPlan.from_json`.
 
     Attributes:
-        name: display name.
-        rooms: at least one room.
         camera_height_m: height of the camera assumed for panoramas of this plan.
         warnings: problems that do not prevent use, such as overlapping rooms.
         north: azimuth of true north (radians), None if unknown.
-        openings: doors, windows and passages.
         opening_kinds: kinds of openings that the plan shows completely.
         opening_tolerance_m: maximum distance between an opening's line and its wall.
         opening_faces: the parts of walls that openings occupy.
         camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
         states_camera_height: True if the plan gives `camera_height_m`; otherwise the height is estimated per query.
-        anchor: position on Earth, None if unknown.
     """
 
     name: str

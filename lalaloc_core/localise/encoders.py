@@ -116,14 +116,10 @@ class Encoders:
         """Return the query of a panorama of the bundle's input size.
 
         The panorama is first rolled to undo the heading, if it is known. Each hypothesis then assumes a rotation from
-        there by a number of sectors, of which a full turn has `ring_sectors`.
-
-        Args:
-            image: pixels of the panorama.
-            heading: azimuth of the centre column (radians); None if unknown, with one hypothesis per sector.
-            camera_height: gives the picture its metric scale.
-            heading_tolerance: largest error of `heading` (radians); if it is not 0, there are hypotheses for the
-                sectors within it, and the heading is refined.
+        there by a number of sectors, of which a full turn has `ring_sectors`. The camera height gives the picture its
+        metric scale. Without `heading`, the azimuth of the centre column (radians), there is one hypothesis per sector;
+        if `heading_tolerance` (radians) is not 0, there are hypotheses for the sectors within it, and the heading is
+        refined.
         """
         frame, frame_roll, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
         sectors = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING

@@ -106,13 +106,9 @@ class Terms(NamedTuple):
 class _Views(NamedTuple):
     """Layouts of m poses, ready to be compared.
 
-    Attributes:
-        log_profile: (m, w) log wall profiles (m).
-        opening: (m, w) place of each azimuth's class in a row of w x c losses; None without openings.
-        room_index: (m,) rooms.
-        pose, column: (e,) the azimuths with a view through an opening.
-        log_behind: (e,) log distance (m) of the wall behind.
-        odds: (e,) odds that the prediction is of that wall.
+    `opening` is the place of each azimuth's class in a row of w x c losses. The e azimuths `pose`, `column` have a view
+    through an opening: `log_behind` is the log distance (m) of the wall behind, and `odds` those that the prediction is
+    of that wall.
     """
 
     log_profile: Float[np.ndarray, "m w"]
@@ -127,13 +123,8 @@ class _Views(NamedTuple):
 class MatchingCost:
     """Matching cost of the poses of one plan for one query.
 
-    Args:
-        plan: the plan of the poses.
-        query: the encoded panorama; it must have a predicted wall profile.
-        reach_m: distance (m) from the camera within which the best of the poses lies.
-        weights: weights of the terms, from the model's bundle.
-        config: settings.
-        stride: compare only azimuths whose column is a multiple of `stride`.
+    The query must have a predicted wall profile. `reach_m` is the distance from the camera within which the best of the
+    poses lies. Only azimuths whose column is a multiple of `stride` are compared.
     """
 
     def __init__(

@@ -190,17 +190,9 @@ def localise(
 ) -> Localisation:
     """Localise an encoded panorama in a plan.
 
-    Args:
-        plan: the floor plan.
-        grid: the plan's pose grid, made for the query's camera height.
-        encoders: networks of the model.
-        query: the encoded panorama.
-        refine: last stage; "lpo" without a `refiner`, or with one that returns None, ends at "vdr".
-        top_k: maximum number of candidates.
-        refiner: runs pose refinement.
-        config: settings of the search.
-        clock: times the stages; by default a new one.
-        hints: priors of the place. With strict hints, a known heading is not doubted.
+    The grid is the plan's, made for the query's camera height. `refine` is the last stage: "lpo" without a `refiner`,
+    or with one that returns None, ends at "vdr". `clock` times the stages. With strict hints, a known heading is not
+    doubted.
 
     Raises:
         InvalidHintError: the hints do not fit the plan, or strict hints exclude all of it.

@@ -275,15 +275,9 @@ def posterior_from_weights(
 ) -> Posterior:
     """Return the posterior of weighted places.
 
-    Args:
-        query: the encoded panorama.
-        candidates: the candidates whose probability is wanted, the answer first.
-        pose: (m,) number of each place's grid pose.
-        position: (m, 2) the places (m).
-        heading: (m,) heading of the panorama (radians).
-        weight: (m,) probabilities; the sum is one.
-        poses: number of grid poses.
-        counted: positions and headings by which candidates count the places; default: `position` and `heading`.
+    `pose` is the number of each place's grid pose, of `poses`; `heading` is that of the panorama (radians); the sum of
+    `weight` is one. `candidates` are those whose probability is wanted, the answer first; they count the places by
+    `counted` (default: `position` and `heading`).
     """
     counted_position, counted_heading = (position, heading) if counted is None else counted
     near = np.linalg.norm(counted_position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M

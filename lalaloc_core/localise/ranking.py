@@ -60,14 +60,9 @@ def suppress(
 ) -> list[int]:
     """Return the indices of distinct poses by rising cost (non-maximum suppression).
 
-    Args:
-        position_m: (n, 2) positions.
-        cost: (n,) costs.
-        separation_m: poses closer than this to a better one are dropped.
-        limit: maximum number of poses.
-        heading: (n,) radians; with it, poses at one place are distinct if their headings differ.
-        ceiling: poses below this cost are limited by `limit_below` instead of `limit`, if that is larger.
-        limit_below: see `ceiling`.
+    Poses closer than `separation_m` to a better one are dropped; with `heading` (radians), poses at one place are
+    distinct if their headings differ. At most `limit` poses are returned; poses below the cost `ceiling` are limited by
+    `limit_below` instead, if that is larger.
     """
     remaining = ranking(cost, position_m, heading)
     kept: list[int] = []

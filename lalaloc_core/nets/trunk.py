@@ -43,8 +43,6 @@ class TrunkConfig:
 
     Attributes:
         stem: channels after the first convolution.
-        widths: channels of the seven stages.
-        repeats: blocks of the seven stages.
         frozen_stages: number of first stages that are not trained, along with the stem; -1 trains the stem as well.
     """
 
@@ -167,9 +165,7 @@ class _Block(nn.Module):
 class StyleMixing:
     """Mixing of styles within a batch (MixStyle: Zhou et al., ICLR 2021).
 
-    Attributes:
-        partner: (b,) index of the other picture in the batch.
-        share: (b,) 0 to 1, share of the partner's style.
+    `partner` is the index of the other picture in the batch, `share` (0 to 1) that of the partner's style.
     """
 
     partner: Int[Tensor, "b"]

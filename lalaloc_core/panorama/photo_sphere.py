@@ -48,7 +48,6 @@ class PhotoSphere:
         part: visible part of the sphere, None for all of it or if unknown.
         fault: problem with the metadata of `part`, None if they are valid or missing.
         refusal: reason that the metadata rule the picture out, None if they do not.
-        pitch: elevation of the centre above the horizon.
         roll: clockwise rotation of the camera about its viewing direction; the horizon rotates counterclockwise.
         compass_heading: azimuth of the centre, clockwise from true north; None if missing.
     """

@@ -36,15 +36,9 @@ _MAY_DIFFER = {"command", "label", "limit", "skipped"}
 
 
 def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = None) -> list[Prediction]:
-    """Localise every query of a run, or the rest of an interrupted run.
+    """Localise every query of a run, or the rest of an interrupted run; return at most `info.limit` predictions.
 
-    Args:
-        folder: folder of the predictions.
-        info: description of the run.
-        workers: processes of one thread each; 0 for this process, None for one per core.
-
-    Returns:
-        all predictions, `info.limit` at most.
+    `workers` are processes of one thread each; 0 for this process, None for one per core.
 
     Raises:
         RunError: `folder` holds a run with another description.

@@ -39,9 +39,7 @@ class ImportedPlan:
     """Plan of one storey of a file.
 
     Attributes:
-        document: plan in the native format.
         report: use of the layers, and likely mistakes.
-        level: storey, if the file gives it.
         anchor: place of the plan's origin on Earth, if the file gives it.
         checked: limits and plan of an earlier validation.
     """

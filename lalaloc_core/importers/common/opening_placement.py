@@ -26,13 +26,7 @@ _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 @dataclass(frozen=True)
 class PlacedOpenings:
-    """Result of the placement.
-
-    Attributes:
-        openings: openings on walls.
-        off_wall: openings that lie on no wall.
-        overlapping: number of openings left out because another takes their place.
-    """
+    """Openings on walls, openings on no wall, and the number left out because another takes their place."""
 
     openings: list[SketchedOpening]
     off_wall: list[SketchedOpening]

@@ -18,12 +18,7 @@ _CEILING_M = (1.0, 20.0)
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """Two points of a drawing and their distance.
-
-    Attributes:
-        start, end: (x, y) in the file's coordinates; pixels of a picture.
-        distance_m: distance of the points in metres.
-    """
+    """Two points (x, y) of a drawing, in the file's coordinates (pixels of a picture), and their distance (m)."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -55,13 +50,11 @@ class ImportOptions:
         units: unit of the file's coordinates.
         scale: denominator of a drawing's scale on paper, 100 for "1:100" (PDF, SVG).
         metres_per_pixel: length of a pixel, or of a user unit of an SVG.
-        known_distance: two points and their distance; sets the scale.
         level: name or number of the storey to import, if the file has several.
         layers: layers, groups or classes to import, ignoring case; empty for all.
         page: page of a PDF, counted from 1.
         y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
         ceiling_height_m: ceiling height of rooms without one in the file.
-        name: name of the plan.
     """
 
     units: str | None = None

@@ -29,8 +29,6 @@ class ImportReport:
         scale_source: source of that length.
         is_draft: the plan was inferred from a picture or from unnamed lines; review it before use.
         layers: use of the entities, by layer.
-        notes: steps taken.
-        warnings: likely mistakes in the file.
         unsure: guesses and their reasons.
     """
 

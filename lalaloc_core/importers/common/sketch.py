@@ -66,13 +66,8 @@ class Sketch:
     """Contents of one storey.
 
     Attributes:
-        rooms: rooms.
-        openings: doors, windows and passages.
         obstacles: areas without floor, such as columns; cut out of the rooms that they lie in.
-        inner_walls: free-standing walls.
-        name: name of the plan.
         north_deg: direction of north, clockwise from +y.
-        level: the storey.
         anchor: place of the origin on Earth.
         opening_kinds: kinds of openings that the source shows completely; None for those that occur.
     """

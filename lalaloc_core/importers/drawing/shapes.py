@@ -29,10 +29,8 @@ class Area:
     """Closed shape.
 
     Attributes:
-        shape: the area.
         layer: layer, group or class.
         role: role by the name of the layer.
-        name: name of a room.
         kind: words about the use of a room, such as the class of an SVG element.
         is_dark: dark enough to be a wall; None if the drawing has no fills.
     """

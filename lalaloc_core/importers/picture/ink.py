@@ -30,9 +30,7 @@ class Ink:
     Attributes:
         gray: grey picture with white paper; rows from the top.
         warmth: 128 without colour, higher towards red, lower towards blue; None for a grey picture.
-        mask: True at dark pixels.
         lines: `mask`, and faint lines that are darker than their surroundings.
-        metres_per_pixel: length of a pixel of these arrays.
         skew_deg: clockwise rotation that straightened the picture.
         size: rows and columns of the picture before the rotation, at this resolution.
     """

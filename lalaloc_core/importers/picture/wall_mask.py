@@ -29,13 +29,7 @@ _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
 
 @dataclass(frozen=True, eq=False)
 class WallMask:
-    """Wall pixels.
-
-    Attributes:
-        mask: True in walls.
-        thickness_m: usual thickness of a wall.
-        cavities: labels of the white areas inside walls, 0 elsewhere; None for dark walls.
-    """
+    """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls."""
 
     mask: Bool[np.ndarray, "h w"]
     thickness_m: float

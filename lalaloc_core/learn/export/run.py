@@ -35,16 +35,10 @@ def export_run(
 ) -> Bundle:
     """Export a training run to a bundle, with its decoder if it has one.
 
-    Args:
-        folder: of the run.
-        out: folder of the bundle.
-        name: of the model.
-        version: of the model.
-        notes: additional entries of the manifest's `training`.
-        layout_from: run folder of the layout encoder used as teacher; default: `folder`.
-        layout_only: export no image encoder; the bundle answers layout queries only.
-        last: export the last weights instead of the best by validation. With two stages this applies to the image
-            encoder, because its teacher was the best layout encoder.
+    `notes` are additional entries of the manifest's `training`, and `layout_from` is the run folder of the layout
+    encoder used as teacher (default: `folder`). A `layout_only` bundle answers layout queries only. `last` exports the
+    last weights instead of the best by validation; with two stages this applies to the image encoder, because its
+    teacher was the best layout encoder.
 
     Raises:
         CheckpointError: a stage has no checkpoint, or the branches have different networks.

@@ -84,13 +84,9 @@ class BestCheckpoint:
     """Keeper of the best checkpoint: the lowest negative log likelihood of wall profiles, which also ranks poses.
 
     Networks without a likelihood are ranked by the validation queries within 1 m, ties by the smaller median. Metrics
-    without either are not ranked, and nothing is kept.
-
-    Args:
-        path: file of the best checkpoint; one of an earlier run is deleted unless this run resumes it.
-        stage: provides the modules for the kept weights.
-        validate: scores the kept weights again, because validation scenes may have changed when a run resumes.
-        resume: continue an earlier run.
+    without either are not ranked, and nothing is kept. The file of an earlier run is deleted unless this run resumes
+    it. `validate` then scores the kept weights again, because validation scenes may have changed; `stage` provides the
+    modules for them.
     """
 
     def __init__(self, path: Path, stage: TrainingStage, validate: Validate | None, *, resume: bool) -> None:

@@ -41,17 +41,10 @@ def run_stage(
     """Train a stage to the end of its schedule, or resume an interrupted run.
 
     Writes `<stage>.pt` (the last checkpoint), `<stage>.best.pt` (the best by validation, if metrics rank it) and
-    `<stage>.csv` (losses and validation by step) into `folder`.
-
-    Args:
-        stage: networks, data and losses.
-        folder: folder of the run.
-        device: training device.
-        workers: number of processes that make batches.
-        resume: continue from `<stage>.pt`.
-        checkpoint_minutes: minutes between checkpoints.
-        validate: function of the modules (averaged if averaging is on) that returns metrics; called per checkpoint.
-        begun_from: origin of the initial weights, stored in checkpoints; a resumed run keeps its checkpoint's value.
+    `<stage>.csv` (losses and validation by step) into `folder`. `workers` processes make batches. `validate` is a
+    function of the modules (averaged if averaging is on) that returns metrics; it is called per checkpoint.
+    `begun_from` is the origin of the initial weights, stored in checkpoints; a resumed run keeps its checkpoint's
+    value.
 
     Raises:
         CheckpointError: `resume` is set, and the checkpoint is missing or has another configuration or other data.

@@ -76,20 +76,13 @@ class LayoutValidation:
 class ImageValidation:
     """Panorama queries, one per camera in its usual appearance: accuracy of the nearest grid pose.
 
-    The nearest pose is found by latent, and for networks with a wall profile also by that profile: the mean
-    |Δ log distance|, each clipped at `_MAX_LOG_ERROR`, to the layouts of the grid. Metrics cover all queries and each
+    The nearest pose is found by latent, and for networks with a wall profile also by that profile: the mean |Δ log
+    distance|, each clipped at `_MAX_LOG_ERROR`, to the layouts of the grid. Metrics cover all queries and each
     furniture level. Further metrics are the median over the queries of the median |Δ log distance| to the true wall,
-    and for architecture `trunk` the balanced accuracy of the openings.
-
-    Args:
-        config: provides the sizes.
-        scenes: with cameras whose photographs can be read.
-        layout_encoder: frozen teacher; None uses the one being trained.
-        device: to run on.
-        usual: preferred appearance of the photographs; cameras without it use their first.
-        problems: receives the errors of unreadable photographs, which are left out; None raises the first error.
-        prefix: of the names of all metrics.
-        cache: file that caches the photographs, because rendering them is slow.
+    and for architecture `trunk` the balanced accuracy of the openings. Without a frozen `layout_encoder` (teacher), the
+    one being trained is used. Cameras without a photograph of the `usual` appearance use their first. `problems`
+    receives the errors of unreadable photographs, which are left out; None raises the first error. `cache` is a file of
+    the photographs, because rendering them is slow.
 
     Raises:
         DatasetError: a photograph cannot be read and `problems` is None, or no photograph can be read.

@@ -40,13 +40,8 @@ _PADDING = {
 class PanoramaRenderer:
     """Renders shots as equirectangular panoramas of one size on one device.
 
-    Args:
-        materials: pictures of materials.
-        height: rows of a panorama, even.
-        width: columns.
-        device: device that renders.
-        supersample: rays per pixel along a column and along a row, or one number for both. Photographs average over
-            their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
+    `supersample` is the number of rays per pixel along a column and along a row, or one number for both. Photographs
+    average over their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
 
     Raises:
         InvalidInputError: `height` is odd, or a count of rays is less than one.

@@ -63,16 +63,11 @@ def sample_shots(
 ) -> list[Shot]:
     """Draw shots uniformly over a home's floor.
 
-    Args:
-        home: the home.
-        count: number of shots.
-        rng: source of randomness.
-        level: amount of furniture; None draws it for every shot.
-        by_room_share: share of shots whose room is drawn uniformly first, which favours closets and corridors.
-        hard_share: share of shots from rare places that are hard to localise: close to a wall, on the threshold of an
-            open door or in it, in the narrowest rooms.
-        unusual_heights_m: range of camera heights of the quarter that is not taken from 1.3 to 1.7 m.
-        night_share: share of shots at night, with black windows.
+    Without `level` every shot draws its amount of furniture. `by_room_share` is the share of shots whose room is drawn
+    uniformly first, which favours closets and corridors; `hard_share` the share from rare places that are hard to
+    localise: close to a wall, on the threshold of an open door or in it, in the narrowest rooms. `unusual_heights_m` is
+    the range of camera heights of the quarter that is not taken from 1.3 to 1.7 m. Shots at night (`night_share`) have
+    black windows.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
     by_room = np.flatnonzero(rng.random(count) < by_room_share)

@@ -24,11 +24,7 @@ class ScenePart(IntEnum):
 
 
 class Streams:
-    """Random streams of one scene.
-
-    Args:
-        seed: seed of the shot.
-        is_staged: true if every part restarts its stream, see `begin`.
+    """Random streams of one scene; with `is_staged` every part restarts its stream, see `begin`.
 
     Attributes:
         shapes: decides everything except materials.

@@ -44,10 +44,6 @@ class Decal(NamedTuple):
 class SceneTables:
     """Tables of one scene; see `RenderScene` for their rows.
 
-    Args:
-        camera_m: camera position (2,) in the plan frame.
-        surfaces: table of surfaces that decals, prisms and walls refer to.
-
     Attributes:
         walls_m: ends of the walls in the plan frame; those of the own room come first.
         wall_surfaces: their surfaces.
