@@ -29,7 +29,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
@@ -213,10 +213,7 @@ class MatchingCost:
     def predicted(
         self, columns: Int[np.ndarray, "a"]
     ) -> tuple[Float[np.ndarray, "k a"], Float[np.ndarray, "k a"], Float[np.ndarray, "k a c"] | None]:
-        """Return the predictions at some azimuths: centres, precisions, and the weighted cost of every opening class.
-
-        The costs are None if openings are not compared.
-        """
+        """Return centres, precisions and weighted costs of opening classes (None: not compared) at some azimuths."""
         loss = self._opening_losses
         loss = None if loss is None else self._weights.openings * loss[:, columns]
         return self._centre[:, columns], self._precision[:, columns], loss
@@ -231,7 +228,9 @@ class MatchingCost:
         if layouts.seen is not None and self._config.use_see_through:
             row, entry = layouts.seen.entries(pose)
             column, log_behind = layouts.seen.column[entry], layouts.seen.log_behind[entry]
-            odds = self._open_odds(layouts.seen.kind[entry])
+            is_passage = layouts.seen.kind[entry] == PASSAGE_CODE
+            share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
+            odds = share / (1.0 - share)
         log_profile = layouts.log_profile[pose].astype(np.float32, copy=False)
         return _Views(log_profile, opening, layouts.room_index[pose], row, column, log_behind, odds)
 
@@ -279,12 +278,6 @@ class MatchingCost:
         if loss is None or views.opening is None:
             return np.zeros(len(views.room_index), np.float32)
         return loss.take(hypothesis[:, None] * loss[0].size + views.opening).mean(axis=1)
-
-    def _open_odds(self, kind: UInt8[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-        """Return the odds that the prediction is of the wall behind openings of some kinds."""
-        is_passage = kind == PASSAGE_CODE
-        open_share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
-        return open_share / (1.0 - open_share)
 
     @cached_property
     def _opening_losses(self) -> Float[np.ndarray, "k w c"] | None:
