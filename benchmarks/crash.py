@@ -28,6 +28,7 @@ import httpx
 from benchmarks.harness import argument_parser, query_of
 from examples.launch import running_service
 from examples.truth import PLAN_PATH, read_poses
+from lalaloc_client import Client
 
 _CLIENTS = 6
 _TIMEOUT_S = 120.0
@@ -117,17 +118,13 @@ def main() -> int:
 def _inspect(url: str, uploads: Uploads, names: list[str], data: Path) -> dict[str, Any]:
     """Compare the stored plans with the uploads."""
     stored: dict[str, str] = {}
-    doubled, usable, cursor = 0, 0, None
+    doubled, usable = 0, 0
     pose = read_poses()[0]
+    with Client(url) as client:
+        for plan in client.floorplans():
+            doubled += plan.name in stored
+            stored[plan.name] = plan.id
     with httpx.Client(base_url=url, timeout=60.0) as client:
-        while True:
-            page = client.get("/floorplans", params={"limit": 100} | ({"cursor": cursor} if cursor else {})).json()
-            for plan in page["floorplans"]:
-                doubled += plan["name"] in stored
-                stored[plan["name"]] = plan["id"]
-            cursor = page.get("next_cursor")
-            if cursor is None:
-                break
         for plan_id in uploads.plan_ids.values():
             response = client.post("/localise", **query_of(pose, floorplan_id=plan_id))
             usable += response.status_code == httpx.codes.OK

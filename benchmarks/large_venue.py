@@ -13,7 +13,7 @@ import json
 import random
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.harness import argument_parser, example_service, query_of, resident_mb
 from examples.truth import TruePose, read_poses
+from lalaloc_client import Client
 from lalaloc_core.localise.bundle import Bundle
 from service.settings import Settings
 from service.storage import open_store
@@ -51,18 +52,6 @@ def upload(client: httpx.Client, documents: Sequence[dict[str, Any]]) -> list[st
     with ThreadPoolExecutor(_CLIENTS) as threads:
         responses = threads.map(lambda document: client.post("/floorplans", json=document), documents)
         return [response.raise_for_status().json()["id"] for response in responses]
-
-
-def pages(client: httpx.Client, venue_id: str) -> Iterator[dict[str, Any]]:
-    """Yield all plans of a venue, page by page."""
-    cursor = None
-    while True:
-        options = {"limit": _PAGE} | ({"cursor": cursor} if cursor else {})
-        page = client.get(f"/venues/{venue_id}/plans", params=options).raise_for_status().json()
-        yield from page["plans"]
-        cursor = page["next_cursor"]
-        if cursor is None:
-            return
 
 
 def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
@@ -104,7 +93,8 @@ def main() -> int:
         venue = wait_until_ready(client, venue_id)
         report["ready_s"] = round(time.perf_counter() - begin, 1)
         report["resident_mb"]["ready"] = resident_mb(service.process)
-        listed = [(plan["level"], plan["floorplan_id"]) for plan in pages(client, venue_id)]
+        with Client(service.url) as paging:
+            listed = [(plan.level, plan.floorplan_id) for plan in paging.venue_plans(venue_id, page_size=_PAGE)]
         report["queries"] = [_localise(client, venue_id, service.plan_id, pose) for pose in read_poses()]
         report["resident_mb"]["localised"] = resident_mb(service.process)
         report["state_check_ms"] = round(state_check_ms(service.data, venue_id), 1)

@@ -57,6 +57,6 @@ def _synth(arguments: argparse.Namespace) -> None:
 def _contact_sheet(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from lalaloc_core.learn.synth.rendering.contact_sheet import contact_sheet
+    from lalaloc_core.learn.synth.rendering.panorama import contact_sheet
 
     contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)

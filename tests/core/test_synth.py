@@ -21,8 +21,7 @@ from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNI
 from lalaloc_core.learn.synth.homes.plans import Home, generate_home
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN
 from lalaloc_core.learn.synth.homes.splits import home_of as home_of_split
-from lalaloc_core.learn.synth.rendering.contact_sheet import contact_sheet
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, contact_sheet, sample_shots
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
