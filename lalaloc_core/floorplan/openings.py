@@ -41,7 +41,6 @@ class Opening:
         kind: `door`, `window` or `passage` (an opening without a leaf).
         line_m: (2, 2) its two ends.
         sill_m, head_m: heights of its lower and upper edge over the floor; None if the plan does not give them.
-        name: name for users.
         rooms: ids of the rooms that it belongs to; None for all rooms whose wall it lies on.
     """
 
@@ -63,8 +62,6 @@ class OpeningFace:
     """The part of a room's wall that an opening occupies, with at most one room behind it.
 
     Attributes:
-        opening: index of the opening in the plan.
-        room: index of the room.
         wall: index of the wall in the room's `walls_m`.
         start, end: ends of the part, as shares of the wall's length.
         behind: index of the room behind, the room itself at a free-standing wall, -1 for none.

@@ -36,7 +36,6 @@ class Room:
     Attributes:
         name: name for users; names may repeat.
         polygon_m: (n, 2) outline, counter-clockwise, not closed (the last vertex joins the first).
-        ceiling_height_m: height over the floor.
         id: unique within its plan.
         type: one of `conventions.ROOM_TYPES`.
         holes_m: areas inside the outline that are no floor, such as columns and shafts: each (k, 2), clockwise, not

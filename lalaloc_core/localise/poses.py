@@ -271,10 +271,8 @@ class RefinementJob:
 
     Attributes:
         targets: (k, d) latents, or other embeddings for an optimiser with another embedding.
-        position_m: (k, 2) positions (m).
         heading: (k,) headings (radians) in the frame.
         walls_m: (k, n, 4) walls of each pose's room (m), padded.
-        camera_height_m, ceiling_height_m: (k,) heights (m).
         optimise_heading: whether the heading is refined as well.
         log_profile: (k, w) centres of the predicted log wall profiles (m); None compares latents alone.
         precision: (k, w) factors that turn differences of log distance into residuals.

@@ -64,11 +64,10 @@ class PanoramaLimits:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Panorama:
-    """A panorama as the image encoder expects it: the full sphere, level.
+    """The full sphere, level, as the image encoder expects it.
 
-    Attributes:
-        pixels: (h, w, 3) RGB.
-        compass_heading: azimuth of the centre column, radians clockwise from true north; None if not in the metadata.
+    `compass_heading` is the azimuth of the centre column, radians clockwise from true north; None if not in the
+    metadata.
     """
 
     pixels: UInt8[np.ndarray, "h w 3"]

@@ -16,10 +16,8 @@ _ROWS = 64
 def level(pixels: UInt8[np.ndarray, "h w 3"], *, pitch: float, roll: float) -> UInt8[np.ndarray, "h w 3"]:
     """Resample a panorama as taken by a level camera with the same heading; bilinear, across seam and poles.
 
-    Args:
-        pixels: (h, w, 3) the panorama.
-        pitch: elevation of the picture's centre, radians above the horizon.
-        roll: rotation of the camera about that direction, radians clockwise.
+    `pitch` is the elevation of the picture's centre, radians above the horizon; `roll` the rotation of the camera about
+    that direction, radians clockwise.
     """
     height, width = pixels.shape[:2]
     axes = camera_axes(pitch=pitch, roll=roll)

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.synth.camera.develop import develop
+from lalaloc_core.learn.synth.camera.develop import develop, lens_gain, tilt
 from lalaloc_core.learn.synth.camera.exposure import Exposure, sample_exposure, sample_staged_exposure
 from lalaloc_core.learn.synth.camera.jpeg import compress
-from lalaloc_core.learn.synth.camera.lens import lens_gain, tilt
 from lalaloc_core.learn.synth.camera.patches import cover_poles
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots

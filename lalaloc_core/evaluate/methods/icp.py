@@ -38,7 +38,6 @@ class IcpConfig:
         plan_cell_m: the same for the plan's cloud. Cells as coarse as the scan's pull points along their own wall,
             which costs most of a centimetre.
         still_m, still_iterations: an alignment converges after this many successive updates of less than `still_m`.
-        spacing_m: distance between points along walls before merging.
         columns: rays of the scan of a layout query.
     """
 

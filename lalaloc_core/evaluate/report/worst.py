@@ -59,8 +59,6 @@ class WorstQuery:
     """One of the worst queries.
 
     Attributes:
-        found_room: name of the final pose's room; None without an answer.
-        error_m: position error; None without an answer.
         first_error_m: position error after the first stage.
         facts: known difficulties of the photograph.
         symmetric: whether the pose fits the mirrored room; see `failures.is_symmetric`.

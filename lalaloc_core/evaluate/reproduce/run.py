@@ -42,7 +42,6 @@ class TableMaker:
         budget: size of networks and schedule of the trained variants.
         shipped: bundle of the rows of the shipped model.
         limit: queries per row; None for the budget's default.
-        command: command recorded in the tables.
     """
 
     data: Path

@@ -65,10 +65,8 @@ class Prediction:
         room_rank: rank of the best candidate in the true room, from 1; None without one.
         signals: inputs of the confidence model by stage; see `localise.confidence`.
         information: curvature of the cost at the final pose, by x and y (m) and, if searched, heading (radians).
-        candidates: candidate poses, best first, if the method ranks any.
         confidence: predicted probability of a position error below 1 m.
         heading_confidence: predicted probability of a heading error below 5°.
-        found_height_m: the estimated camera height, if the method estimates it.
         facts: known difficulties of the photograph, in alphabetical order; see `learn.data.dataset.Described`.
     """
 
@@ -110,10 +108,7 @@ class RunInfo:
         data_format: one of `DATASET_FORMATS`; None to detect it.
         generated: arguments of the generator if `data` is None.
         furniture, lighting: appearance of the photographs; None if the data set has no such choice.
-        limit: maximum number of queries; None for all.
         bundle: folder of the model; None for methods without one.
-        skip_bad: whether unusable scenes and cameras are skipped instead of ending the run.
-        command: the command that repeats the run.
         skipped: skipped scenes and cameras, with reasons.
     """
 

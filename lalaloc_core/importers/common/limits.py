@@ -17,14 +17,11 @@ class ImportLimits:
     """Limits on a plan file; larger files are refused with the value and the limit.
 
     Attributes:
-        max_plan_bytes: size of the file.
         max_unpacked_bytes: total size of the files in an archive, after decompression.
-        max_archive_files: number of files in an archive.
         max_entities: number of lines, polygons, texts and blocks, plus their vertices.
         max_depth: nesting depth of elements, blocks and objects.
         max_plan_pixels: pixels of a picture, or of a page that is rendered.
         max_import_s: duration of an import. It is checked between entities, so a library call can exceed it.
-        plan: limits of the resulting plan.
     """
 
     max_plan_bytes: int = 50_000_000

@@ -29,7 +29,6 @@ class GapContent:
 
     Attributes:
         kind: "swing" for the arc of a door, "pane" for two or more lines along the wall, "line" for a single line.
-        confidence: 0 to 1.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
     """
 

@@ -77,9 +77,7 @@ class Camera:
     Attributes:
         name: unique within its scene.
         position_m: (x, y) in the plan frame.
-        room_index: room of the plan that contains the position.
         heading: azimuth of the photographs' centre column, radians.
-        camera_height_m: above the floor.
         photographs: by appearance of the room.
     """
 

@@ -21,7 +21,6 @@ class Surface:
         size_m: of one repeat.
         turn: of the pattern in the plane, radians.
         gloss: share of light reflected as by a mirror, straight on.
-        glow: light given off.
         skirting: colour below 8 cm (None: none).
     """
 

@@ -159,13 +159,10 @@ class TrainConfig:
     """All settings of a training run except its data.
 
     Attributes:
-        name: of the run.
         architecture: `ring`, `trunk`, or the networks of the `paper`.
-        seed: of all random draws.
         turns: headings of training layouts and panoramas: "any" and "quarters" (multiples of 90°) with random
             mirroring, or "none", heading 0 only, which suffices for queries with known heading.
         ring, trunk, paper: sizes of the networks; an architecture ignores the sizes of others.
-        layout, image: settings of the stages.
     """
 
     name: str

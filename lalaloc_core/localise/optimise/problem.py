@@ -42,7 +42,6 @@ class LpoConfig:
     """Settings of both optimisers.
 
     Attributes:
-        method: the optimiser.
         margin_m: smallest distance of poses to walls, so that none crosses one.
         max_iterations: maximum number of Levenberg-Marquardt evaluations, including the first at the start.
         profile_iterations: the same for wall profiles; more steps would follow errors of the prediction.

@@ -48,8 +48,6 @@ class PlanIndex:
 
     Attributes:
         rows: records of type `prototypes.ROW` that include the plans' prototypes; can be a memory-mapped file.
-        step_m: step of the pose grids of the prototypes.
-        cells: coarse quantiser.
         plan_count: number of plans, p.
         row: (u,) number in `rows` of each distinct prototype, ordered by cell.
         owner: (n,) plans that own the distinct prototypes, grouped by prototype.

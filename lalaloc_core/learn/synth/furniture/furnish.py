@@ -42,9 +42,7 @@ class Prism(NamedTuple):
         axis_x, axis_y: unit vector of its first axis; the second is the first turned by +90°.
         half_a, half_b: half extents along the two axes, metres.
         z0, z1: lower and upper end above the floor, metres.
-        finish: its material.
         piece: number of its piece of furniture.
-        is_round: true for a cylinder.
         label: label of the piece, see `pieces`.
     """
 

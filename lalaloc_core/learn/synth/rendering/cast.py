@@ -44,7 +44,6 @@ class Hits:
         surface: row of the scene's surfaces.
         slot: its room (0 for all furniture seen through the own room).
         normal: unit normal, facing the camera.
-        furniture: true for a prism.
         gap_m: distance in the column's plane to the next piece of furniture behind the hit that stands on the floor,
             inf if there is none; for contact shadows.
         wall_gap_m: on floors and ceilings, distance to the wall at the end of the column; large elsewhere.

@@ -25,12 +25,7 @@ _ANGLE_SHARES = (0.15, 0.4, 0.15, 0.3)
 
 
 class Leaf(NamedTuple):
-    """A leaf of an open door in the plan frame.
-
-    Attributes:
-        axis: unit vector from the hinge to the handle.
-        in_own_room: true if it stands in the room of the opening.
-    """
+    """A leaf of an open door in the plan frame; `axis` points from the hinge to the handle."""
 
     centre_m: Float[np.ndarray, "2"]
     axis: Float[np.ndarray, "2"]

@@ -63,8 +63,6 @@ class Prisms(Records):
         axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is the first turned by +90°.
         half_a_m, half_b_m: half extents along the two axes.
         z0_m, z1_m: lower and upper end above the floor.
-        is_round: 1 for a cylinder.
-        surface: row of the surfaces.
         is_opaque: 1 for prisms that cast shadows.
     """
 
