@@ -7,6 +7,7 @@ in `type`, `kind`, `category` and `class`. By default a polygon is a room and a 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
