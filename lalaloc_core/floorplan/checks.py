@@ -48,8 +48,7 @@ def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
 def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ...]:
     """Return a warning for each of the first twenty pairs of rooms that overlap, within a bounded amount of work."""
     shapes = [room.shape for room in rooms]
-    first, second = shapely.STRtree(shapes).query(shapes)
-    pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
+    pairs = _near_pairs(shapes)
     crossings = _Crossings(rooms)
     warnings: list[str] = []
     work, is_complete = 0, len(pairs) <= _MAX_PAIRS
@@ -70,6 +69,17 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
     if not is_complete:
         warnings.append("more rooms may overlap; the remaining pairs were not checked")
     return tuple(warnings)
+
+
+def _near_pairs(shapes: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
+    """Return the pairs of rooms whose bounding boxes meet, in order, and none after the first `_MAX_PAIRS + 1`."""
+    tree = shapely.STRtree(shapes)
+    pairs: list[tuple[int, int]] = []
+    for number, shape in enumerate(shapes):
+        pairs += [(number, other) for other in np.sort(tree.query(shape)).tolist() if other > number]
+        if len(pairs) > _MAX_PAIRS:
+            break
+    return pairs[: _MAX_PAIRS + 1]
 
 
 class _Crossings:

@@ -24,6 +24,9 @@ class PlanLimits:
     # Opening faces on the walls of one room, and walls that one opening can lie on.
     max_openings_per_room: int = 100
     max_walls_per_opening: int = 32
+    # Opening faces on all walls, and comparisons of an opening with a wall near it.
+    max_opening_faces: int = 200_000
+    max_opening_pairs: int = 3_000_000
     max_extent_m: float = 1000.0
     max_area_m2: float = 200_000.0
     # Sum of the bounding boxes of the rooms, which the pose grid is computed over.
@@ -49,6 +52,8 @@ NO_LIMITS = PlanLimits(
     max_openings=10**9,
     max_openings_per_room=10**9,
     max_walls_per_opening=10**9,
+    max_opening_faces=10**9,
+    max_opening_pairs=10**12,
     max_extent_m=math.inf,
     max_area_m2=math.inf,
     max_bounds_area_m2=math.inf,

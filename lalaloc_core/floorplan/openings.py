@@ -7,14 +7,15 @@ a room lie behind each other, only the nearest gets the opening.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -31,6 +32,10 @@ _MIN_PIECE_M = 0.1
 # Openings that share less than this of a wall touch.
 TOUCHING_M = 0.01
 _ROUNDING_M = 1e-6
+# Longest piece of an opening that is compared with walls by its bounding box, unless it would have too many pieces.
+_PIECE_M, _MAX_PIECES = 8.0, 16
+# Openings that are compared at once.
+_BATCH = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +111,31 @@ class _Walls:
         self.start, self.edge = ends[:, :2], ends[:, 2:] - ends[:, :2]
         self.length_m = np.hypot(*self.edge.T)
         self._first = np.concatenate([[0], np.cumsum(counts)])
-        self._tree = shapely.STRtree([shapely.LineString(wall) for wall in ends.reshape(-1, 2, 2)])
+        self._tree = shapely.STRtree(np.asarray(shapely.linestrings(ends.reshape(-1, 2, 2))))
 
-    def near(self, line_m: Float[np.ndarray, "2 2"], tolerance_m: float) -> np.ndarray:
-        """Return the indices of walls whose bounding boxes are near a line."""
-        low, high = line_m.min(axis=0) - tolerance_m, line_m.max(axis=0) + tolerance_m
-        return np.sort(self._tree.query(shapely.box(*low, *high)))
+    def near(
+        self, line_m: Float[np.ndarray, "k 2 2"], tolerance_m: float
+    ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], int]:
+        """Return the sorted pairs (line, wall) whose bounding boxes are near each other, and the number of comparisons.
 
-    def shares(self, room: int, wall: int, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Project points onto a wall; return shares of its length, clipped to 0 and 1."""
+        Long lines are cut first, because the bounding box of a diagonal has walls that are far from it.
+        """
+        along = line_m[:, 1] - line_m[:, 0]
+        pieces = np.clip(np.ceil(np.hypot(*along.T) / _PIECE_M), 1, _MAX_PIECES).astype(int)
+        line = np.repeat(np.arange(len(line_m)), pieces)
+        number = np.arange(len(line)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        begin, end = (line_m[line, 0] + ((number + k) / pieces[line])[:, None] * along[line] for k in (0, 1))
+        low, high = np.minimum(begin, end) - tolerance_m, np.maximum(begin, end) + tolerance_m
+        piece, wall = self._tree.query(shapely.box(*low.T, *high.T))
+        pairs = np.unique(line[piece] * len(self.room) + wall)
+        return *np.divmod(pairs, len(self.room)), len(line) + len(wall)
+
+    def shares(self, room: int, wall: int, ends_m: Sequence[tuple[float, float]]) -> list[float]:
+        """Project points onto a wall; return shares of its length, ascending and clipped to 0 and 1."""
         index = self._first[room] + wall
-        along = (points_m - self.start[index]) @ self.edge[index] / self.length_m[index] ** 2
-        return np.clip(along, 0.0, 1.0)
+        (x, y), (dx, dy) = self.start[index].tolist(), self.edge[index].tolist()
+        squared = float(self.length_m[index]) ** 2
+        return sorted(min(max(((px - x) * dx + (py - y) * dy) / squared, 0.0), 1.0) for px, py in ends_m)
 
 
 def place_openings(
@@ -136,24 +154,17 @@ def place_openings(
     if not openings:
         return (), ()
     walls = _Walls(rooms)
-    by_id: dict[str, list[int]] = {}
-    for number, room in enumerate(rooms):
-        by_id.setdefault(room.id, []).append(number)
     faces: list[OpeningFace] = []
     lost = []
-    for index, opening in enumerate(openings):
-        contacts = _contacts(index, opening, by_id, walls, tolerance_m, limits)
-        found = [face for contact in contacts for face in _faces(index, opening, contact, contacts, walls)]
+    in_room = Counter[int]()
+    for index, contacts in enumerate(_all_contacts(openings, rooms, walls, tolerance_m, limits)):
+        found = [face for contact in contacts for face in _faces(index, openings[index], contact, contacts, walls)]
         faces += found
         if not found:
             lost.append(index)
-    for room, count in Counter(face.room for face in faces).items():
-        if count > limits.max_openings_per_room:
-            raise InvalidFloorPlanError(
-                f"{count} openings on its walls; the limit is {limits.max_openings_per_room} "
-                "(PlanLimits.max_openings_per_room)",
-                room=rooms[room].name,
-            )
+        in_room.update(face.room for face in found)
+        # Checked at every opening, because overlapping rooms can cut openings into thousands of faces.
+        _check_counts(in_room, {face.room for face in found}, len(faces), rooms, limits)
     _check_overlaps(openings, faces, rooms)
     return tuple(faces), tuple(lost)
 
@@ -163,51 +174,105 @@ def label(opening: Opening, index: int) -> str:
     return f"opening {index} ({opening.kind}{f' {opening.name!r}' if opening.name else ''})"
 
 
-def _contacts(
-    index: int, opening: Opening, by_id: dict[str, list[int]], walls: _Walls, tolerance_m: float, limits: PlanLimits
-) -> list[_Contact]:
-    """Return the walls that an opening lies on; at each point of the opening only the nearest wall of a room."""
-    start = opening.line_m[0]
-    along = opening.line_m[1] - start
-    length_m = float(np.hypot(*along))
-    direction = along / length_m
-    near = walls.near(opening.line_m, tolerance_m)
-    if opening.rooms is not None:
-        near = near[np.isin(walls.room[near], [room for name in opening.rooms for room in by_id.get(name, [])])]
-    near = near[np.abs(walls.edge[near] @ direction) >= _MIN_COSINE * walls.length_m[near]]
-    first = walls.start[near] - start
-    ends = np.stack([first, first + walls.edge[near]], axis=1)
-    along_m = ends @ direction
-    aside_m = ends[..., 0] * direction[1] - ends[..., 1] * direction[0]
+def _check_counts(
+    in_room: Counter[int], changed: set[int], faces: int, rooms: Sequence[Room], limits: PlanLimits
+) -> None:
+    for room in changed:
+        if in_room[room] > limits.max_openings_per_room:
+            raise InvalidFloorPlanError(
+                f"{in_room[room]} openings on its walls; the limit is {limits.max_openings_per_room} "
+                "(PlanLimits.max_openings_per_room)",
+                room=rooms[room].name,
+            )
+    if faces > limits.max_opening_faces:
+        raise InvalidFloorPlanError(
+            f"the openings cover more than {limits.max_opening_faces} parts of walls, the limit "
+            "(PlanLimits.max_opening_faces); remove rooms and openings that lie on each other"
+        )
+
+
+def _all_contacts(
+    openings: Sequence[Opening], rooms: Sequence[Room], walls: _Walls, tolerance_m: float, limits: PlanLimits
+) -> Iterator[list[_Contact]]:
+    """Yield the walls that each opening lies on, in batches that bound the memory."""
+    by_id: dict[str, list[int]] = {}
+    for number, room in enumerate(rooms):
+        by_id.setdefault(room.id, []).append(number)
+    compared = 0
+    for first in range(0, len(openings), _BATCH):
+        batch = openings[first : first + _BATCH]
+        line_m = np.stack([opening.line_m for opening in batch])
+        line, wall, comparisons = walls.near(line_m, tolerance_m)
+        compared += comparisons
+        if compared > limits.max_opening_pairs:
+            raise InvalidFloorPlanError(
+                f"the openings are near more than {limits.max_opening_pairs} walls in total, the limit "
+                "(PlanLimits.max_opening_pairs); remove long openings, and rooms that lie on each other"
+            )
+        on_wall = _on_walls(line_m, line, wall, walls, tolerance_m)
+        for number, opening in enumerate(batch):
+            contacts = on_wall.get(number, [])
+            if opening.rooms is not None:
+                own = {room for name in opening.rooms for room in by_id.get(name, ())}
+                contacts = [contact for contact in contacts if contact.room in own]
+            if len(contacts) > limits.max_walls_per_opening:
+                raise InvalidFloorPlanError(
+                    f"{label(opening, first + number)} lies on {len(contacts)} walls; the limit is "
+                    f"{limits.max_walls_per_opening} (PlanLimits.max_walls_per_opening)"
+                )
+            yield _nearest(contacts, float(np.hypot(*(line_m[number, 1] - line_m[number, 0]))))
+
+
+def _on_walls(
+    line_m: Float[np.ndarray, "k 2 2"],
+    line: Int[np.ndarray, "n"],
+    wall: Int[np.ndarray, "n"],
+    walls: _Walls,
+    tolerance_m: float,
+) -> dict[int, list[_Contact]]:
+    """Return the contacts of pairs (line, wall) that lie on each other, by line, in the order of the walls."""
+    vector = line_m[:, 1] - line_m[:, 0]
+    lengths_m = np.hypot(*vector.T)
+    direction = vector / lengths_m[:, None]
+    parallel = np.abs((walls.edge[wall] * direction[line]).sum(axis=1)) >= _MIN_COSINE * walls.length_m[wall]
+    line, wall = line[parallel], wall[parallel]
+    length_m, along = lengths_m[line], direction[line]
+    first = walls.start[wall] - line_m[line, 0]
+    ends = np.stack([first, first + walls.edge[wall]], axis=1)
+    along_m = (ends * along[:, None]).sum(axis=2)
+    aside_m = ends[..., 0] * along[:, 1:] - ends[..., 1] * along[:, :1]
     low, high = np.clip(along_m.min(axis=1), 0.0, length_m), np.clip(along_m.max(axis=1), 0.0, length_m)
     # Distance of the wall at both ends of its overlap with the opening.
     slope = np.divide(aside_m[:, 1] - aside_m[:, 0], along_m[:, 1] - along_m[:, 0])
-    off_m = aside_m[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - along_m[:, :1])
-    least_m = min(_MIN_PIECE_M, 0.5 * length_m)
-    on = (np.abs(off_m).max(axis=1) <= tolerance_m + _ROUNDING_M) & (high - low >= least_m)
-    if on.sum() > limits.max_walls_per_opening:
-        raise InvalidFloorPlanError(
-            f"{label(opening, index)} lies on {on.sum()} walls; the limit is {limits.max_walls_per_opening} "
-            "(PlanLimits.max_walls_per_opening)"
-        )
-    away_m = np.abs(off_m).mean(axis=1)
-    contacts: list[_Contact] = []
-    for k in np.flatnonzero(on)[np.argsort(away_m[on], kind="stable")]:
-        wall = near[k]
-        # A room lies to the left of its walls.
-        side = 0 if walls.is_free_standing[wall] else int(np.sign(walls.edge[wall] @ direction))
-        contact = _Contact(
-            int(walls.room[wall]),
-            int(walls.number[wall]),
-            float(low[k] / length_m),
-            float(high[k] / length_m),
-            float(away_m[k]),
-            side,
-        )
-        shared_m = [_shared(contact, other) * length_m for other in contacts if other.room == contact.room]
+    off_m = np.abs(aside_m[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - along_m[:, :1]))
+    least_m = np.minimum(_MIN_PIECE_M, 0.5 * length_m)
+    on = np.flatnonzero((off_m.max(axis=1) <= tolerance_m + _ROUNDING_M) & (high - low >= least_m))
+    # A room lies to the left of its walls.
+    side = np.sign((walls.edge[wall[on]] * along[on]).sum(axis=1)).astype(int)
+    side[walls.is_free_standing[wall[on]]] = 0
+    columns = (
+        line[on],
+        walls.room[wall[on]],
+        walls.number[wall[on]],
+        low[on] / length_m[on],
+        high[on] / length_m[on],
+        off_m[on].mean(axis=1),
+        side,
+    )
+    found: dict[int, list[_Contact]] = {}
+    for number, *values in zip(*(column.tolist() for column in columns), strict=True):
+        found.setdefault(number, []).append(_Contact(*values))
+    return found
+
+
+def _nearest(contacts: Sequence[_Contact], length_m: float) -> list[_Contact]:
+    """Keep only the nearest wall of a room at each point of an opening."""
+    kept: list[_Contact] = []
+    for contact in sorted(contacts, key=lambda contact: contact.away_m):
+        shared_m = [_shared(contact, other) * length_m for other in kept if other.room == contact.room]
         if max(shared_m, default=0.0) <= TOUCHING_M:
-            contacts.append(contact)
-    return sorted(contacts, key=lambda contact: (contact.room, contact.wall))
+            kept.append(contact)
+    return sorted(kept, key=lambda contact: (contact.room, contact.wall))
 
 
 def _shared(first: _Contact, second: _Contact) -> float:
@@ -218,32 +283,22 @@ def _faces(
     index: int, opening: Opening, contact: _Contact, contacts: Sequence[_Contact], walls: _Walls
 ) -> list[OpeningFace]:
     """Split a contact wherever the room behind changes."""
-    start, along = opening.line_m[0], opening.line_m[1] - opening.line_m[0]
+    (x, y), (x1, y1) = opening.line_m.tolist()
     beyond = [contact] if contact.side == 0 else [other for other in contacts if other.side == -contact.side]
-    least = TOUCHING_M / float(np.hypot(*along))
+    least = TOUCHING_M / math.hypot(x1 - x, y1 - y)
     ends_beyond = {end for other in beyond for end in (other.low, other.high)}
     cuts = {end for end in ends_beyond if contact.low + least < end < contact.high - least}
     faces = []
     for low, high in pairwise(sorted({contact.low, contact.high, *cuts})):
-        ends = start + np.array([[low], [high]]) * along
-        own = sorted(walls.shares(contact.room, contact.wall, ends).tolist())
+        ends = [(x + share * (x1 - x), y + share * (y1 - y)) for share in (low, high)]
+        own = walls.shares(contact.room, contact.wall, ends)
         middle = 0.5 * (low + high)
         behind = [other for other in beyond if other.low <= middle <= other.high]
         face = OpeningFace(opening=index, room=contact.room, wall=contact.wall, start=own[0], end=own[1])
         if behind:
             other = min(behind, key=lambda contact: contact.away_m)
-            leaving = sorted(walls.shares(other.room, other.wall, ends).tolist())
-            face = OpeningFace(
-                opening=index,
-                room=contact.room,
-                wall=contact.wall,
-                start=own[0],
-                end=own[1],
-                behind=other.room,
-                exit_wall=other.wall,
-                exit_start=leaving[0],
-                exit_end=leaving[1],
-            )
+            leaving = walls.shares(other.room, other.wall, ends)
+            face = replace(face, behind=other.room, exit_wall=other.wall, exit_start=leaving[0], exit_end=leaving[1])
         faces.append(face)
     return faces
 
@@ -256,21 +311,33 @@ def _check_overlaps(openings: Sequence[Opening], faces: Sequence[OpeningFace], r
     for (room, wall), group in on_wall.items():
         length_m = float(np.hypot(*(rooms[room].walls_m[wall, 2:] - rooms[room].walls_m[wall, :2])))
         group.sort(key=lambda face: face.start)
-        for k, face in enumerate(group):
-            for other in group[k + 1 :]:
-                if (min(face.end, other.end) - other.start) * length_m <= TOUCHING_M:
-                    break
-                first, second = openings[face.opening], openings[other.opening]
-                if face.opening != other.opening and not _stacked(first, second):
-                    raise InvalidFloorPlanError(
-                        f"{label(first, face.opening)} and {label(second, other.opening)} overlap; move one, or give "
-                        "both sill_m and head_m if one is above the other",
-                        room=rooms[room].name,
-                    )
+        pair = _first_overlap([openings[face.opening] for face in group], group, length_m)
+        if pair is not None:
+            first, second = (group[k].opening for k in pair)
+            raise InvalidFloorPlanError(
+                f"{label(openings[first], first)} and {label(openings[second], second)} overlap; move one, or give "
+                "both sill_m and head_m if one is above the other",
+                room=rooms[room].name,
+            )
 
 
-def _stacked(first: Opening, second: Opening) -> bool:
-    return is_above(first.sill_m, second.head_m) or is_above(second.sill_m, first.head_m)
+def _first_overlap(
+    openings: Sequence[Opening], faces: Sequence[OpeningFace], length_m: float
+) -> tuple[int, int] | None:
+    """Return the first two faces on a wall, sorted by start, whose openings overlap; None without any."""
+    if len(faces) < 2:
+        return None
+    start, end = np.array([(face.start, face.end) for face in faces]).T
+    number = np.array([face.opening for face in faces])
+    sill_m, head_m = np.array([(opening.sill_m, opening.head_m) for opening in openings], float).T
+    later = np.triu(np.ones((len(faces), len(faces)), bool), 1)
+    shared = (np.minimum(end[:, None], end) - start) * length_m > TOUCHING_M
+    # Faces after the first one that only touches are not compared.
+    near = np.logical_and.accumulate(shared | ~later, axis=1) & later
+    # Unknown heights are NaN, which is above nothing.
+    stacked = (sill_m[:, None] >= head_m) | (sill_m >= head_m[:, None])
+    pairs = np.argwhere(near & ~stacked & (number[:, None] != number))
+    return (int(pairs[0, 0]), int(pairs[0, 1])) if len(pairs) else None
 
 
 def is_above(sill_m: float | None, head_m: float | None) -> bool:

@@ -163,6 +163,8 @@ def test_too_many_openings_are_refused() -> None:
     windows = [{"kind": "window", "line": [[0.0, 0.5 * k], [0.0, 0.5 * k + 0.4]]} for k in range(6)]
     message = refused(FloorPlan.from_dict, ROOMS | {"openings": windows}, PlanLimits(max_openings_per_room=5))
     assert "room 'room 1': 6 openings on its walls; the limit is 5" in message
+    message = refused(FloorPlan.from_dict, ROOMS | {"openings": windows}, PlanLimits(max_opening_faces=5))
+    assert "the openings cover more than 5 parts of walls, the limit (PlanLimits.max_opening_faces)" in message
 
 
 def test_opening_along_many_walls_is_refused() -> None:

@@ -41,6 +41,61 @@ def slivers(count: int) -> dict[str, Any]:
     return plan_document(*[[[k, 0], [k + 200, 200], [k + 200.05, 200], [k + 0.05, 0]] for k in range(count)])
 
 
+@pytest.fixture
+def compared(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return the number of pairs that each query of a spatial index finds."""
+    found: list[int] = []
+
+    class CountingTree(shapely.STRtree):
+        def query(self, *arguments: Any, **options: Any) -> np.ndarray:
+            pairs = super().query(*arguments, **options)
+            found.append(pairs.shape[-1])
+            return pairs
+
+    monkeypatch.setattr(shapely, "STRtree", CountingTree)
+    return found
+
+
+def rows_of_rooms(rooms: int) -> dict[str, Any]:
+    """Return rooms of 3 m in rows of 16, each with a door to the next."""
+    places = [(3.0 * (k % 16), 3.0 * (k // 16)) for k in range(rooms)]
+    document = plan_document(*[rectangle(2.9, 2.9, at=place) for place in places])
+    document["openings"] = [{"kind": "door", "line": [[x + 2.95, y + 1.0], [x + 2.95, y + 1.9]]} for x, y in places]
+    return document
+
+
+def lie_on_each_other(rooms: int) -> dict[str, Any]:
+    return plan_document(*[rectangle(4.0, 4.0, at=(1e-4 * k, 0.0)) for k in range(rooms)])
+
+
+@pytest.mark.parametrize("shape", [rows_of_rooms, lie_on_each_other])
+def test_comparisons_grow_linearly(shape: Any, compared: list[int]) -> None:
+    counts = []
+    for rooms in (256, 512):
+        compared.clear()
+        FloorPlan.from_dict(shape(rooms))
+        counts.append(sum(compared))
+    assert 0 < counts[1] <= 2.1 * counts[0]
+
+
+@pytest.mark.parametrize("rooms", [256, 512, 1024])
+def test_comparisons_of_long_openings_are_limited(rooms: int, compared: list[int]) -> None:
+    document = rows_of_rooms(rooms)
+    document["openings"] = [{"kind": "door", "line": [[0.01 * k, 0], [48, 3 * rooms / 16]]} for k in range(2 * rooms)]
+    with pytest.raises(InvalidFloorPlanError, match=r"near more than 20000 walls in total, the limit \(PlanLimits\."):
+        FloorPlan.from_dict(document, PlanLimits(max_opening_pairs=20_000))
+    # Openings are compared in small batches.
+    assert sum(compared) < 40_000
+
+
+def test_long_opening_is_compared_with_the_walls_along_it(compared: list[int]) -> None:
+    document = rows_of_rooms(256)
+    document["openings"] = [{"kind": "passage", "line": [[0, 0], [48, 48]]}, document["openings"][0]]
+    FloorPlan.from_dict(document)
+    # The walls of all 256 rooms lie in the box of the diagonal.
+    assert max(compared) < 256
+
+
 def test_crossing_combs_stay_within_the_work_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Check that the total size of intersected pairs is limited, independent of the number of rooms."""
     intersected = []
