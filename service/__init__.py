@@ -12,12 +12,13 @@ storage/    database: plans, pose grids, keys, kept answers
 pools/      pools of worker processes
 workers/    programs of the worker processes
 telemetry/  metrics, logs and traces
-preview/    drawings and meshes of plans
+renditions/ files made from plans
 conversion/ plan files, read and written in worker processes
 on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
 Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP),
-`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`, and the
+`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`, `stored_plan.py`,
+and the
 command lines `cli.py`, `openapi.py`, `__main__.py`.
 """

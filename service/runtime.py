@@ -15,12 +15,11 @@ from lalaloc_core import __version__
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from service.conversion import Converter
+from service.conversion import Converter, RenditionCache
 from service.fair_share import with_headroom
 from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
-from service.preview import Drawings
 from service.query import (
     Decoder,
     Localiser,
@@ -45,8 +44,8 @@ _READ_THREADS = 4
 _UPLOAD_THREADS = with_headroom(2)
 # Limit of the poses that a venue query searches, because it copies them. A single plan can have more.
 _VENUE_POSES = 40_000
-# Memory limit of drawings, and limit of the revisions that wait to be drawn.
-_DRAWINGS_BYTES, _MAX_WAITING_DRAWINGS = 32 * 2**20, 16
+# Limit of the files of stored plans that are made or wait.
+_MAX_PENDING_RENDITIONS = 16
 # Age up to which a plan in memory is used while the database is away.
 _PLAN_CACHE_AGE_S = 600.0
 # Timeout of an event stream; the client then reconnects.
@@ -72,7 +71,7 @@ class Runtime:
         uploads: threads that check, prepare and store plans.
         file_uploads: threads for uploads that wait for the converter.
         reads: store reads of queries.
-        drawings: drawings and meshes of plans.
+        renditions: files made from stored plans.
     """
 
     settings: Settings
@@ -91,7 +90,7 @@ class Runtime:
     uploads: Threads
     file_uploads: Threads
     reads: BoundedReads
-    drawings: Drawings
+    renditions: RenditionCache
 
     @property
     def ready(self) -> bool:
@@ -167,6 +166,13 @@ def start_runtime(
         localisers = localiser, venue_localiser
     else:
         localisers = backends.localisers(localiser.model, settings, telemetry)
+    renditions = RenditionCache(
+        store.plans,
+        converter,
+        step_m=settings.grids.grid_step_m,
+        limit_bytes=settings.storage.plan_cache_bytes,
+        max_pending=_MAX_PENDING_RENDITIONS,
+    )
     _log_start(bundle, grids, telemetry)
     return Runtime(
         settings=settings,
@@ -185,7 +191,7 @@ def start_runtime(
         uploads=uploads,
         file_uploads=file_uploads,
         reads=components.reads,
-        drawings=_closing(cleanup, Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_WAITING_DRAWINGS)),
+        renditions=_closing(cleanup, renditions),
     )
 
 

@@ -272,7 +272,8 @@ class StorageSettings(SettingGroup):
     plan_cache_bytes: int = Field(
         default=64 * 2**20,
         ge=0,
-        description="Floor plans kept in memory, for speed and for queries while the database is down. 0: none.",
+        description="Floor plans kept in memory, for speed and for queries while the database is down; as much again "
+        "for their descriptions, walls, drawings, meshes and exports. 0: none.",
     )
     grid_cache_bytes: int = Field(default=2**30, ge=0, description="Pose grids kept in memory.")
     venue_cache_bytes: int = Field(

@@ -84,10 +84,13 @@ FORBIDDEN = {
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
     "fair_share",
+    "cores settings setting_groups setting_types errors problem_kinds schemas stored_plan threads bounded_cache "
+    "telemetry",
+    "renditions",
     # `workers` runs in worker processes and does not import their supervisors.
-    "cores settings setting_groups setting_types errors problem_kinds schemas threads bounded_cache telemetry workers",
+    "workers",
     "pools storage",
-    "grids preview security conversion",
+    "grids security conversion",
     "http",
     "query http.middleware",
     "runtime",

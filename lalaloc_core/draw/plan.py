@@ -13,6 +13,9 @@ from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, Box, xml_text
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.floorplan.rooms import interior_point
 
+# (x_min, y_min, x_max, y_max) of a plan.
+Bounds = tuple[float, float, float, float]
+
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
 # Colours of the line on the wall, and of the gap through it.
@@ -21,7 +24,7 @@ _GAP_COLOURS = {"door": "#f6dfc6", "window": "#cde6fb", "passage": "#ffffff"}
 # Thickness of drawn walls outside each floor; walls between rooms meet.
 _WALL_M = 0.12
 # Placeholder for a heat map in the result of `draw_rooms`.
-_HEAT_PLACE = "<!--heat-->"
+HEAT_PLACE = "<!--heat-->"
 # Largest length of the scale bar, as a share of the drawing's width.
 _BAR_SHARE = 0.2
 # Radius, in standard deviations, that holds 95 % of a 2-D normal distribution: sqrt(-2 log 0.05).
@@ -46,18 +49,21 @@ def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None
     The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
     is drawn at (x, -y). `rooms` is a cached result of `draw_rooms` for the plan.
     """
-    left, top, width, height = _view_box(plan, [] if marker is None else [(marker.x_m, marker.y_m)])
+    head, tail = svg_around(plan.name, plan.bounds_m, marker)
+    return head + (draw_rooms(plan) if rooms is None else rooms).replace(HEAT_PLACE, "") + tail
+
+
+def svg_around(name: str, bounds_m: Bounds, marker: Marker | None = None) -> tuple[str, str]:
+    """Return the parts of `plan_svg` before and after the rooms, for the name and the bounds of a plan."""
+    left, top, width, height = _view_box(bounds_m, [] if marker is None else [(marker.x_m, marker.y_m)])
     scale = 1000.0 / max(width, height)
-    lines = [
+    head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * scale:.0f}" height="{height * scale:.0f}" '
-        f'viewBox="{left:.3f} {top:.3f} {width:.3f} {height:.3f}" font-family="{FONT_FAMILY}" text-anchor="middle">',
-        f"<title>{xml_text(plan.name)}</title>",
-        _rooms_and_scale(plan, rooms, ""),
-    ]
-    if marker is not None:
-        lines.append(draw_camera(marker, max(_size_m(plan))))
-    lines.append("</svg>\n")
-    return "\n".join(lines)
+        f'viewBox="{left:.3f} {top:.3f} {width:.3f} {height:.3f}" font-family="{FONT_FAMILY}" text-anchor="middle">\n'
+        f"<title>{xml_text(name)}</title>\n"
+    )
+    camera = "" if marker is None else f"\n{draw_camera(marker, max(_size_m(bounds_m)))}"
+    return head, f"{_scale_bar(bounds_m)}{camera}\n</svg>\n"
 
 
 def plan_part(
@@ -76,24 +82,25 @@ def plan_part(
     the plan.
     """
     x, y, box_width, box_height = box
-    left, top, width, height = _view_box(plan, seen_m)
+    left, top, width, height = _view_box(plan.bounds_m, seen_m)
     scale = min(box_width / width, box_height / height)
+    drawn = (draw_rooms(plan) if rooms is None else rooms).replace(HEAT_PLACE, heat)
     x, y = x + 0.5 * (box_width - scale * width), y + 0.5 * (box_height - scale * height)
     return (
         f'<g class="plan" transform="translate({x:.2f} {y:.2f}) scale({scale:.5f}) translate({-left:.4f} {-top:.4f})" '
-        f'text-anchor="middle">{_rooms_and_scale(plan, rooms, heat)}{over}</g>'
+        f'text-anchor="middle">{drawn}{_scale_bar(plan.bounds_m)}{over}</g>'
     )
 
 
 def shape_of(plan: FloorPlan, seen_m: Sequence[tuple[float, float]] = ()) -> float:
     """Return the aspect ratio (width / height) of a plan's drawing."""
-    _, _, width, height = _view_box(plan, seen_m)
+    _, _, width, height = _view_box(plan.bounds_m, seen_m)
     return width / height
 
 
 def extent_m(plan: FloorPlan) -> float:
     """Return the longer side (m) of a plan's drawing, which scales marks."""
-    return max(_size_m(plan))
+    return max(_size_m(plan.bounds_m))
 
 
 def floor_path(plan: FloorPlan) -> str:
@@ -104,7 +111,7 @@ def floor_path(plan: FloorPlan) -> str:
 
 def draw_rooms(plan: FloorPlan) -> str:
     """Draw outlines, openings, names and areas of all rooms: the slow part of a drawing, independent of cameras."""
-    extent = max(_size_m(plan))
+    extent = max(_size_m(plan.bounds_m))
     wall = 2.0 * max(_WALL_M, extent / 400.0)
     lines = [
         f'<path class="solid" d="{floor_path(plan)}" fill="none" stroke="{INK}" stroke-width="{wall:.4f}" '
@@ -112,7 +119,7 @@ def draw_rooms(plan: FloorPlan) -> str:
         f'<g stroke="{INK}" stroke-linejoin="round">',
         *(_outline(room, _FILLS[index % len(_FILLS)], extent) for index, room in enumerate(plan.rooms)),
         "</g>",
-        _HEAT_PLACE,
+        HEAT_PLACE,
         '<g class="openings">',
         *(_opening(plan, face, extent) for face in plan.opening_faces),
         "</g>",
@@ -142,25 +149,18 @@ def draw_camera(marker: Marker, extent: float) -> str:
     )
 
 
-def _rooms_and_scale(plan: FloorPlan, rooms: str | None, heat: str) -> str:
-    x_min, y_min, _, _ = plan.bounds_m
-    plan_width, plan_height = _size_m(plan)
-    drawn = (draw_rooms(plan) if rooms is None else rooms).replace(_HEAT_PLACE, heat)
-    return drawn + _scale_bar(x_min, y_min, plan_width, max(plan_width, plan_height))
-
-
-def _size_m(plan: FloorPlan) -> tuple[float, float]:
+def _size_m(bounds_m: Bounds) -> tuple[float, float]:
     """Return width and height of the drawing, margins included."""
-    x_min, y_min, x_max, y_max = plan.bounds_m
+    x_min, y_min, x_max, y_max = bounds_m
     width, height = x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 2 * _MARGIN_M
     # The scale bar with its label is below the plan and grows with it.
     return width, height + max(_MARGIN_M, _LABEL_SHARE * max(width, height))
 
 
-def _view_box(plan: FloorPlan, seen_m: Sequence[tuple[float, float]]) -> tuple[float, float, float, float]:
+def _view_box(bounds_m: Bounds, seen_m: Sequence[tuple[float, float]]) -> tuple[float, float, float, float]:
     """Return left, top, width and height of the view, y pointing down."""
-    width, height = _size_m(plan)
-    left, top = plan.bounds_m[0] - _MARGIN_M, -plan.bounds_m[3] - _MARGIN_M
+    width, height = _size_m(bounds_m)
+    left, top = bounds_m[0] - _MARGIN_M, -bounds_m[3] - _MARGIN_M
     right, bottom = left + width, top + height
     reach = max(width, height) / _CAMERAS_PER_EXTENT * _CAMERA_REACH
     for x_m, y_m in seen_m:
@@ -233,7 +233,10 @@ def _label(room: Room, extent_m: float) -> str:
     )
 
 
-def _scale_bar(x_min: float, y_min: float, width_m: float, extent_m: float) -> str:
+def _scale_bar(bounds_m: Bounds) -> str:
+    x_min, y_min = bounds_m[:2]
+    width_m, height_m = _size_m(bounds_m)
+    extent_m = max(width_m, height_m)
     length = 10.0 ** math.floor(math.log10(_BAR_SHARE * width_m))
     length *= max(factor for factor in (1, 2, 5) if factor == 1 or factor * length <= _BAR_SHARE * width_m)
     y = -y_min + _MARGIN_M

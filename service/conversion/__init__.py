@@ -1,9 +1,11 @@
-"""Import and export of plan files in worker processes.
+"""Import of plan files, and files made from stored plans, in worker processes.
 
-Begin with `converter.py`, the pool of workers. `files.py` imports native plans in the service itself.
+Begin with `converter.py`, the pool of workers. `files.py` imports native plans in the service itself;
+`rendition_cache.py` keeps files made from stored plans.
 """
 
 from service.conversion.converter import Converter
 from service.conversion.files import PlanFile, convert, seems_native
+from service.conversion.rendition_cache import RenditionCache
 
-__all__ = ["Converter", "PlanFile", "convert", "seems_native"]
+__all__ = ["Converter", "PlanFile", "RenditionCache", "convert", "seems_native"]

@@ -6,21 +6,22 @@ a file that takes too long is not. The workers start with the first file that is
 
 from __future__ import annotations
 
-import json
+import asyncio
 import threading
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from typing import NoReturn
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
+from service.stored_plan import Rendition
 from service.telemetry import Telemetry
-from service.workers.convert import ConversionRefusal, ExportJob, Imported, ImportJob, run_converter
+from service.workers.convert import ConversionRefusal, Imported, ImportJob, RenditionJob, run_converter
 
-_Pool = WorkerPool[ImportJob | ExportJob, Imported | bytes | ConversionRefusal]
+_Result = Imported | Rendition | ConversionRefusal
+_Pool = WorkerPool[ImportJob | RenditionJob, _Result]
 
 # Largest number of waiting files.
 _QUEUE = 16
@@ -81,30 +82,35 @@ class Converter:
         assert isinstance(result, Imported)
         return result
 
-    async def write(self, plan: FloorPlan, format: str, client: str) -> bytes:
-        """Export a plan as a file.
+    def begin_rendition(self, job: RenditionJob, client: str) -> Future[_Result]:
+        """Queue a file that is made from a stored plan. Blocks while the plan is copied.
 
-        Args:
-            plan: plan to export.
-            format: one of `lalaloc_core.importers.EXPORT_FORMATS`.
-            client: client that the job counts for.
+        Raises:
+            OverloadedError, ConverterNotReadyError, StoppingError: see `read`.
+        """
+        try:
+            return self._running_pool().submit(job, self._settings.plans.import_deadline_s, client)
+        except JobLostError as error:
+            self._raise_lost(error)
+
+    async def rendition(self, begun: Future[_Result]) -> Rendition:
+        """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
 
         Raises:
             InvalidFloorPlanError: the plan lacks something that the format requires.
-            MissingExtraError: a library of the format is not installed.
-            OverloadedError: the queue is full.
-            DeadlineExceededError: the export did not finish in time.
-            ConverterNotReadyError: no worker is running.
-            StoppingError: the service is shutting down.
+            DamagedDataError: the stored plan is damaged.
+            MissingExtraError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `read`.
         """
-        job = ExportJob(json.dumps(plan.to_dict()), format)
         try:
-            result = await self._running_pool().run_job(job, self._settings.plans.import_deadline_s, client)
+            async with asyncio.timeout(self._settings.plans.import_deadline_s):
+                result = await asyncio.wrap_future(begun)
+        except TimeoutError:
+            self._raise_lost(JobLostError("deadline"))
         except JobLostError as error:
             self._raise_lost(error)
         if isinstance(result, ConversionRefusal):
             raise result.error()
-        assert isinstance(result, bytes)
+        assert isinstance(result, Rendition)
         return result
 
     def close(self) -> None:

@@ -1,7 +1,8 @@
 """Conditional requests (RFC 9110): entity tags, and the answers that depend on them.
 
-All tags are strong: equal tags mean equal bytes. The tag of a plan is `"<revision id>.<digest of the bytes>"`, because
-status and progress change within a revision. `If-Match` compares the part before the dot only, so it accepts every tag
+All tags are strong: equal tags mean equal bytes. The tag of a plan is `"<revision id>.<digest>"`, because status and
+progress change within a revision; the digest is that of all that the bytes depend on, so that a tag is compared before
+the bytes are made. `If-Match` compares the part before the dot only, so it accepts every tag
 of the current revision, and the plain `"<revision id>"`. Venues have tags of the same kind.
 """
 
@@ -9,13 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from starlette.requests import Request
 from starlette.responses import Response
 
+from lalaloc_core import __version__
 from service.errors import InvalidRequestError, RevisionMismatchError
+from service.http.parts import PartsResponse
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}
@@ -38,29 +41,39 @@ class Tags:
     all: frozenset[str]
 
 
-def content_etag(content: bytes) -> str:
-    """Return the entity tag of some bytes."""
-    return f'"{hashlib.sha256(content).hexdigest()[:_DIGITS]}"'
+def digest_etag(digest: str) -> str:
+    """Return the entity tag of the bytes with a SHA-256 digest."""
+    return f'"{digest[:_DIGITS]}"'
 
 
-def plan_etag(revision_id: str, content: bytes) -> str:
-    """Return the entity tag of a plan at a revision."""
-    return f'"{revision_id}.{hashlib.sha256(content).hexdigest()[:_DIGITS]}"'
+def revision_etag(revision_id: str, *parts: object) -> str:
+    """Return the entity tag of a representation of a revision, which needs no content.
+
+    Args:
+        revision_id: id of the revision.
+        parts: everything else that the bytes depend on, besides the version of the service.
+    """
+    digest = hashlib.sha256(repr((__version__, *parts)).encode()).hexdigest()
+    return f'"{revision_id}.{digest[:_DIGITS]}"'
 
 
-def conditional_answer(
-    request: Request, content: bytes, media_type: str, etag: str, headers: Mapping[str, str] | None = None
-) -> Response:
-    """Answer a GET: with the content, or with 304 if the client has it already.
+def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None = None) -> Response | None:
+    """Return 304 if the client has the representation with this tag already; otherwise None.
 
     Raises:
         InvalidRequestError: `If-None-Match` is not a list of entity tags.
     """
     none_match = _tags(request, "If-None-Match")
-    common = {"ETag": etag, **_CACHED, **(headers or {})}
     if none_match is not None and (none_match.any or etag.strip('"') in none_match.all):
-        return Response(status_code=304, headers=common)
-    return Response(content, media_type=media_type, headers=common)
+        return Response(status_code=304, headers={"ETag": etag, **_CACHED, **(headers or {})})
+    return None
+
+
+def tagged_answer(
+    parts: Sequence[bytes | memoryview], media_type: str, etag: str, headers: Mapping[str, str] | None = None
+) -> Response:
+    """Return a representation, given in parts, with its tag."""
+    return PartsResponse(parts, media_type, {"ETag": etag, **_CACHED, **(headers or {})})
 
 
 def expected_revision(request: Request, resource_id: str, revision_id: str, *, what: str = "floor plan") -> str | None:

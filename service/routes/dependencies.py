@@ -31,34 +31,6 @@ Tenant = Annotated[str, Depends(_tenant_of)]
 Client = Annotated[str, Depends(_client_of)]
 
 
-def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:
-    """Return a stored plan of a tenant.
-
-    Raises:
-        UnknownFloorPlanError: no such plan.
-        StoreUnavailableError: the database is away.
-    """
-    record = plans.get(tenant, floorplan_id) if is_id(floorplan_id) else None
-    if record is None:
-        raise UnknownFloorPlanError(floorplan_id)
-    return record
-
-
-def plan_at_revision(current: PlanRecord, revision_id: str, plans: Plans) -> PlanRecord:
-    """Return a stored plan at one of its revisions.
-
-    Raises:
-        UnknownRevisionError: no such revision is kept.
-        StoreUnavailableError: the database is away.
-    """
-    if revision_id == current.revision_id:
-        return current
-    found = plans.get_revision(current.tenant, current.id, revision_id) if is_id(revision_id) else None
-    if found is None:
-        raise UnknownRevisionError(current.id, revision_id)
-    return found
-
-
 def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
     """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted.
 
@@ -70,6 +42,21 @@ def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
     if summary is None:
         raise UnknownFloorPlanError(floorplan_id)
     return summary
+
+
+def plan_at_revision(tenant: str, current: PlanSummary, revision_id: str | None, plans: Plans) -> PlanSummary:
+    """Return a stored plan at one of its revisions; None names the current one.
+
+    Raises:
+        UnknownRevisionError: no such revision is kept.
+        StoreUnavailableError: the database is away.
+    """
+    if revision_id is None or revision_id == current.revision_id:
+        return current
+    found = plans.summary(tenant, current.id, revision_id) if is_id(revision_id) else None
+    if found is None:
+        raise UnknownRevisionError(current.id, revision_id)
+    return found
 
 
 async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:

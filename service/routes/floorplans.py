@@ -6,6 +6,7 @@ import json
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response, status
+from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.floorplan import FloorPlan
 from service.conversion import convert
@@ -21,10 +22,11 @@ from service.errors import (
 )
 from service.grids import GridState
 from service.http import IdempotentRequest
-from service.http.conditional import conditional_answer, expected_revision
+from service.http.conditional import expected_revision, not_modified, tagged_answer
 from service.http.cursors import cursor_text, parse_cursor
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
+from service.renditions import describe
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
@@ -36,13 +38,12 @@ from service.routes.dependencies import (
     Tenant,
     plan_at_revision,
     plan_summary,
-    stored_plan,
 )
-from service.routes.plan_answers import list_entries, plan_representation, plan_state
+from service.routes.plan_answers import description_etag, description_parts, list_entries
 from service.routes.plan_uploads import REFUSED_UPLOADS, UPLOAD_BODY, PlanUpload, read_upload
 from service.runtime import Runtime
 from service.schemas import FloorPlanAnswer, FloorPlanList
-from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord
+from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
 from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
@@ -82,7 +83,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
         else:
             # Stored by an earlier attempt, and possibly replaced since.
             runtime.grids.on_plan_stored(record, None)
-            state = plan_state(record, runtime.grids)
+            state = runtime.grids.states([plan_summary(tenant, record.id, runtime.store.plans)])[0]
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from claim to answer, so that a disconnect does not interrupt it.
@@ -120,22 +121,29 @@ def list_floorplans(
     responses=NOT_MODIFIED
     | problem_responses(UnknownFloorPlanError, UnknownRevisionError, InvalidRequestError, StoreUnavailableError),
 )
-def get_floorplan(
+async def get_floorplan(
     floorplan_id: str,
     request: Request,
     runtime: Running,
     tenant: Tenant,
+    client: Client,
     revision: Annotated[str | None, Query(description="Id of an older revision.")] = None,
 ) -> Response:
     """Return a stored floor plan with the status and progress of its pose grid."""
-    record = stored_plan(tenant, floorplan_id, runtime.store.plans)
-    superseded = revision is not None and revision != record.revision_id
-    if revision is not None and superseded:
-        record = plan_at_revision(record, revision, runtime.store.plans)
-    add_log_fields(request, plan=record.id, revision=record.revision_id)
+
+    def look() -> tuple[PlanSummary, GridState, bool]:
+        current = plan_summary(tenant, floorplan_id, runtime.store.plans)
+        plan = plan_at_revision(tenant, current, revision, runtime.store.plans)
+        return plan, runtime.grids.states([plan])[0], plan.revision_id != current.revision_id
+
+    plan, state, superseded = await run_in_threadpool(look)
+    add_log_fields(request, plan=plan.id, revision=plan.revision_id)
     step_m = runtime.settings.grids.grid_step_m
-    content, etag = plan_representation(record, plan_state(record, runtime.grids), step_m, superseded=superseded)
-    return conditional_answer(request, content, JSON, etag)
+    etag = description_etag(plan.revision_id, state, step_m, superseded=superseded)
+    if (answer := not_modified(request, etag)) is not None:
+        return answer
+    description = await runtime.renditions.get(plan.id, plan.revision_id, "description", client)
+    return tagged_answer(description_parts(description, state, step_m, superseded=superseded), JSON, etag)
 
 
 @router.put(
@@ -202,10 +210,13 @@ def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[Floo
 
 def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:
     add_log_fields(request, plan=record.id, revision=record.revision_id)
-    content, etag = plan_representation(record, state, runtime.settings.grids.grid_step_m)
+    step_m = runtime.settings.grids.grid_step_m
+    description = describe(record.plan, record, step_m)
+    runtime.renditions.put(record.revision_id, "description", description)
+    content = b"".join(description_parts(description, state, step_m))
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
     # The tag of this answer, which is also that of a GET from this location.
-    headers = {"Content-Location": path, "ETag": etag}
+    headers = {"Content-Location": path, "ETag": description_etag(record.revision_id, state, step_m)}
     if code == status.HTTP_201_CREATED:
         headers["Location"] = path
     return Response(content, code, headers, JSON)

@@ -5,6 +5,7 @@ Nothing is inline or loaded from elsewhere. The pages need no API key; they ask 
 
 from __future__ import annotations
 
+import hashlib
 import re
 from functools import lru_cache
 from importlib.resources import files
@@ -13,7 +14,7 @@ from mimetypes import guess_type
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
-from service.http.conditional import conditional_answer, content_etag
+from service.http.conditional import digest_etag, not_modified, tagged_answer
 
 router = APIRouter(include_in_schema=False)
 
@@ -63,7 +64,7 @@ def _file(request: Request, name: str) -> Response:
     if not _NAME.fullmatch(name):
         raise HTTPException(404)
     content, media, etag = _built(name)
-    return conditional_answer(request, content, media, etag, _HEADERS)
+    return not_modified(request, etag, _HEADERS) or tagged_answer([content], media, etag, _HEADERS)
 
 
 @lru_cache(_MAX_FILES)
@@ -78,4 +79,4 @@ def _built(name: str) -> tuple[bytes, str, str]:
         raise HTTPException(404)
     content = path.read_bytes()
     media = "text/javascript" if name.endswith(".js") else guess_type(name)[0] or "application/octet-stream"
-    return content, media, content_etag(content)
+    return content, media, digest_etag(hashlib.sha256(content).hexdigest())

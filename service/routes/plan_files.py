@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from lalaloc_core.draw.plan import Marker
+from lalaloc_core.draw.plan import HEAT_PLACE, Bounds, Marker, svg_around
 from lalaloc_core.errors import MissingExtraError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
 from service.errors import (
     ConverterNotReadyError,
@@ -19,15 +19,18 @@ from service.errors import (
     UnanchoredPlanError,
     UnknownFloorPlanError,
 )
-from service.http.conditional import conditional_answer, content_etag
+from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary, stored_plan
-from service.storage.records import PlanRecord
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary
+from service.runtime import Runtime
+from service.storage.records import PlanSummary
+from service.stored_plan import RenditionKind
 from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
+_HEAT = HEAT_PLACE.encode()
 _SVG, _GLB = "image/svg+xml", "model/gltf-binary"
 # Tolerance for a covariance whose three numbers were rounded.
 _ROUNDED = 1e-3
@@ -53,15 +56,18 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
 )
 def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
     """Return the uploaded file of the current revision, unchanged, with the media type of its content."""
-    current = plan_summary(tenant, floorplan_id, runtime.store.plans)
+    plans = runtime.store.plans
+    current = plan_summary(tenant, floorplan_id, plans)
     add_log_fields(request, plan=current.id, revision=current.revision_id)
-    original = runtime.store.plans.original(tenant, current.id)
-    if original is None:
+    digest = plans.original_digest(current.revision_id)
+    if digest is not None and (answer := not_modified(request, digest_etag(digest))) is not None:
+        return answer
+    original = plans.original(tenant, current.id)
+    if digest is None or original is None:
         raise UnknownFloorPlanError(floorplan_id)
     # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
-    etag = content_etag(original.content)
-    return conditional_answer(request, original.content, original.media_type, etag, kept)
+    return tagged_answer([original.content], original.media_type, digest_etag(digest), kept)
 
 
 @router.get(
@@ -98,12 +104,11 @@ async def get_export(
     ] = "native",
 ) -> Response:
     """Return the plan in another file format."""
-    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
-    if format == "imdf" and record.plan.anchor is None:
-        raise UnanchoredPlanError(record.id)
-    content = await runtime.converter.write(record.plan, format, client)
+    plan = await _look(request, tenant, floorplan_id, runtime)
+    if format == "imdf" and not plan.anchored:
+        raise UnanchoredPlanError(plan.id)
     kept = {"Content-Disposition": f'attachment; filename="plan.{FORMATS[format].suffix}"'}
-    return conditional_answer(request, content, FORMATS[format].media_type, content_etag(content), kept)
+    return await _rendition(request, plan, format, FORMATS[format].media_type, runtime, client, kept)
 
 
 @router.get(
@@ -118,6 +123,7 @@ async def get_preview(
     request: Request,
     runtime: Running,
     tenant: Tenant,
+    client: Client,
     x_m: Annotated[float | None, Query(allow_inf_nan=False, description="x of a camera to mark.")] = None,
     y_m: Annotated[float | None, Query(allow_inf_nan=False, description="y of a camera to mark.")] = None,
     heading_deg: Annotated[
@@ -144,13 +150,19 @@ async def get_preview(
     marker = None
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
-    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
-    if marker is not None:
-        _check_near(marker, record.plan)
-    content = await runtime.drawings.svg(record, marker)
+    plan = await _look(request, tenant, floorplan_id, runtime)
     # Defence in depth: the drawing has no scripts.
     policy = {"Content-Security-Policy": "default-src 'none'"}
-    return conditional_answer(request, content, _SVG, content_etag(content), policy)
+    etag = revision_etag(plan.revision_id, "drawing", marker)
+    if (answer := not_modified(request, etag, policy)) is not None:
+        return answer
+    rooms = await runtime.renditions.get(plan.id, plan.revision_id, "drawing", client)
+    if marker is not None:
+        _check_near(marker, rooms.bounds_m)
+    head, tail = svg_around(plan.name, rooms.bounds_m, marker)
+    heat, drawn = rooms.content.index(_HEAT), memoryview(rooms.content)
+    parts = (head.encode(), drawn[:heat], drawn[heat + len(_HEAT) :], tail.encode())
+    return tagged_answer(parts, _SVG, etag, policy)
 
 
 @router.get(
@@ -164,25 +176,42 @@ async def get_preview(
         **_PROBLEMS,
     },
 )
-async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
-    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
-    content = await runtime.drawings.glb(record)
-    return conditional_answer(request, content, _GLB, content_etag(content))
+    plan = await _look(request, tenant, floorplan_id, runtime)
+    return await _rendition(request, plan, "mesh", _GLB, runtime, client)
 
 
-def _noted(request: Request, record: PlanRecord) -> PlanRecord:
-    add_log_fields(request, plan=record.id, revision=record.revision_id)
-    return record
+async def _look(request: Request, tenant: str, floorplan_id: str, runtime: Runtime) -> PlanSummary:
+    plan = await run_in_threadpool(plan_summary, tenant, floorplan_id, runtime.store.plans)
+    add_log_fields(request, plan=plan.id, revision=plan.revision_id)
+    return plan
 
 
-def _check_near(marker: Marker, plan: FloorPlan) -> None:
+async def _rendition(
+    request: Request,
+    plan: PlanSummary,
+    kind: RenditionKind,
+    media_type: str,
+    runtime: Runtime,
+    client: str,
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """Answer with a file made from a plan, or with 304 before it is made."""
+    etag = revision_etag(plan.revision_id, kind)
+    if (answer := not_modified(request, etag, headers)) is not None:
+        return answer
+    made = await runtime.renditions.get(plan.id, plan.revision_id, kind, client)
+    return tagged_answer([made.content], media_type, etag, headers)
+
+
+def _check_near(marker: Marker, bounds_m: Bounds) -> None:
     """Refuse a camera that is too far from the plan to be drawn with it.
 
     Raises:
         InvalidRequestError: the camera is further away than the plan's larger side.
     """
-    x_min, y_min, x_max, y_max = plan.bounds_m
+    x_min, y_min, x_max, y_max = bounds_m
     margin_m = max(x_max - x_min, y_max - y_min)
     ranges = (("x_m", marker.x_m, x_min, x_max), ("y_m", marker.y_m, y_min, y_max))
     faults = [

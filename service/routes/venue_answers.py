@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from service.http.conditional import plan_etag
+from service.http.conditional import revision_etag
 from service.runtime import Runtime
 from service.schemas import VenueAnchorAnswer, VenueAnswer, VenuePlanAnswer, VenueSummary
 from service.storage.records import VenueMember, VenueRecord
@@ -33,7 +33,7 @@ def venue_representation(record: VenueRecord, runtime: Runtime) -> tuple[bytes, 
         plans_failed=counts.failed,
     )
     content = answer.model_dump_json().encode()
-    return content, plan_etag(record.revision_id, content)
+    return content, revision_etag(record.revision_id, content)
 
 
 def plan_entries(members: list[VenueMember], runtime: Runtime) -> list[VenuePlanAnswer]:

@@ -24,7 +24,7 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.http import IdempotentRequest
-from service.http.conditional import conditional_answer, expected_revision
+from service.http.conditional import expected_revision, not_modified, tagged_answer
 from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
@@ -130,7 +130,7 @@ def get_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant)
     """Return a stored venue with the number of plans that are ready."""
     record = _stored(tenant, venue_id, runtime)
     content, etag = venue_representation(record, runtime)
-    return conditional_answer(request, content, JSON, etag)
+    return not_modified(request, etag) or tagged_answer([content], JSON, etag)
 
 
 @router.get(

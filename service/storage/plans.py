@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import uuid
 from collections.abc import Collection
@@ -13,7 +12,6 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, delete, func, select, text, update
 
-from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M
 from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
@@ -26,40 +24,11 @@ from service.storage.statements import newest_first, read_chunks, select_summari
 from service.storage.stored_grids import insert_grid
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
 from service.storage.venues import remove_from_venues
+from service.stored_plan import PlanDocument, StoredPlan
 from service.telemetry import LOGGER_NAME
 
 # Advisory lock on PostgreSQL that keeps the count of plans exact; differs from the other locks.
 _COUNT_LOCK = 5_210_002
-
-
-@dataclass(frozen=True)
-class PlanDocument:
-    """Stored form of a plan, which was validated at upload; reading it back checks only its digest.
-
-    Attributes:
-        document: the plan in the native format.
-        document_sha256: its digest; None for plans stored by an earlier version of the service.
-        warnings: warnings of the validation as a JSON list; None as for the digest.
-    """
-
-    document: str
-    document_sha256: str | None
-    warnings: str | None
-
-    @classmethod
-    def from_plan(cls, plan: FloorPlan) -> PlanDocument:
-        """Return the stored form of a plan."""
-        document = json.dumps(plan.to_dict())
-        return cls(document, _digest(document), json.dumps(plan.warnings))
-
-    def plan(self) -> FloorPlan | None:
-        """Return the plan; None if the document is damaged."""
-        if self.document_sha256 is not None and _digest(self.document) != self.document_sha256:
-            return None
-        try:
-            return FloorPlan.from_stored(self.document, None if self.warnings is None else json.loads(self.warnings))
-        except (InvalidFloorPlanError, ValueError, TypeError):
-            return None
 
 
 @dataclass(frozen=True)
@@ -214,10 +183,35 @@ class Plans:
         with self._database.reading() as connection:
             return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
 
-    def summary(self, tenant: str, plan_id: str) -> PlanSummary | None:
-        """Return a plan at its current revision without its document, even if that is damaged."""
-        query = select_summaries().where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+    def summary(self, tenant: str, plan_id: str, revision_id: str | None = None) -> PlanSummary | None:
+        """Return a plan without its document, even if that is damaged, at its current or another stored revision."""
+        query = select_summaries(current=revision_id is None)
+        query = query.where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        if revision_id is not None:
+            query = query.where(REVISIONS.c.id == revision_id)
         return next(iter(self._summaries(query)), None)
+
+    def stored(self, revision_id: str) -> StoredPlan | None:
+        """Return a plan at a revision with its unparsed document, regardless of tenant. Callers check access first."""
+        columns = REVISIONS.c
+        query = select(
+            columns.plan_id.label("id"),
+            columns.id.label("revision_id"),
+            columns.number.label("revision"),
+            FLOORPLANS.c.created_at,
+            columns.created_at.label("updated_at"),
+            columns.report,
+        ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.id == columns.plan_id)
+        with self._database.reading() as connection:
+            row = connection.execute(query.where(columns.id == revision_id)).one_or_none()
+            if row is None:
+                return None
+            return StoredPlan(**row._mapping, document=_document(connection, revision_id))
+
+    def original_digest(self, revision_id: str) -> str | None:
+        """Return the digest of a revision's uploaded file, regardless of tenant. Callers check access first."""
+        with self._database.reading() as connection:
+            return connection.scalar(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
 
     def original(self, tenant: str, plan_id: str) -> Original | None:
         """Return the uploaded file of a plan's current revision.
@@ -315,9 +309,7 @@ class Plans:
             return None
         if (plan := self._cache.plan(row.tenant, row.id, row.revision_id)) is not None:
             return _StoredPlan(row, plan)
-        columns = REVISIONS.c
-        query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == row.revision_id)
-        return _StoredPlan(row, PlanDocument(**connection.execute(query).one()._mapping))
+        return _StoredPlan(row, _document(connection, row.revision_id))
 
     def _record(self, found: _StoredPlan) -> PlanRecord:
         """Parse a plan; call it outside of transactions, because it is slow.
@@ -333,8 +325,28 @@ class Plans:
         return PlanRecord(**row._mapping, plan=plan)
 
 
+def _record(self, found: _StoredPlan) -> PlanRecord:
+    """Parse a plan; call it outside of transactions, because it is slow.
+
+    Raises:
+        DamagedDataError: the document is damaged.
+    """
+    row, plan = found.row, found.plan
+    if isinstance(plan, PlanDocument):
+        plan = plan.plan()
+        if plan is None:
+            raise _damaged("document", row.id, row.revision_id)
+    return PlanRecord(**row._mapping, plan=plan)
+
+
 def _digest(document: str) -> str:
     return hashlib.sha256(document.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _document(connection: Connection, revision_id: str) -> PlanDocument:
+    columns = REVISIONS.c
+    query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == revision_id)
+    return PlanDocument(**connection.execute(query).one()._mapping)
 
 
 def _record(

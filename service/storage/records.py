@@ -9,6 +9,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.poses import PoseGrid
 from service.storage.grid_format import SortedPrototypes
+from service.stored_plan import PlanHead
 
 # Tenant of all callers without API keys.
 DEFAULT_TENANT = "default"
@@ -65,35 +66,27 @@ class Original:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanRecord:
+class PlanRecord(PlanHead):
     """Stored floor plan at one of its revisions.
 
     Attributes:
-        id: id of the plan.
         tenant: owner of the plan.
-        revision_id: id of the revision, unique among all plans.
-        revision: number of the revision, from 1.
-        created_at: time when the plan was first stored.
-        updated_at: time when the revision was stored.
         plan: the plan.
         failure: error of the last computation of its pose grid, if it failed.
-        report: import report as JSON text; None for plans of an earlier version of the service.
     """
 
-    id: str
     tenant: str
-    revision_id: str
-    revision: int
-    created_at: datetime
-    updated_at: datetime
     plan: FloorPlan
     failure: str | None
-    report: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSummary:
-    """Stored floor plan without its rooms, for listings; attributes as of `PlanRecord`."""
+    """Stored floor plan without its rooms, for listings; attributes as of `PlanRecord`.
+
+    Attributes:
+        anchored: True if the plan's place on Earth is known.
+    """
 
     id: str
     revision_id: str
@@ -105,6 +98,7 @@ class PlanSummary:
     area_m2: float
     camera_height_m: float
     failure: str | None
+    anchored: bool
 
 
 @dataclass(frozen=True)

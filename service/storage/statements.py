@@ -72,20 +72,22 @@ def read_exactly(connection: Connection, table: Table, owner: dict[str, Any], si
     return content if filled == size_bytes else None
 
 
-def select_summaries() -> Any:
-    """Return a query for the columns of `PlanSummary`, of all plans at their current revision."""
+def select_summaries(*, current: bool = True) -> Any:
+    """Return a query for the columns of `PlanSummary`, of all plans at their current or at every revision."""
+    link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
     return select(
         FLOORPLANS.c.id,
-        FLOORPLANS.c.revision_id,
+        REVISIONS.c.id.label("revision_id"),
         REVISIONS.c.number.label("revision"),
         FLOORPLANS.c.created_at,
-        FLOORPLANS.c.updated_at,
+        REVISIONS.c.created_at.label("updated_at"),
         FLOORPLANS.c.name,
         REVISIONS.c.room_count,
         REVISIONS.c.area_m2,
         REVISIONS.c.camera_height_m,
         REVISIONS.c.failure,
-    ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
+        FLOORPLANS.c.latitude.is_not(None).label("anchored"),
+    ).join_from(FLOORPLANS, REVISIONS, link)
 
 
 def is_complete_grid() -> ColumnElement[bool]:

@@ -1,7 +1,7 @@
 """Program of a conversion worker process, the only part of the service that reads drawings and models.
 
-It turns an `ImportJob` into an `Imported`, an `ExportJob` into a file, and either into a `ConversionRefusal` if the
-file cannot be read or written. The libraries of a format are loaded with its first file.
+It turns an `ImportJob` into an `Imported`, a `RenditionJob` into a `Rendition`, and either into a `ConversionRefusal`
+if the file cannot be read or written. The libraries of a format are loaded with its first file.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from multiprocessing.connection import Connection
 from typing import Any, Literal
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import (
     ImportedPlan,
     ImportLimits,
     ImportOptions,
     detect_media_type,
-    export_plan,
     import_plan,
 )
+from service.errors import DamagedDataError
+from service.stored_plan import Rendition, RenditionKind, StoredPlan
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs
 
 # A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the
@@ -39,11 +39,12 @@ class ImportJob:
 
 
 @dataclass(frozen=True)
-class ExportJob:
-    """Stored plan document to be written in a format."""
+class RenditionJob:
+    """Stored plan from which a file is made."""
 
-    document: str
-    format: str
+    stored: StoredPlan
+    kind: RenditionKind
+    step_m: float
 
 
 @dataclass(frozen=True)
@@ -74,21 +75,25 @@ class ConversionRefusal:
     """
 
     reason: str
-    kind: Literal["invalid", "levels", "extra"] = "invalid"
+    kind: Literal["invalid", "levels", "extra", "damaged"] = "invalid"
     room: str | None = None
     names: tuple[str, ...] = field(default=())
 
     @classmethod
-    def of(cls, error: InvalidFloorPlanError | MissingExtraError) -> ConversionRefusal:
+    def of(cls, error: InvalidFloorPlanError | MissingExtraError | DamagedDataError) -> ConversionRefusal:
         """Return the refusal for an error."""
+        if isinstance(error, DamagedDataError):
+            return cls(str(error), "damaged")
         if isinstance(error, MissingExtraError):
             return cls(str(error), "extra", names=(error.action, error.extra))
         if isinstance(error, SeveralLevelsError):
             return cls(error.reason, "levels", names=error.levels)
         return cls(error.reason, room=error.room)
 
-    def error(self) -> InvalidFloorPlanError | MissingExtraError:
+    def error(self) -> InvalidFloorPlanError | MissingExtraError | DamagedDataError:
         """Return the error for the refusal."""
+        if self.kind == "damaged":
+            return DamagedDataError(self.reason)
         if self.kind == "extra":
             return MissingExtraError(*self.names)
         if self.kind == "levels":
@@ -124,11 +129,11 @@ def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: in
     serve_jobs(connection, lambda: _converting(limits), is_fit)
 
 
-def _converting(limits: ImportLimits) -> Callable[[ImportJob | ExportJob], Imported | bytes | ConversionRefusal]:
-    def convert(job: ImportJob | ExportJob) -> Imported | bytes | ConversionRefusal:
+def _converting(limits: ImportLimits) -> Callable[[ImportJob | RenditionJob], Imported | Rendition | ConversionRefusal]:
+    def convert(job: ImportJob | RenditionJob) -> Imported | Rendition | ConversionRefusal:
         try:
-            return _export(job) if isinstance(job, ExportJob) else _import(job, limits)
-        except (InvalidFloorPlanError, MissingExtraError) as error:
+            return _render(job) if isinstance(job, RenditionJob) else _import(job, limits)
+        except (InvalidFloorPlanError, MissingExtraError, DamagedDataError) as error:
             return ConversionRefusal.of(error)
         except MemoryError:
             return ConversionRefusal(
@@ -145,8 +150,11 @@ def _import(job: ImportJob, limits: ImportLimits) -> Imported:
     return Imported(_plain(imported.document), report_of(imported), media_type)
 
 
-def _export(job: ExportJob) -> bytes:
-    return export_plan(FloorPlan.from_stored(job.document, ()), job.format)
+def _render(job: RenditionJob) -> Rendition:
+    # Imported late: its libraries take memory that imports do not need.
+    from service.renditions import make_rendition
+
+    return make_rendition(job.stored, job.kind, job.step_m)
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:

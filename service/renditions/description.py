@@ -1,0 +1,63 @@
+"""Description of a plan: the `FloorPlanAnswer` as JSON in two parts, the state of its pose grid and the rest.
+
+The rest depends on the revision only and can have megabytes; the state is short and changes while the grid is computed.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.sampling import grid_size
+from service.schemas import BoundsAnswer, FloorPlanAnswer, GridAnswer, ImportReport, RoomAnswer
+from service.schemas.stored_plans import PlanStatus
+from service.stored_plan import PlanHead, Rendition
+
+_STATE = {"status", "progress", "reason", "grid"}
+
+
+def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:
+    """Return a plan's description without its state and its first brace; see `state_of_description`."""
+    report = None if head.report is None else ImportReport.model_validate_json(head.report)
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    poses = grid_size(plan, step_m)
+    answer = FloorPlanAnswer(
+        id=head.id,
+        revision=head.revision_id,
+        revision_number=head.revision,
+        name=plan.name,
+        status="preparing",
+        progress=0.0,
+        reason=None,
+        rooms=[
+            RoomAnswer(
+                id=room.id,
+                name=room.name,
+                type=room.type,
+                area_m2=room.area_m2,
+                ceiling_height_m=room.ceiling_height_m,
+                vertices=len(room.polygon_m),
+            )
+            for room in plan.rooms
+        ],
+        area_m2=plan.area_m2,
+        bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
+        camera_height_m=plan.camera_height_m,
+        grid=GridAnswer(step_m=step_m, poses=poses),
+        # Warnings of the import come first.
+        warnings=list(dict.fromkeys([*(() if report is None else report.warnings), *plan.warnings])),
+        import_report=report,
+        plan=plan.to_dict(),
+        created_at=head.created_at,
+        updated_at=head.updated_at,
+    )
+    return Rendition(answer.model_dump_json(exclude=_STATE).encode()[1:], plan.bounds_m, poses)
+
+
+def state_of_description(
+    status: PlanStatus | Literal["superseded"], progress: float, reason: str | None, *, poses: int, step_m: float
+) -> bytes:
+    """Return the part of a description that precedes the content of `describe`."""
+    grid = GridAnswer(step_m=step_m, poses=poses)
+    state = FloorPlanAnswer.model_construct(status=status, progress=progress, reason=reason, grid=grid)
+    return state.model_dump_json(include=_STATE).encode()[:-1] + b","

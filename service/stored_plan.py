@@ -1,0 +1,93 @@
+"""Stored plans before they are parsed, and the files made from them; light, because worker processes import it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import ExportFormat
+
+# Files made from a plan: its description (a part of the answer to GET), its walls, its rooms as SVG, its mesh, exports.
+RenditionKind = Literal["description", "layout", "drawing", "mesh"] | ExportFormat
+
+
+@dataclass(frozen=True)
+class PlanDocument:
+    """Stored form of a plan, which was validated at upload; reading it back checks only its digest.
+
+    Attributes:
+        document: the plan in the native format.
+        document_sha256: its digest; None for plans stored by an earlier version of the service.
+        warnings: warnings of the validation as a JSON list; None as for the digest.
+    """
+
+    document: str
+    document_sha256: str | None
+    warnings: str | None
+
+    @classmethod
+    def from_plan(cls, plan: FloorPlan) -> PlanDocument:
+        """Return the stored form of a plan."""
+        document = json.dumps(plan.to_dict())
+        return cls(document, _digest(document), json.dumps(plan.warnings))
+
+    def plan(self) -> FloorPlan | None:
+        """Return the plan; None if the document is damaged."""
+        if self.document_sha256 is not None and _digest(self.document) != self.document_sha256:
+            return None
+        try:
+            return FloorPlan.from_stored(self.document, None if self.warnings is None else json.loads(self.warnings))
+        except (InvalidFloorPlanError, ValueError, TypeError):
+            return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanHead:
+    """Stored plan at one of its revisions, without its rooms.
+
+    Attributes:
+        id: id of the plan.
+        revision_id: id of the revision, unique among all plans.
+        revision: number of the revision, from 1.
+        created_at: time when the plan was first stored.
+        updated_at: time when the revision was stored.
+        report: import report as JSON text; None for plans of an earlier version of the service.
+    """
+
+    id: str
+    revision_id: str
+    revision: int
+    created_at: datetime
+    updated_at: datetime
+    report: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredPlan(PlanHead):
+    """Stored plan as the database holds it, with its document."""
+
+    document: PlanDocument
+
+
+@dataclass(frozen=True)
+class Rendition:
+    """File made from a revision of a plan.
+
+    Attributes:
+        content: the file.
+        bounds_m: bounds of the plan.
+        poses: estimated size of the pose grid; 0 in files other than descriptions.
+    """
+
+    content: bytes
+    bounds_m: tuple[float, float, float, float]
+    poses: int = 0
+
+
+def _digest(document: str) -> str:
+    return hashlib.sha256(document.encode("utf-8", "surrogatepass")).hexdigest()
