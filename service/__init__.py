@@ -18,7 +18,6 @@ on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
 Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP),
-`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`, `stored_plan.py`,
-and the
-command lines `cli.py`, `openapi.py`, `__main__.py`.
+`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`,
+`stored_plan.py`, and the command lines `cli.py`, `openapi.py`, `__main__.py`.
 """

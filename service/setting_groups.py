@@ -152,8 +152,8 @@ class AccessSettings(SettingGroup):
         default=600,
         ge=0,
         le=10**6,
-        description="Rate limit per API key and replica, in requests per minute, for keys without a rate of their own. "
-        "0: no limit.",
+        description="Rate limit per API key and replica, in requests per minute, for keys without a rate of their own; "
+        "an answer to GET counts as one more request per 256 KiB. 0: no limit.",
     )
     rate_burst: int = Field(
         default=60,

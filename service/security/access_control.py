@@ -78,11 +78,16 @@ class AccessControl:
         add_log_fields(request, key=key.id, tenant=key.tenant)
         await self._rates.count(key)
         scopes = frozenset(scope for scope in Permission if scope in key.scopes)
-        caller = Caller(key.tenant, key.id, scopes, client=key.tenant)
+        caller = Caller(key.tenant, key, scopes, client=key.tenant)
         needed = _needed(request)
         if needed not in caller.permissions:
             raise InsufficientScopeError(needed, caller.permissions)
         return caller
+
+    async def charge(self, caller: Caller, sent_bytes: int) -> None:
+        """Count the bytes of an answer to a read against the rate limit of its caller's key."""
+        if caller.key is not None:
+            await self._rates.charge(caller.key, sent_bytes)
 
     async def still_authorised(self, request: Request) -> bool:
         """Return True while the key of an accepted request is valid, or keys are off."""

@@ -10,7 +10,7 @@ from enum import StrEnum
 from starlette.routing import compile_path
 from starlette.types import Scope
 
-from service.storage.records import DEFAULT_TENANT
+from service.storage.records import DEFAULT_TENANT, ApiKey
 
 _SCOPE_KEY = "lalaloc.caller"
 # An IPv6 client usually owns a whole /64.
@@ -69,13 +69,13 @@ class Caller:
 
     Attributes:
         tenant: tenant whose plans are visible.
-        key_id: id of the API key; None while keys are off.
+        key: the API key; None while keys are off.
         permissions: scopes of the key.
         client: unit of fair sharing: the tenant, or without keys the client address.
     """
 
     tenant: str
-    key_id: str | None
+    key: ApiKey | None
     permissions: frozenset[Permission]
     client: str
 

@@ -19,6 +19,8 @@ from service.storage.records import ApiKey
 _ADDRESS_COUNTERS = 1024
 # Invalid API keys per minute of a client address; further ones are rejected without a look-up.
 REFUSED_KEYS_PER_MINUTE = 60
+# Bytes of an answer that cost as much as a request.
+BYTES_PER_REQUEST = 256 * 1024
 
 
 class RateLimits:
@@ -36,11 +38,17 @@ class RateLimits:
         Raises:
             RateLimitedError: the limit is exceeded.
         """
-        per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
         if self._burst:
             await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), key.id, "second")
-        if per_minute:
-            await self._count(RateLimitItemPerMinute(per_minute, namespace="rate"), key.id, "minute")
+        if (limit := self._limit_of(key)) is not None:
+            await self._count(limit, key.id, "minute")
+
+    async def charge(self, key: ApiKey, sent_bytes: int) -> None:
+        """Count an answer as one more request per `BYTES_PER_REQUEST`, up to the limit."""
+        more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(key)
+        if more and limit is not None:
+            _, left = await self._limiter.get_window_stats(limit, key.id)
+            await self._limiter.hit(limit, key.id, cost=min(more, left))
 
     async def count_refused(self, client: str) -> None:
         """Count an invalid key of a client address.
@@ -59,6 +67,10 @@ class RateLimits:
         """
         if not await self._limiter.test(self._refused, _counter_of(client)):
             raise await self._too_many_refused(client)
+
+    def _limit_of(self, key: ApiKey) -> RateLimitItem | None:
+        per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
+        return RateLimitItemPerMinute(per_minute, namespace="rate") if per_minute else None
 
     async def _count(self, limit: RateLimitItem, key_id: str, period: str) -> None:
         if not await self._limiter.hit(limit, key_id):

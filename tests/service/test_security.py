@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import json
 import logging
 import re
 import socket
@@ -429,6 +430,22 @@ def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: Datab
         assert accepted(unlimited) == 20
         metrics = client.get("/metrics", headers=bearer(unlimited)).text
         assert re.search(r'lalaloc_rejections_total\{reason="rate-limited"\} (2[4-6])\.0', metrics)
+        store.close()
+
+
+@pytest.mark.one_replica
+def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+    with start_app(tmp_path, api_keys=True, rate_per_minute=40, rate_burst=0) as client:
+        store = Store(database_of(tmp_path))
+        key = make_key(store)
+        client.headers.update(bearer(key))
+        content = json.dumps(FLAT).encode() + b" " * 5 * rate_limits.BYTES_PER_REQUEST
+        headers = {"Content-Type": "application/json"}
+        url = client.post("/floorplans", content=content, headers=headers).headers["location"]
+        # Six requests each, after one upload. A minute that ends during the test allows some more.
+        statuses = [client.get(f"{url}/original").status_code for _ in range(15)]
+        assert 6 <= statuses.count(200) < 15
+        assert set(statuses) == {200, 429}
         store.close()
 
 

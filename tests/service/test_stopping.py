@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
@@ -128,9 +128,12 @@ def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path)
 def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) -> None:
     with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         plan_id = upload(service.client, tiled_plan(60, openings=True), wait=False)
-        for path in ("", "/layout", "/preview.svg", "/mesh.glb", "/export?format=svg") * 2:
-            with service.connect(f"GET /floorplans/{plan_id}{path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()):
-                pass
+        with ExitStack() as connections:
+            for path in ("/layout", "/layout", "/layout", "/mesh.glb"):
+                head = f"GET /floorplans/{plan_id}{path} HTTP/1.1\r\nHost: localhost\r\n\r\n"
+                connections.enter_context(service.connect(head.encode()))
+            # They have begun, most likely.
+            sleep(1.0)
         service.process.send_signal(signal.SIGTERM)
         assert service.process.wait(30.0) == 0
 

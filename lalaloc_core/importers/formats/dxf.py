@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from ezdxf import options as dxf_options
 from ezdxf import path as dxf_path
 from ezdxf import recover
 from ezdxf.document import Drawing as DxfDocument
@@ -85,6 +86,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return a plan as a DXF drawing in metres; heights, ids and the anchor are lost."""
+    # Without times and random ids, so that a plan always gives the same file.
+    dxf_options.write_fixed_meta_data_for_testing = True
     drawing = new_dxf("R2010")
     drawing.header["$INSUNITS"] = _INSUNITS_METRES
     for layer, colour in _LAYERS.items():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import http_problem_answer, problem_answer
 from service.security.access_control import REFUSALS, AccessControl, routed_path
-from service.security.permissions import OPEN_PATHS, put_caller
+from service.security.permissions import OPEN_PATHS, Caller, put_caller
+
+_READING = frozenset({"GET", "HEAD"})
 
 
 class AuthorisationMiddleware:
@@ -24,11 +26,29 @@ class AuthorisationMiddleware:
         if scope["type"] == "http" and access is not None and routed_path(scope) not in OPEN_PATHS:
             request = Request(scope)
             try:
-                put_caller(scope, await access.authorise(request))
+                caller = await access.authorise(request)
             except REFUSALS as error:
                 await problem_answer(request, error)(scope, receive, send)
                 return
             except HTTPException as error:
                 await http_problem_answer(request, error)(scope, receive, send)
                 return
+            put_caller(scope, caller)
+            if scope["method"] in _READING:
+                await self._read(access, caller, scope, receive, send)
+                return
         await self._app(scope, receive, send)
+
+    async def _read(self, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle a read, and charge the caller for the bytes of the answer."""
+        sent_bytes = 0
+
+        async def counting(message: Message) -> None:
+            nonlocal sent_bytes
+            sent_bytes += len(message.get("body", b""))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, counting)
+        finally:
+            await access.charge(caller, sent_bytes)
