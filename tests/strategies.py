@@ -1,10 +1,10 @@
-"""Random rooms, plans and poses for property tests, and builders shared by all tests."""
+"""Random rooms, plans and poses for property tests, and builders and comparisons shared by all tests."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from hypothesis import strategies as st
@@ -13,14 +13,21 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.sampling import PoseSet, random_poses
 
 Polygon = list[list[float]]
+T = TypeVar("T")
 
 # Random rooms are wider than this almost everywhere, so that a pose with the margin below exists.
 POSE_MARGIN_M = 0.15
 
 
-def rectangle(width_m: float, depth_m: float, at: tuple[float, float] = (0.0, 0.0)) -> Polygon:
-    """Return a rectangle with its lower left corner at `at`."""
-    x, y = at
+def present(value: T | None) -> T:
+    """Return a value that must not be None."""
+    assert value is not None
+    return value
+
+
+def rectangle(width_m: float, depth_m: float, corner: tuple[float, float] = (0.0, 0.0)) -> Polygon:
+    """Return a rectangle with its lower left corner at `corner`."""
+    x, y = corner
     return [[x, y], [x + width_m, y], [x + width_m, y + depth_m], [x, y + depth_m]]
 
 
@@ -40,6 +47,14 @@ def spiral(corners: int) -> Polygon:
         return [[r * math.cos(a), r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]
 
     return [*arm(0.3), *reversed(arm(0.0))]
+
+
+def same_ring(first: np.ndarray, second: np.ndarray, tolerance_m: float) -> bool:
+    """Return True if two rings (n, 2) have the same vertices in the same cyclic order."""
+    if first.shape != second.shape:
+        return False
+    shifts = (np.roll(first, shift, axis=0) for shift in range(len(first)))
+    return any(np.abs(shifted - second).max() <= tolerance_m for shifted in shifts)
 
 
 def plan_document(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> dict[str, Any]:
@@ -112,29 +127,16 @@ def notched(draw: st.DrawFn) -> Polygon:
     start = draw(st.floats(0.1, 0.4)) * width
     end = start + draw(st.floats(0.15, 0.4)) * width
     tip = depth * (1.0 + draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(0.1, 0.5)))
-    return [
-        [0.0, 0.0],
-        [width, 0.0],
-        [width, depth],
-        [end, depth],
-        [end, tip],
-        [start, tip],
-        [start, depth],
-        [0, depth],
-    ]
+    notch = [[end, depth], [end, tip], [start, tip], [start, depth]]
+    return [[0.0, 0.0], [width, 0.0], [width, depth], *notch, [0.0, depth]]
 
 
 @st.composite
 def slanted(draw: st.DrawFn) -> Polygon:
     """Draw rectangles with one corner cut off at an angle."""
     width, depth = draw(_lengths), draw(_lengths)
-    return [
-        [0.0, 0.0],
-        [width, 0.0],
-        [width, depth * (1.0 - draw(_shares))],
-        [width * (1.0 - draw(_shares)), depth],
-        [0.0, depth],
-    ]
+    side, top = depth * (1.0 - draw(_shares)), width * (1.0 - draw(_shares))
+    return [[0.0, 0.0], [width, 0.0], [width, side], [top, depth], [0.0, depth]]
 
 
 @st.composite
@@ -187,9 +189,9 @@ def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
     rooms, openings, x, previous = [], [], 0.0, None
     for index in range(draw(st.integers(1, 3))):
         width, depth, base = draw(st.floats(2.5, 6.0)), draw(st.floats(2.5, 6.0)), draw(st.floats(-0.8, 0.8))
-        room = {"name": f"room {index}", "polygon": rectangle(width, depth, at=(x, base))}
+        room = {"name": f"room {index}", "polygon": rectangle(width, depth, corner=(x, base))}
         if draw(st.booleans()):
-            room["holes"] = [rectangle(0.4, 0.3, at=(x + 0.6 * width, base + 0.4 * depth))]
+            room["holes"] = [rectangle(0.4, 0.3, corner=(x + 0.6 * width, base + 0.4 * depth))]
         if draw(st.booleans()):
             stub = [[x + 0.3 * width, base + depth], [x + 0.3 * width, base + 0.6 * depth]]
             room["walls"] = [stub]

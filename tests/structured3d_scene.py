@@ -24,7 +24,7 @@ class Drawing:
     """Planes, lines and junctions of an annotation; millimetres."""
 
     junctions: list[list[float]] = field(default_factory=list)
-    lines: list[tuple[int, int]] = field(default_factory=list)
+    lines: list[tuple[int, ...]] = field(default_factory=list)
     planes: list[tuple[str, list[int]]] = field(default_factory=list)
     semantics: list[dict[str, Any]] = field(default_factory=list)
 
@@ -57,8 +57,8 @@ class Drawing:
     def opening(self, wall: int, start_mm: np.ndarray, end_mm: np.ndarray, sill_mm: float, head_mm: float) -> int:
         """Add a door or window, a hole in a wall with its own plane; return that plane."""
         corners = [
-            self.junction(float(at[0]), float(at[1]), z)
-            for at, z in ((start_mm, sill_mm), (end_mm, sill_mm), (end_mm, head_mm), (start_mm, head_mm))
+            self.junction(float(point_mm[0]), float(point_mm[1]), z)
+            for point_mm, z in ((start_mm, sill_mm), (end_mm, sill_mm), (end_mm, head_mm), (start_mm, head_mm))
         ]
         ring = self.ring(corners)
         self.planes[wall][1].extend(ring)

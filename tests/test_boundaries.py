@@ -79,6 +79,7 @@ QUERY_SIDE = ("floorplan", "importers", "panorama", "render", "nets", "localise"
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),
+    "lalaloc_core.learn.heldout": ("lalaloc_core.learn.synth",),
     "service": ("lalaloc_core.learn", "lalaloc_core.evaluate", "lalaloc_core.cli"),
 }
 # Layers of the service, above the layers of the core, lowest first.

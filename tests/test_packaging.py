@@ -1,19 +1,27 @@
-"""Tests of installation and image: named files exist, and the right torch is chosen."""
+"""Tests of installation, image and Kubernetes manifests: they agree with each other and with the service."""
 
 from __future__ import annotations
 
 import re
 import tomllib
+from copy import deepcopy
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
+import kubernetes_validate
 import pytest
 import yaml
+from fastapi.routing import APIRoute
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from scripts import install_torch
+from service.cores import share_cores
+from service.http.admission_control import Admission, AdmissionLimits
+from service.routes import ROUTERS
 from service.settings import PREFIX, SETTING_NAMES, Settings
+from service.telemetry import Telemetry
 
 ROOT = Path(__file__).parents[1]
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
@@ -21,6 +29,18 @@ REPLICAS = yaml.safe_load((ROOT / "docker" / "compose.replicas.yaml").read_text(
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]["service"]
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 SETTINGS = {PREFIX + name.upper() for name in SETTING_NAMES}
+FOLDER = ROOT / "docker" / "kubernetes"
+KUSTOMIZATION: dict[str, Any] = yaml.safe_load((FOLDER / "kustomization.yaml").read_text(encoding="utf-8"))
+RESOURCES: dict[str, dict[str, Any]] = {
+    name: yaml.safe_load((FOLDER / name).read_text(encoding="utf-8")) for name in KUSTOMIZATION["resources"]
+}
+BY_KIND = {manifest["kind"]: manifest for manifest in RESOURCES.values()}
+# Oldest supported and newest version at the time of writing.
+VERSIONS = ("1.34", "1.37")
+POD: dict[str, Any] = BY_KIND["Deployment"]["spec"]["template"]["spec"]
+CONTAINER: dict[str, Any] = POD["containers"][0]
+LABELS: dict[str, str] = BY_KIND["Deployment"]["spec"]["template"]["metadata"]["labels"]
+CONFIGURED: dict[str, str] = BY_KIND["ConfigMap"]["data"]
 
 
 def _constraints() -> dict[str, str]:
@@ -150,3 +170,123 @@ def test_image_does_not_run_as_root() -> None:
     context = ROOT / "docker" / build["context"]
     assert (context / build["dockerfile"]).read_text(encoding="utf-8") == DOCKERFILE
     assert f"AS {build['target']}\n" in final_stage
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", RESOURCES)
+def test_manifests_are_valid(name: str, version: str) -> None:
+    assert kubernetes_validate.validate(RESOURCES[name], version, strict=True) == version
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "value"),
+    [
+        ("deployment.yaml", ("spec", "replica"), 2),
+        ("deployment.yaml", ("spec", "template", "spec", "containers", 0, "readinessProbe", "periodSeconds"), "2s"),
+        ("horizontalpodautoscaler.yaml", ("spec", "metrics", 0, "pods", "target", "averageValue"), [3]),
+        ("poddisruptionbudget.yaml", ("spec", "maxUnavailible"), 1),
+    ],
+)
+def test_validation_notices_a_mistake(name: str, path: tuple[str | int, ...], value: object) -> None:
+    manifest: Any = deepcopy(RESOURCES[name])
+    inner = manifest
+    for step in path[:-1]:
+        inner = inner[step]
+    inner[path[-1]] = value
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(manifest, VERSIONS[-1], strict=True)
+
+
+def test_every_manifest_is_applied() -> None:
+    not_resources = {"kustomization.yaml", "prometheus-adapter.yaml"}
+    assert {path.name for path in FOLDER.iterdir()} - not_resources == set(RESOURCES)
+    name, _, tag = CONTAINER["image"].partition(":")
+    assert KUSTOMIZATION["images"] == [{"name": name, "newTag": tag}]
+
+
+def test_manifests_select_the_same_pods() -> None:
+    spec = {kind: manifest.get("spec", {}) for kind, manifest in BY_KIND.items()}
+    assert spec["Deployment"]["selector"]["matchLabels"] == LABELS
+    assert spec["Service"]["selector"] == LABELS
+    assert spec["PodDisruptionBudget"]["selector"]["matchLabels"] == LABELS
+    assert spec["NetworkPolicy"]["podSelector"]["matchLabels"] == LABELS
+    assert [rule["labelSelector"]["matchLabels"] for rule in POD["topologySpreadConstraints"]] == [LABELS]
+    scaled = spec["HorizontalPodAutoscaler"]["scaleTargetRef"]
+    assert (scaled["kind"], scaled["name"]) == ("Deployment", BY_KIND["Deployment"]["metadata"]["name"])
+    # A replica count would override the autoscaler on every deployment.
+    assert "replicas" not in spec["Deployment"]
+    assert POD["serviceAccountName"] == BY_KIND["ServiceAccount"]["metadata"]["name"]
+    assert [source["configMapRef"]["name"] for source in CONTAINER["envFrom"]] == [
+        BY_KIND["ConfigMap"]["metadata"]["name"]
+    ]
+
+
+def test_manifest_settings_exist() -> None:
+    given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
+    values: dict[str, Any] = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
+    assert Settings(**values).access.api_keys
+    named = {variable["name"] for variable in CONTAINER["env"]}
+    assert {name.removeprefix(PREFIX).lower() for name in named} <= SETTING_NAMES
+    assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}
+    # Secret values come from a secret.
+    assert all("value" not in entry and "secretKeyRef" in entry["valueFrom"] for entry in CONTAINER["env"])
+    assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
+
+
+def test_pod_has_time_to_stop() -> None:
+    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().requests.stop_deadline_s
+    assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
+    probe = CONTAINER["readinessProbe"]
+    assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]
+
+
+def test_pod_has_minimal_rights() -> None:
+    security = CONTAINER["securityContext"]
+    assert security["readOnlyRootFilesystem"]
+    assert security["allowPrivilegeEscalation"] is False
+    assert security["capabilities"] == {"drop": ["ALL"]}
+    assert POD["securityContext"]["runAsNonRoot"]
+    assert POD["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert POD["automountServiceAccountToken"] is False
+    assert f"--uid {POD['securityContext']['runAsUser']} " in DOCKERFILE
+    # Only the data folder and the temporary folder are writable.
+    written = {mount["mountPath"] for mount in CONTAINER["volumeMounts"]}
+    assert written == {"/tmp", *re.findall(r"LALALOC_DATA_DIR=(\S+)", DOCKERFILE)}
+    assert {mount["name"] for mount in CONTAINER["volumeMounts"]} == {volume["name"] for volume in POD["volumes"]}
+    assert all("sizeLimit" in volume["emptyDir"] for volume in POD["volumes"])
+
+
+def test_ports_and_probes_match_the_service() -> None:
+    [port] = CONTAINER["ports"]
+    assert f"EXPOSE {port['containerPort']}" in DOCKERFILE
+    assert BY_KIND["Service"]["spec"]["ports"][0]["targetPort"] == port["name"]
+    probes = [CONTAINER[f"{kind}Probe"]["httpGet"] for kind in ("startup", "liveness", "readiness")]
+    assert {probe["port"] for probe in probes} == {port["name"]}
+    paths = {route.path for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)}
+    assert {probe["path"] for probe in probes} <= paths
+    # A stopping service is alive but not ready, so it finishes its requests.
+    assert CONTAINER["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    assert CONTAINER["readinessProbe"]["httpGet"]["path"] == "/readyz"
+
+
+def test_autoscaler_uses_an_existing_metric() -> None:
+    [by_requests] = [
+        metric for metric in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if metric["type"] == "Pods"
+    ]
+    metric = by_requests["pods"]["metric"]["name"]
+    adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
+    assert [rule["seriesQuery"].partition("{")[0] for rule in adapter["rules"]["custom"]] == [metric]
+    telemetry = Telemetry()
+    Admission(AdmissionLimits.from_settings(Settings()), telemetry)
+    assert f"\n{metric} " in telemetry.render().decode()
+    # The autoscaler adds pods before the running pods refuse requests.
+    cores = int(CONTAINER["resources"]["limits"]["cpu"])
+    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
+    assert shares.compute_threads == cores
+    assert int(by_requests["pods"]["target"]["averageValue"]) < 2 * (shares.workers + shares.compute_threads)
+
+
+def test_node_can_be_drained_without_an_outage() -> None:
+    scaling = BY_KIND["HorizontalPodAutoscaler"]["spec"]
+    assert scaling["minReplicas"] > BY_KIND["PodDisruptionBudget"]["spec"]["maxUnavailable"]
+    assert BY_KIND["Deployment"]["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 0

@@ -1,4 +1,4 @@
-"""Small homes in ZInD's structure with known poses: `python -m tests.zind_home OUT`.
+"""Small homes in ZInD's structure with known poses.
 
 A right-handed plan with true poses is mirrored into ZInD's frame, and every panorama gets a frame of its own with a
 random turn, scale and place. Its picture is painted from that frame alone, by ZInD's rule that a point (x, y) is seen
@@ -7,7 +7,6 @@ at the image azimuth atan2(-x, y): each wall in a colour of its own, floor and c
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Sequence
@@ -144,17 +143,3 @@ def _painted(vertices: np.ndarray, ceiling_height: float, size: tuple[int, int])
         pixels[rises < -1.0, column] = FLOOR_GREY
         pixels[rises > ceiling_height - 1.0, column] = CEILING_GREY
     return pixels
-
-
-def main() -> None:
-    """Write the homes into a folder."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    write_homes(arguments.out, np.random.default_rng(arguments.seed))
-    print(arguments.out)
-
-
-if __name__ == "__main__":
-    main()

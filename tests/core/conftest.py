@@ -1,17 +1,20 @@
-"""Fixtures of the core's tests: small networks, and the tiny bundle, opened."""
+"""Fixtures of the core's tests: the tiny bundle, opened, and the material library."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from tests.core.questions import PaintedSession
 
 # Derandomised: results depend on the commit only.
 settings.register_profile(
@@ -32,14 +35,6 @@ def _fixed_weights() -> None:
 
 
 @pytest.fixture(scope="session")
-def smooth_encoder() -> RingLayoutEncoder:
-    """Untrained layout encoder: a fixed, smooth embedding of layouts, sufficient for optimisation."""
-    torch.manual_seed(0)
-    config = RingConfig(sectors=64, channels=8, layout_width=16, layout_dilations=(1,))
-    return RingLayoutEncoder(config).eval().requires_grad_(False)
-
-
-@pytest.fixture(scope="session")
 def opened_bundle(tiny_bundle: Path) -> Bundle:
     """Tiny bundle with parsed manifest."""
     return Bundle.open(tiny_bundle)
@@ -55,3 +50,18 @@ def encoders(opened_bundle: Bundle) -> Encoders:
 def optimiser(opened_bundle: Bundle) -> PoseRefiner:
     """LPO with the tiny bundle."""
     return PoseRefiner.from_bundle(opened_bundle)
+
+
+@pytest.fixture(scope="session")
+def materials() -> MaterialLibrary:
+    """Library of procedural materials."""
+    return MaterialLibrary.create(np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> Encoders:
+    """Encoders whose image encoder reads the wall profile from painted pixels."""
+    encoders = Encoders(opened_bundle, threads=1)
+    assert isinstance(optimiser.encoder, RingLayoutEncoder)
+    encoders._image = PaintedSession(optimiser.encoder)
+    return encoders

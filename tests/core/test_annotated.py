@@ -36,6 +36,8 @@ from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.profile import wall_profile
+from tests.core.questions import prediction_of
+from tests.strategies import present
 
 REAL = Path(__file__).parents[3] / "shared" / "real" / "annotated"
 WIDTH = 256
@@ -204,8 +206,7 @@ class TestGalleries:
     def test_gallery_profile_matches_the_annotation(self, root: Path) -> None:
         dataset = AnnotatedPhotographs(root)
         for name in dataset.scenes("test"):
-            key = GalleryKey.from_scene(name)
-            assert key is not None
+            key = present(GalleryKey.from_scene(name))
             photograph = next(p for p in dataset.photographs if p.name == key.photograph)
             scene = dataset.load(name)
             (camera,) = scene.cameras
@@ -306,8 +307,7 @@ class TestAzimuths:
         predicted = np.array([0, 0, 0, 1, 1, 0, 2, 2])
         scores = np.eye(4)[predicted]
         measures = measure_azimuths([np.ones(8)], np.zeros(8), np.zeros(8), truth, scores)
-        assert measures.confusion is not None
-        classes = score_classes(measures.confusion, OPENING_CLASSES)
+        classes = score_classes(present(measures.confusion), OPENING_CLASSES)
         assert classes.recall == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
         assert classes.precision == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
         # A class that never occurs has no recall.
@@ -318,12 +318,11 @@ class TestAzimuths:
 def answer(
     scene: str, *, room: int, x_m: float, rank: int | None, confidence: float = 0.5, heading_deg: float = 0.0
 ) -> Prediction:
-    return Prediction(
+    return prediction_of(
+        Pose(x_m=0.0, y_m=0.0, room_index=3, heading_deg=0.0),
         scene=scene,
         camera="hall",
         room="hall",
-        camera_height_m=1.5,
-        truth=Pose(x_m=0.0, y_m=0.0, room_index=3, heading_deg=0.0),
         stages={"lpo": Pose(x_m=x_m, y_m=0.0, room_index=room, heading_deg=heading_deg)},
         room_rank=rank,
         confidence=confidence,
@@ -368,13 +367,8 @@ class TestGalleryScores:
         assert (scores.located, scores.turned) == pytest.approx((2 / 3, 1 / 3))
 
     def test_missing_answer_is_a_miss(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
-        missing = Prediction(
-            scene="nook-0",
-            camera="nook",
-            room="nook",
-            camera_height_m=1.5,
-            truth=Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0),
-        )
+        truth = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
+        missing = prediction_of(truth, scene="nook-0", camera="nook", room="nook")
         (only,) = answers_in_galleries([missing], photographs)
         assert not only.located
         assert np.isinf(only.error_m)

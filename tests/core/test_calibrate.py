@@ -1,9 +1,11 @@
-"""Calibration of confidence, covariance and matching weights."""
+"""Calibration of confidence, covariance and matching weights, and the cohort that calibrates a fit."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_matching_weights
+from lalaloc_core.errors import BundleError, InvalidInputError
+from lalaloc_core.evaluate.calibrate import (
+    Answers,
+    calibrate,
+    cross_validate,
+    fit_confidence,
+    fit_matching_weights,
+    store_cohort,
+)
 from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
-from tests.strategies import seeds
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.synthetic import training_plans
+from lalaloc_core.localise.bundle import COHORT, Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
+from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, cost_by_chance, log_cost_to_chance
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import PoseRefiner
+from lalaloc_core.localise.pipeline import LocaliseConfig, localise
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.retrieval import build_grid, grid_costs
+from tests.core.questions import perfect_query, prediction_of
+from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
 # Model that generates the predictions of `believable`.
@@ -32,22 +51,17 @@ def result(
     latent_distance: float = 0.1,
 ) -> Prediction:
     """Return a prediction with a position error (m); NaN for no answer."""
-    answered = not math.isnan(error_m)
-    signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty}
-    signals |= {
+    signals = {
+        "log_odds": log_odds,
+        "cost": cost,
+        "uncertainty": uncertainty,
         "latent_distance": latent_distance,
         "cost_to_chance": answer_to_chance + 0.5,
         "answer_to_chance": answer_to_chance,
     }
-    return Prediction(
-        scene="a",
-        camera="0",
-        room="kitchen",
-        camera_height_m=1.5,
-        truth=TRUTH,
-        stages={"lpo": dataclasses.replace(TRUTH, x_m=error_m)} if answered else {},
-        signals={"lpo": signals} if answered else {},
-    )
+    if math.isnan(error_m):
+        return prediction_of(TRUTH)
+    return prediction_of(TRUTH, stages={"lpo": dataclasses.replace(TRUTH, x_m=error_m)}, signals={"lpo": signals})
 
 
 def confidence(model: LogisticModel, prediction: Prediction) -> float:
@@ -312,8 +326,85 @@ class TestCovariance:
         right = [bent(np.array([0.01 * k, 0.0]), 100.0 * np.eye(2)) for k in range(1, 6)]
         wrong = [bent(np.array([2.0, 0.0]), 100.0 * np.eye(2))] * 20
         plain = [result(0.1)] * 20
-        expected = both(right, []).position_factor
-        assert expected is not None
+        expected = present(both(right, []).position_factor)
         assert both(right + wrong + plain, []).position_factor == expected
         assert both(plain, []).position_factor is None
         assert both(right, []).heading_factor is None
+
+
+CAMERA_M = 1.5
+PLANS = training_plans(4, 0)
+
+
+@pytest.fixture(scope="module")
+def cohort(encoders: Encoders) -> Cohort:
+    return cohort_of(PLANS, encoders.manifest.profile_columns, 0)
+
+
+def log_cost_to_cohort(encoders: Encoders, cohort: Cohort | None, plan: FloorPlan, query: Query) -> float:
+    weights, config = MatchingWeights(), MatchingConfig()
+    grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+    cost = float(grid_costs(plan, grid, query, weights, config).cost.min())
+    expected = cost_by_chance(cohort, plan, query, config.grid_reach * 0.5, weights, config)
+    return log_cost_to_chance(cost, expected)
+
+
+@pytest.mark.parametrize("log_scale", [-3.5, -2.0], ids=["clear", "dim"])
+def test_only_the_own_home_fits_better_than_the_cohort(encoders: Encoders, cohort: Cohort, log_scale: float) -> None:
+    home, hall = crooked_flat(), plan_of(rectangle(14.0, 11.0))
+    query = perfect_query(encoders, home, (5.1, 1.3), log_scale=log_scale)
+    assert log_cost_to_cohort(encoders, cohort, home, query) < -0.5
+    assert log_cost_to_cohort(encoders, cohort, hall, query) > 0.5
+
+
+def test_signal_is_zero_without_cohort_or_profile(encoders: Encoders, cohort: Cohort) -> None:
+    home = crooked_flat()
+    query = perfect_query(encoders, home, (5.1, 1.3), log_scale=-3.5)
+    assert log_cost_to_cohort(encoders, None, home, query) == 0.0
+    assert log_cost_to_cohort(encoders, cohort, home, replace(query, profile=None)) == 0.0
+
+
+def test_cohort_has_a_fixed_size_and_is_reproducible(cohort: Cohort, encoders: Encoders) -> None:
+    columns = encoders.manifest.profile_columns
+    assert cohort.log_profile.shape == cohort.kind.shape == (min(SIZE, len(cohort.kind)), columns)
+    assert len(cohort.kind) > 500
+    assert set(np.unique(cohort.kind)) > {0, 1}
+    again = cohort_of(PLANS, columns, 0)
+    np.testing.assert_array_equal(again.log_profile, cohort.log_profile)
+
+
+class TestBundles:
+    @pytest.fixture
+    def with_cohort(self, opened_bundle: Bundle, cohort: Cohort, tmp_path: Path) -> Bundle:
+        folder = tmp_path / "bundle"
+        shutil.copytree(opened_bundle.folder, folder)
+        return store_cohort(Bundle.open(folder), cohort)
+
+    def test_cohort_is_stored_and_gives_signals(
+        self, with_cohort: Bundle, cohort: Cohort, optimiser: PoseRefiner
+    ) -> None:
+        found = present(Cohort.of_bundle(Bundle.open(with_cohort.folder)))
+        np.testing.assert_array_equal(found.kind, cohort.kind)
+        encoders, home = Encoders(with_cohort, threads=1), crooked_flat()
+        query = perfect_query(encoders, home, (5.1, 1.3), log_scale=-3.5)
+        grid = build_grid(home, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+        config = LocaliseConfig(every_stage=True)
+        signals = localise(home, grid, encoders, query, refiner=optimiser.refine, config=config).signals
+        expected = log_cost_to_cohort(encoders, cohort, home, query)
+        assert len(signals) == 3
+        for signal in signals.values():
+            assert signal.cost_to_chance == pytest.approx(expected, abs=0.05)
+        # The position lies between grid poses, so only refinement reaches the minimum.
+        assert signals["retrieval"].answer_to_chance == pytest.approx(expected, abs=0.05)
+        assert signals["lpo"].answer_to_chance < expected - 0.5
+
+    def test_older_bundle_has_no_cohort(self, opened_bundle: Bundle) -> None:
+        assert Cohort.of_bundle(opened_bundle) is None
+
+    @pytest.mark.parametrize("damage", ["no arrays", "other columns"])
+    def test_damaged_cohort_is_named(self, with_cohort: Bundle, cohort: Cohort, damage: str) -> None:
+        narrow = Cohort(cohort.log_profile[:, :-1], cohort.kind[:, :-1]).to_bytes()
+        (with_cohort.folder / COHORT).write_bytes(b"nothing" if damage == "no arrays" else narrow)
+        changed = write_manifest(with_cohort.folder, with_cohort.manifest)
+        with pytest.raises(BundleError, match=r"cohort\.npz"):
+            Cohort.of_bundle(changed)

@@ -25,7 +25,6 @@ LALALOC = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main;
 
 
 def run_in(folder: Path, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line in another folder."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)} | changes
     return subprocess.run(
         [*LALALOC, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
@@ -84,12 +83,64 @@ def test_errors_are_one_line(
     assert complaint in line
 
 
-@pytest.mark.parametrize("option", [["--heading", "400"], ["--camera-height", "-1"], ["--heading-tolerance", "50"]])
-def test_numbers_out_of_range_are_refused(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("command", "code", "message"),
+    [
+        ("evaluate --bundle {bundle} --out {out} --data nowhere", 2, "nowhere"),
+        ("evaluate --bundle {bundle} --out {out} --lighting warm", 2, "no photographs 'full/warm'"),
+        ("evaluate --bundle {bundle} --out {out} --data {own_data} --split train", 2, "split 'train'"),
+        ("evaluate --bundle {out} --homes 1", 1, "error: no model bundle at"),
+        ("export --run {out} --out {out} --version 1", 1, "error: no checkpoint at"),
+        ("score {out}", 1, "error: no evaluation run at"),
+        ("reproduce --table roof", 2, "unknown table 'roof'; --table is one of localisation"),
+        ("reproduce", 2, "no table is chosen"),
+        ("reproduce --table similarity", 2, "--data is missing"),
+        ("synth --out {out} --scenes 250 --split test", 2, "scenes is 250; the limits of split 'test' are 1 to 249"),
+        ("synth --out {out} --scenes 1 --height 33", 2, "height is 33; it must be an even number"),
+        ("synth --out {out} --scenes 1 --height 8", 2, "height is 8"),
+        ("synth --out {out} --scenes 1 --seed -1", 2, "seed is -1"),
+        ("synth --out {out} --scenes 1 --workers 0", 2, "workers is 0; the minimum is 1"),
+        ("synth --out {out} --scenes 1 --textures nowhere", 2, "no <category>/<material>/*.jpg below 'nowhere'"),
+        ("train layout --out {out} --skip-bad", 2, "--skip-bad"),
+        ("train layout --out {out} --data x --textures y", 2, "--textures"),
+        ("train layout --preset tiny-trunk --out {out} --photographs {out}", 2, "--photographs"),
+        ("train layout --preset tiny-trunk --out {out} --teacher {out}", 2, "--teacher"),
+        ("train layout --preset tiny-trunk --out {out} --layout-from {out}", 2, "--layout-from"),
+        ("train image --out {out} --data somewhere --render device", 2, "--render is for generated homes"),
+    ],
+)
+def test_invalid_request_is_refused_before_writing(
+    command: str, code: int, message: str, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = command.format(bundle=tiny_bundle, out=out, own_data=EXAMPLES / "own_data").split()
+    assert main(words) == code
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "",
+        "fly",
+        "train roof",
+        "evaluate --kind song",
+        "evaluate --limit 0",
+        "evaluate --grid-step -1",
+        "evaluate --workers -1",
+        "reproduce --limit 0",
+        "localise plan.json photo.jpg --heading 400",
+        "localise plan.json photo.jpg --camera-height -1",
+        "localise plan.json photo.jpg --heading-tolerance 50",
+    ],
+)
+def test_invalid_argument_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["localise", PLAN, KITCHEN, *option])
+        main(command.split())
     assert ended.value.code == 2
-    assert f"argument {option[0]}" in capsys.readouterr().err
+    options = [f"argument {word}" for word in command.split() if word.startswith("--")]
+    assert all(option in capsys.readouterr().err for option in options)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])

@@ -87,7 +87,7 @@ def test_moved_anchor_maps_the_same_places(place: tuple[float, float]) -> None:
 @pytest.mark.parametrize("place", PLACES)
 def test_geojson_is_read_anywhere(place: tuple[float, float]) -> None:
     plan = FloorPlan.from_dict(
-        plan_document(rectangle(4.0, 3.0, at=(-2.0, -1.5)), rectangle(5.0, 3.0, at=(2.2, -1.5)))
+        plan_document(rectangle(4.0, 3.0, corner=(-2.0, -1.5)), rectangle(5.0, 3.0, corner=(2.2, -1.5)))
         | {"anchor": {"longitude": place[0], "latitude": place[1], "north_deg": 0.0}}
     )
     assert plan.anchor is not None

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 import shapely
 import torch
@@ -17,52 +15,35 @@ from hypothesis import strategies as st
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
 from lalaloc_core.evaluate.methods.alignment import depth_aligner
+from lalaloc_core.evaluate.methods.decode import VdrDecode
 from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
+from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.evaluate.methods.similarity import DepthGrid, Layout
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.optimise import LpoConfig, PoseOptimiser
+from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.render.sampling import PoseSet
-from tests.core.questions import CAMERA_M, BareRoom, question_at
-from tests.core.test_headings import COLUMNS, RING, paint
-from tests.strategies import Scene, convex_polygons, crooked_flat, plan_of, room_polygons, scene_of, seeds
+from tests.core.questions import CAMERA_M, BareRoom, paint, question_at
+from tests.core.test_headings import COLUMNS, RING
+from tests.strategies import Scene, convex_polygons, crooked_flat, plan_of, present, room_polygons, scene_of, seeds
 
 ROWS = 16
 _ROUNDED = 2e-4
 
 
-class PaintedProfile(onnxruntime.InferenceSession):
-    """Stub of the image encoder's session: returns the wall profile painted on the picture (`paint`)."""
-
-    def __init__(self) -> None:
-        """Skip loading."""
-
-    def run(self, output_names: Any, input_feed: Any, run_options: Any = None) -> list[np.ndarray]:
-        assert output_names == ["ring", "log_profile", "log_scale"]
-        pixels = input_feed["image"][:, 0].astype(np.float64)
-        log_m = np.log((pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * 1e-4).astype(np.float32)
-        # Explicit layouts use neither the ring nor the predicted scale.
-        return [np.zeros((1, RING.channels, RING.sectors), np.float32), log_m, np.zeros_like(log_m)]
-
-
 @dataclass(frozen=True, eq=False)
 class PaintedRoom(BareRoom):
-    """Photograph that shows only its wall profile."""
-
     def image(self, height: int, width: int) -> np.ndarray:
         position = np.array([self.position_m])
         walls = self.plan.walls_m[self.plan.room_index_at(position)]
         return paint(wall_profile(position, np.array([self.heading]), walls, COLUMNS)[0])
-
-
-@pytest.fixture(scope="module")
-def painted(opened_bundle: Bundle) -> Encoders:
-    encoders = Encoders(opened_bundle, threads=1)
-    encoders._image = PaintedProfile()
-    return encoders
 
 
 def depth_job(scene: Scene, starts_m: np.ndarray, truths_m: np.ndarray, columns: int) -> RefinementJob:
@@ -112,36 +93,6 @@ class TestAligner:
         job = RefinementJob(**{**vars(job), "targets": thinned})
         np.testing.assert_allclose(aligner.refine(job).cost, 0.0, atol=1e-5)
 
-    @given(room_polygons(), seeds(), st.sampled_from(["l1", "l2"]))
-    @settings(max_examples=10)
-    def test_first_step_follows_finite_differences(self, polygon: list, seed: int, norm: Any) -> None:
-        scene = scene_of(plan_of(polygon), 1, seed)
-        start = scene.poses.position_m
-        targets = torch.linspace(0.0, 1.0, 3)[None]
-
-        # Smooth in the profile, so that differences and derivatives agree.
-        def embedding(profile_m: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-            return torch.stack([profile_m.log().mean(1), profile_m.square().mean(1), profile_m[:, 0]], dim=1)
-
-        job = RefinementJob(**{**vars(depth_job(scene, start, start, 32)), "targets": targets.numpy()})
-
-        def distance(offset: np.ndarray) -> float:
-            profile = torch.from_numpy(wall_profile(start + offset, np.zeros(1), scene.walls_m, 32))
-            residual = embedding(profile) - targets
-            return float(residual.abs().mean() if norm == "l1" else residual.norm())
-
-        step = 1e-5
-        gradient = np.array([(distance(step * e) - distance(-step * e)) / (2 * step) for e in np.eye(2)])
-        once = LpoConfig(method="adam", adam_steps=2, adam_learning_rate=1e-3)
-        moved = PoseOptimiser(embedding, 32, norm=norm, config=once).refine(job).position_m[0] - start[0]
-        # Adam's first step has the sign of the gradient; it is kept only where it lowers the distance.
-        clear = np.abs(gradient) > 1e-2 * np.abs(gradient).max()
-        if np.any(moved != 0.0):
-            assert (np.sign(moved[clear]) == -np.sign(gradient[clear])).all()
-            np.testing.assert_allclose(np.abs(moved[clear]), 1e-3, rtol=1e-2)
-        else:
-            assert distance(-1e-3 * np.sign(gradient)) >= distance(np.zeros(2)) - 1e-6
-
     def test_levenberg_marquardt_needs_squares(self) -> None:
         with pytest.raises(ConfigError, match="l1"):
             PoseOptimiser(lambda profile, *_: profile, 32, norm="l1", config=LpoConfig())
@@ -150,10 +101,10 @@ class TestAligner:
 class TestPredictedProfile:
     @given(heading=st.floats(-math.pi, TWO_PI))
     @settings(max_examples=15)
-    def test_profile_is_turned_to_heading_zero(self, painted: Encoders, heading: float) -> None:
+    def test_profile_is_turned_to_heading_zero(self, perfect: Encoders, heading: float) -> None:
         plan, position = crooked_flat(), (1.37, 1.12)
         image = PaintedRoom(plan, position, heading).image(0, 0)
-        profile, left_over = painted.profile(image, heading, CAMERA_M)
+        profile, left_over = perfect.profile(image, heading, CAMERA_M)
         assert abs(left_over) <= 0.5 * TWO_PI / COLUMNS + 1e-9
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
@@ -164,8 +115,7 @@ class TestPredictedProfile:
         predicted_profiles = []
         for view in (image, image[:, ::-1]):
             inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.array([CAMERA_M], np.float32)}
-            assert encoders._image is not None
-            (predicted,) = encoders._image.run(["log_profile"], inputs)
+            (predicted,) = present(encoders._image).run(["log_profile"], inputs)
             predicted_profiles.append(np.asarray(predicted)[0])
         assert left_over == 0.0
         np.testing.assert_allclose(
@@ -184,12 +134,12 @@ class TestMethod:
     @pytest.mark.parametrize("position", [(1.13, 1.02), (5.21, 1.42), (2.34, 4.81)])
     @pytest.mark.parametrize("heading", [None, 0.0, 2.3])
     def test_perfect_prediction_is_located(
-        self, painted: Encoders, position: tuple[float, float], heading: float | None
+        self, perfect: Encoders, position: tuple[float, float], heading: float | None
     ) -> None:
         plan = crooked_flat()
         photograph = None if heading is None else PaintedRoom(plan, position, heading)
         question = question_at(plan, position, photograph=photograph, heading=heading or 0.0)
-        answer = ExplicitLayout(painted).locate(question)
+        answer = ExplicitLayout(perfect).locate(question)
         errors = [math.hypot(f.x_m - position[0], f.y_m - position[1]) for f in answer.stages.values()]
         assert list(answer.stages) == ["retrieval", "vdr", "align"]
         assert list(answer.timings_ms) == ["encode", "retrieve", "vdr", "align"]
@@ -203,40 +153,68 @@ class TestMethod:
 
     @given(seed=seeds())
     @settings(max_examples=3)
-    def test_retrieval_minimises_mean_depth_difference(self, painted: Encoders, seed: int) -> None:
-        plan = _two_ceilings()
-        scene = scene_of(plan, 1, seed)
-        question = question_at(plan, scene.poses.position_m[0])
-        answer = ExplicitLayout(painted).locate(question)
-        expected = [
-            _slow_distance(question.true_profile(COLUMNS), plan, question.grid, k) for k in range(len(question.grid))
-        ]
-        assert answer.retrieved is not None
-        assert expected[answer.retrieved] == pytest.approx(min(expected), abs=1e-5)
-        assert answer.stages["retrieval"].distance == pytest.approx(min(expected), abs=1e-5)
+    def test_retrieval_minimises_mean_depth_difference(self, perfect: Encoders, seed: int) -> None:
+        document = crooked_flat().to_dict()
+        document["rooms"][1]["ceiling_height_m"] = 3.1
+        plan = FloorPlan.from_dict(document)
+        question = question_at(plan, scene_of(plan, 1, seed).poses.position_m[0])
+        answer = ExplicitLayout(perfect).locate(question)
+        profile_m, ceiling_m = question.true_profile(COLUMNS), question.ceiling_height_m
+        layout = Layout(profile_m=profile_m, camera_height_m=CAMERA_M, ceiling_height_m=ceiling_m)
+        expected = DepthGrid(plan, question.grid, CAMERA_M, rows=32, columns=COLUMNS).distances(layout)
+        assert expected[present(answer.retrieved)] == pytest.approx(expected.min(), abs=1e-5)
+        assert answer.stages["retrieval"].distance == pytest.approx(expected.min(), abs=1e-5)
 
-    def test_unknown_heading_is_refused(self, painted: Encoders) -> None:
+    def test_unknown_heading_is_refused(self, perfect: Encoders) -> None:
         with pytest.raises(InvalidInputError, match="heading"):
-            ExplicitLayout(painted).locate(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
+            ExplicitLayout(perfect).locate(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
 
 
-def _two_ceilings() -> FloorPlan:
-    document = crooked_flat().to_dict()
-    document["rooms"][1]["ceiling_height_m"] = 3.1
-    return FloorPlan.from_dict(document)
+class TrueDecoder(LayoutDecoder):
+    """Stub of a perfect decoder: the layout depth of the true pose for every latent."""
+
+    def __init__(self, question: Question) -> None:
+        super().__init__()
+        camera, ceiling = np.array([CAMERA_M]), np.array([question.ceiling_height_m])
+        self.depth = layout_depth(question.true_profile(COLUMNS)[None], camera, ceiling, DECODED_HEIGHT)
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        depth = torch.from_numpy(self.depth.astype(np.float32)).expand(len(latent), -1, -1)
+        return depth.repeat_interleave(DECODED_WIDTH // depth.shape[2], dim=2)
 
 
-def _slow_distance(profile_m: np.ndarray, plan: FloorPlan, grid: PoseSet, index: int) -> float:
-    """Return the mean |difference| of two depth images of 32 rows, under the ceiling of the pose's room."""
-    room = plan.rooms[int(grid.room_index[index])]
-    seen = wall_profile(grid.position_m[index][None], np.zeros(1), room.walls_m[None], COLUMNS)[0]
-    total = 0.0
-    for i in range(32):
-        elevation = (0.5 - (i + 0.5) / 32) * math.pi
-        height = room.ceiling_height_m - CAMERA_M if elevation > 0.0 else CAMERA_M
-        farthest = height / abs(math.sin(elevation))
-        pairs = zip(profile_m, seen, strict=True)
-        total += sum(
-            abs(min(a / math.cos(elevation), farthest) - min(b / math.cos(elevation), farthest)) for a, b in pairs
-        )
-    return total / (32 * COLUMNS)
+@pytest.mark.parametrize("position", [(1.4, 1.3), (2.1, 0.9), (3.1, 1.6)])
+def test_perfect_decoder_finds_the_truth(encoders: Encoders, position: tuple[float, float]) -> None:
+    question = question_at(plan_of([[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [0.0, 3.0]]), position)
+    answer = VdrDecode(encoders, TrueDecoder(question)).locate(question)
+    found = answer.stages["decode"]
+    assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.02
+    assert found.distance == pytest.approx(0.0, abs=0.01)
+    assert list(answer.timings_ms) == ["encode", "retrieve", "vdr", "decode"]
+
+
+@pytest.mark.parametrize("heading_known", [True, False])
+def test_retrieval_and_vdr_equal_lalaloc(encoders: Encoders, heading_known: bool) -> None:
+    torch.manual_seed(0)
+    question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
+    answer = VdrDecode(encoders, LayoutDecoder()).locate(question)
+    by_latent = LocaliseConfig(matching=MatchingConfig(use_profile=False))
+    expected = LaLaLoc(encoders, refine="vdr", config=by_latent).locate(question)
+    assert list(answer.stages) == ["retrieval", "vdr", "decode"]
+    assert {stage: answer.stages[stage] for stage in expected.stages} == expected.stages
+    assert answer.retrieved == expected.retrieved
+    # The decoder is untrained; the pose still stays in its room.
+    found = answer.stages["decode"]
+    assert crooked_flat().room_index_at(np.array([[found.x_m, found.y_m]]))[0] == found.room_index
+    if heading_known:
+        assert found.heading == pytest.approx(0.7)
+
+
+def test_decoded_layouts_have_the_compared_width(encoders: Encoders) -> None:
+    torch.manual_seed(0)
+    decoder = LayoutDecoder().eval()
+    latents = np.random.default_rng(0).normal(size=(3, 128)).astype(np.float32)
+    decoded = VdrDecode(encoders, decoder).decode(latents).reshape(3, DECODED_HEIGHT, COLUMNS)
+    with torch.no_grad():
+        whole = decoder(torch.from_numpy(latents)).numpy()
+    np.testing.assert_allclose(decoded, whole[:, :, :: DECODED_WIDTH // COLUMNS], atol=1e-6)

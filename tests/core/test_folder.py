@@ -40,7 +40,7 @@ def root(tmp_path: Path) -> Path:
 def write_scene(root: Path, name: str, poses: str = POSES, **plan: Any) -> Path:
     folder = root / name
     (folder / "rooms").mkdir(parents=True)
-    document = plan_document(rectangle(3.0, 3.0), rectangle(3.0, 2.0, at=(4.0, 0.0)), camera_height_m=1.3, **plan)
+    document = plan_document(rectangle(3.0, 3.0), rectangle(3.0, 2.0, corner=(4.0, 0.0)), camera_height_m=1.3, **plan)
     document["rooms"][1]["ceiling_height_m"] = 2.1
     (folder / "plan.json").write_text(json.dumps(document))
     (folder / "poses.csv").write_text(poses)
@@ -64,15 +64,11 @@ class TestReading:
         assert scene.photograph(study, dataset.appearances[0]).image(64, 128).mean() == 200
         assert pickle.loads(pickle.dumps(dataset)) == dataset
 
-    def test_height_column_is_optional(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, "home", "panorama,x_m,y_m,heading_deg\nhall.png,1,2,0\n")
-        assert OwnData(tmp_path).load("home").cameras[0].camera_height_m == 1.3
-
     def test_spreadsheet_tables_are_read(self, tmp_path: Path) -> None:
         rows = '\ufeffheading_deg, y_m,x_m,panorama\r\n90,2,1,"hall.png"\r\n\r\n,,,\r\n'
         write_scene(tmp_path, "home", rows)
         (camera,) = OwnData(tmp_path).load("home").cameras
-        assert camera.position_m.tolist() == [1.0, 2.0]
+        assert (camera.position_m.tolist(), camera.camera_height_m) == ([1.0, 2.0], 1.3)
 
     def test_splits_match_the_table(self, root: Path) -> None:
         write_scene(root, "barn")
@@ -121,6 +117,7 @@ class TestBadFiles:
             (",1,2,0,1.4", ["column 'panorama' is ''", "below the scene's folder"]),
             ("../home/hall.png,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
             ("/etc/passwd,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
+            ("hall.png,1,2,0,", ["column 'panorama' is 'hall.png': it is a duplicate"]),
         ],
     )
     def test_bad_cell_is_refused_or_left_out(self, tmp_path: Path, line: str, reasons: list[str]) -> None:
@@ -135,11 +132,6 @@ class TestBadFiles:
         problems: list[DatasetError] = []
         assert len(OwnData(tmp_path).load("home", problems).cameras) == 1
         assert [str(problem) for problem in problems] == [str(error)]
-
-    def test_duplicate_panorama_is_refused(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, "home", f"{HEADER}\nhall.png,1,2,0,\nhall.png,2,2,0,\n")
-        with pytest.raises(DatasetError, match=r"line 3, column 'panorama' is 'hall\.png': it is a dup"):
-            OwnData(tmp_path).load("home")
 
     @pytest.mark.parametrize(
         ("content", "reason"),
@@ -173,16 +165,6 @@ class TestBadFiles:
         with pytest.raises(DatasetError, match="crosses itself") as caught:
             OwnData(tmp_path).load("home")
         assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "room 2", folder / "plan.json")
-        assert caught.value.__cause__ is not None
-
-    def test_plan_in_millimetres_is_refused(self, tmp_path: Path) -> None:
-        folder = write_scene(tmp_path, "home")
-        document = plan_document(rectangle(4000.0, 3000.0))
-        (folder / "plan.json").write_text(json.dumps(document))
-        with pytest.raises(
-            DatasetError, match=r"4000 m across; the limit is 1000 m .* check that the coordinates are in met"
-        ):
-            OwnData(tmp_path).load("home")
 
     @pytest.mark.parametrize("name", ["house", "../home", "", "/"])
     def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
@@ -239,12 +221,6 @@ class TestOpening:
             open_dataset(path)
         assert caught.value.path == path
         assert str(path) in str(caught.value)
-
-    def test_two_data_sets_in_one_folder_are_refused(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, "home")
-        (tmp_path / "scene_00000").mkdir()
-        with pytest.raises(DatasetError, match="several data sets: Structured3D, own data"):
-            open_dataset(tmp_path)
 
 
 class TestWorkedExample:

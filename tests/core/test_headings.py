@@ -7,10 +7,8 @@ is therefore a wrong sign or an off-by-one between renderer, roll and search.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from hypothesis import given, settings
@@ -19,61 +17,30 @@ from hypothesis import strategies as st
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet
-from tests.strategies import Scene, crooked_flat, scenes
+from tests.core.questions import paint
+from tests.core.test_optimise import smooth_encoder
+from tests.strategies import crooked_flat, present
 
 RING = PRESETS["tiny"].ring
 COLUMNS, SECTORS = RING.profile_columns, RING.sectors
 SECTOR = TWO_PI / SECTORS
-CAMERA_M, CEILING_M = 1.5, 2.5
-_UNIT_M = 1e-4
+CAMERA_M = 1.5
 
 headings = st.floats(-math.pi, 2.0 * math.pi)
 
 
-def paint(profile_m: np.ndarray) -> np.ndarray:
-    """Return a panorama (4, columns, 3) whose pixels encode the wall profile in units of 0.1 mm."""
-    value = np.round(profile_m / _UNIT_M).astype(np.int64)
-    return np.repeat(np.stack([value >> 16, value >> 8 & 255, value & 255], axis=-1)[None], 4, axis=0).astype(np.uint8)
-
-
 def photograph_of(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
-    """Return the painted panorama of a pose."""
     walls = plan.walls_m[pose.room_index]
     return paint(wall_profile(pose.position_m, np.array([heading]), walls, COLUMNS)[0])
-
-
-class PaintedSession(onnxruntime.InferenceSession):
-    """Fake session of the image encoder: decodes the painted profile and returns its layout ring."""
-
-    def __init__(self, encoder: RingLayoutEncoder) -> None:
-        self.encoder = encoder
-
-    def run(self, output_names: Any, input_feed: Any, run_options: Any = None) -> list[np.ndarray]:
-        assert output_names == ["ring", "log_profile", "log_scale"]
-        pixels = torch.from_numpy(input_feed["image"].astype(np.float32))[:, 0]
-        profile = (pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * _UNIT_M
-        camera = torch.from_numpy(input_feed["camera_height_m"])
-        ring = self.encoder.ring(profile, camera, torch.full_like(camera, CEILING_M)).numpy()
-        return [ring, np.log(profile.numpy()), np.full_like(profile.numpy(), -5.0)]
-
-
-@pytest.fixture(scope="module")
-def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> Encoders:
-    encoders = Encoders(opened_bundle, threads=1)
-    assert isinstance(optimiser.encoder, RingLayoutEncoder)
-    encoders._image = PaintedSession(optimiser.encoder)
-    return encoders
 
 
 @pytest.fixture(scope="module")
@@ -85,21 +52,12 @@ POSE = PoseSet(np.array([[1.37, 1.12]]), np.array([0]))
 
 
 class TestRolls:
-    @given(scenes(), st.integers(-COLUMNS, COLUMNS))
-    def test_rolled_profile_is_the_profile_at_heading_zero(self, scene: Scene, shift: int) -> None:
-        def profiles(heading: float) -> np.ndarray:
-            headings = np.full(len(scene.poses), heading)
-            return wall_profile(scene.poses.position_m, headings, scene.walls_m, COLUMNS)
-
-        rolled = np.roll(profiles(shift * TWO_PI / COLUMNS), shift, axis=1)
-        assert np.isclose(rolled, profiles(0.0), rtol=1e-6).mean() > 0.98
-
-    def test_layout_ring_rolls_with_the_profile(self, smooth_encoder: RingLayoutEncoder) -> None:
+    def test_layout_ring_rolls_with_the_profile(self) -> None:
         profile = torch.empty(3, 128).uniform_(0.5, 6.0, generator=torch.Generator().manual_seed(0))
         heights = (torch.full((3,), 1.5), torch.full((3,), 2.5))
-        ring = smooth_encoder.ring(profile, *heights)
+        ring = smooth_encoder().ring(profile, *heights)
         for sectors in (1, 5, 63):
-            rolled = smooth_encoder.ring(profile.roll(2 * sectors, dims=1), *heights)
+            rolled = smooth_encoder().ring(profile.roll(2 * sectors, dims=1), *heights)
             torch.testing.assert_close(rolled, ring.roll(sectors, dims=2), atol=1e-5, rtol=1e-4)
 
     def test_image_ring_and_profile_roll_with_the_panorama(self) -> None:
@@ -147,41 +105,24 @@ class TestRealEncoders:
 
 
 class TestPerfectEncoder:
+    @pytest.mark.parametrize("known", [True, False])
     @given(headings)
     @settings(max_examples=30)
-    def test_known_heading_gives_the_latent_of_the_layout(
-        self, perfect: Encoders, flat: FloorPlan, heading: float
+    def test_nearest_hypothesis_has_the_latent_of_the_layout(
+        self, perfect: Encoders, flat: FloorPlan, known: bool, heading: float
     ) -> None:
-        query = perfect.query(photograph_of(flat, POSE, heading), heading, CameraHeight(CAMERA_M))
-        layout, profile_m = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
-        np.testing.assert_allclose(query.latents, layout, atol=2e-3)
-        assert query.profile is not None
-        np.testing.assert_allclose(np.exp(query.profile.log_m), profile_m, atol=2e-4)
-
-    @given(headings)
-    @settings(max_examples=30)
-    def test_unknown_heading_has_a_hypothesis_with_the_latent(
-        self, perfect: Encoders, flat: FloorPlan, heading: float
-    ) -> None:
-        query = perfect.query(photograph_of(flat, POSE, heading), None, CameraHeight(CAMERA_M))
+        query = perfect.query(photograph_of(flat, POSE, heading), heading if known else None, CameraHeight(CAMERA_M))
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
         layout, profile_m = perfect.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
         np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
-        assert query.profile is not None
-        np.testing.assert_allclose(np.exp(query.profile.log_m[nearest]), profile_m[0], atol=2e-4)
+        np.testing.assert_allclose(np.exp(present(query.profile).log_m[nearest]), profile_m[0], atol=2e-4)
 
     @given(heading=headings, share=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
     @settings(max_examples=30)
     def test_inexact_heading_is_searched_within_its_tolerance(
-        self,
-        perfect: Encoders,
-        optimiser: PoseRefiner,
-        flat: FloorPlan,
-        heading: float,
-        share: float,
-        tolerance: float,
+        self, perfect: Encoders, optimiser: PoseRefiner, flat: FloorPlan, heading: float, share: float, tolerance: float
     ) -> None:
         image = photograph_of(flat, POSE, heading)
         query = perfect.query(image, heading + share * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
@@ -197,13 +138,7 @@ class TestPerfectEncoder:
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)
     def test_search_finds_the_pose_and_the_heading(
-        self,
-        perfect: Encoders,
-        optimiser: PoseRefiner,
-        flat: FloorPlan,
-        heading: float,
-        known: bool,
-        place: int,
+        self, perfect: Encoders, optimiser: PoseRefiner, flat: FloorPlan, heading: float, known: bool, place: int
     ) -> None:
         position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
         pose = PoseSet(position[None], flat.room_index_at(position[None]))

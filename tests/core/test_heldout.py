@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import itertools
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,16 +19,15 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.synthetic.heldout import HeldoutPhotograph, HeldoutScenes
 from lalaloc_core.learn.heldout.furnish import LEVELS, Furnishing
-from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HeldoutHome, HomeKey, home_of, traced_home
-from lalaloc_core.learn.heldout.openings import sample_openings
+from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HomeKey, home_of, traced_home
 from lalaloc_core.learn.heldout.outlines import AREAS_M2, sample_outline
 from lalaloc_core.learn.heldout.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.tracing import Tracer
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
+from tests.core.questions import run_info
 
-PACKAGE = Path(__file__).parents[2] / "lalaloc_core" / "heldout"
 HOMES = 4
 
 
@@ -41,16 +39,6 @@ def photograph(scenes: HeldoutScenes, name: str, camera: int) -> HeldoutPhotogra
     (shot,) = scenes.load(name).cameras[camera].photographs.values()
     assert isinstance(shot, HeldoutPhotograph)
     return shot
-
-
-class TestIndependence:
-    @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.stem)
-    def test_heldout_imports_nothing_of_the_training_generator(self, path: Path) -> None:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-        ours = {name for name in imported if name is not None and name.startswith("lalaloc_core")}
-        plain = {"lalaloc_core.floorplan", "lalaloc_core.conventions"}
-        assert {name for name in ours if not name.startswith("lalaloc_core.learn.heldout")} <= plain
 
 
 class TestPlans:
@@ -152,30 +140,15 @@ class TestTruth:
 
 
 class TestFurniture:
-    def test_full_rooms_have_more_furniture_than_simple_ones(self) -> None:
-        for key in keys():
-            home = home_of(key)
-            taken = {level: self.area(home, key, level) for level in LEVELS}
-            assert taken["empty"] == 0.0 < taken["simple"] < taken["full"]
-
-    @staticmethod
-    def area(home: HeldoutHome, key: HomeKey, level: str) -> float:
-        furnishing = Furnishing(home.plan, home.openings, level, key.rng(1))  # pyright: ignore[reportArgumentType]
-        return sum(float(shapely.area(shape)) for shape in furnishing.taken)
-
-    def test_full_room_contains_the_simple_furniture(self) -> None:
-        key = keys()[0]
+    @pytest.mark.parametrize("key", keys())
+    def test_furniture_grows_with_the_level_within_its_room(self, key: HomeKey) -> None:
         home = home_of(key)
-        simple, full = (Furnishing(home.plan, home.openings, level, key.rng(1)) for level in ("simple", "full"))
-        for less, more in zip(simple.taken, full.taken, strict=True):
+        empty, simple, full = (Furnishing(home.plan, home.openings, level, key.rng(1)).taken for level in LEVELS)
+        areas_m2 = [sum(float(shapely.area(shape)) for shape in taken) for taken in (empty, simple, full)]
+        assert areas_m2[0] == 0.0 < areas_m2[1] < areas_m2[2]
+        for room, less, more in zip(home.plan.plan.rooms, simple, full, strict=True):
             assert less.difference(more.buffer(1e-6)).area == pytest.approx(0.0, abs=1e-9)
-
-    def test_furniture_stays_in_its_room(self) -> None:
-        for key in keys():
-            home = home_of(key)
-            furnishing = Furnishing(home.plan, home.openings, "full", key.rng(1))
-            for room, taken in zip(home.plan.plan.rooms, furnishing.taken, strict=True):
-                assert taken.difference(room.shape).area == 0.0
+            assert more.difference(room.shape).area == 0.0
 
 
 class TestScenes:
@@ -223,23 +196,16 @@ class TestScenes:
     )
     def test_invalid_arguments_are_refused(self, wrong: dict, message: str) -> None:
         with pytest.raises(InvalidInputError, match=message):
-            build_dataset(run_info(wrong))
+            build_dataset(heldout_run(**wrong))
 
 
-def run_info(generated: dict) -> RunInfo:
-    return RunInfo(
-        label="test",
-        method="oracle",
-        kind="layout",
-        dataset="",
-        split="test",
-        generated={"generator": "heldout"} | generated,
-    )
+def heldout_run(**generated: Any) -> RunInfo:
+    return run_info(method="oracle", generated={"generator": "heldout"} | generated)
 
 
 class TestRuns:
     def test_run_uses_heldout_homes(self) -> None:
-        dataset = build_dataset(run_info({"homes": 2, "furniture": "empty"}))
+        dataset = build_dataset(heldout_run(homes=2, furniture="empty"))
         assert dataset == HeldoutScenes(homes=2, furniture="empty")
         assert dataset.description == "out-of-family homes (seed 0)"
 
@@ -257,10 +223,3 @@ class TestRuns:
         arguments = parser.parse_args(["evaluate", "--generator", "heldout", "--method", "oracle", *options])
         with pytest.raises(InvalidInputError, match=message):
             arguments.run(arguments)
-
-
-def test_seed_determines_the_openings() -> None:
-    first, second = (
-        sample_openings(sample_plan(rng, "x"), rng) for rng in (np.random.default_rng(3) for _ in range(2))
-    )
-    assert [(o.kind, o.left_m, o.right_m) for o in first] == [(o.kind, o.left_m, o.right_m) for o in second]

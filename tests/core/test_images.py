@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
-import time
 import zipfile
 import zlib
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from PIL import Image, ImageChops
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
 from lalaloc_core.panorama.segments import count_scans
+from tests.growth import assert_no_worse_than_linear
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
@@ -41,11 +42,6 @@ def read(content: bytes, limits: PanoramaLimits | None = None) -> np.ndarray:
     return read_panorama(content, height=HEIGHT, width=WIDTH, limits=limits)
 
 
-def png_header(width: int, height: int) -> bytes:
-    """Return a PNG with a size in its header and almost no pixels."""
-    return png(width, height, b"\0" * 100)
-
-
 def png(width: int, height: int, rows: bytes, *, depth: int = 8, colour_type: int = 2) -> bytes:
     """Return a PNG of rows, each starting with its filter type."""
 
@@ -62,10 +58,6 @@ def of_scans(width: int, height: int, added: int) -> bytes:
     # A scan starts with its Huffman table.
     begin = content.rindex(b"\xff\xc4", 0, content.rindex(b"\xff\xda"))
     return content[:-2] + added * content[begin:-2] + content[-2:]
-
-
-def grey_16_bit(values: np.ndarray) -> bytes:
-    return encoded(Image.fromarray(values.astype(np.uint16)))
 
 
 class TestAccepted:
@@ -133,8 +125,8 @@ class TestAccepted:
         assert pixels[10, 10].tolist() == list(NEUTRAL)
         assert pixels[10, 50].tolist() == [200, 200, 200]
 
-    @pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (4, 2), (6, 4)])
-    def test_16_bit_colour_keeps_tones(self, colour_type: int, channels: int) -> None:
+    @pytest.mark.parametrize(("colour_type", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
+    def test_16_bit_tones_are_kept(self, colour_type: int, channels: int) -> None:
         values = np.linspace(0, 65535, 128 * 256 * channels).reshape(128, 256, channels).astype(">u2")
         if channels in (2, 4):
             values[..., -1] = 65535
@@ -150,31 +142,21 @@ class TestAccepted:
         assert (pixels == pixels[..., :1]).all()
         assert pixels[24, 56].tolist() == [255, 255, 255]
 
-    def test_16_bit_grey_keeps_tones(self) -> None:
-        ramp = np.tile(np.linspace(0, 65535, 256).astype(np.uint16), (128, 1))
-        pixels = read(grey_16_bit(ramp))
-        expected = ramp.reshape(128, WIDTH, 4).mean(axis=2)[0] / 257.0
-        np.testing.assert_allclose(pixels[10, :, 0], expected, atol=2.0)
-
-    def test_exif_orientation_is_applied(self) -> None:
-        exif = Image.Exif()
-        exif[0x0112] = 6  # stored turned; the viewer turns it a quarter clockwise
-        turned = picture(height=256).transpose(Image.Transpose.ROTATE_90)
-        content = encoded(turned, "JPEG", exif=exif.tobytes(), quality=95)
-        np.testing.assert_allclose(read(content).astype(int), read(encoded(picture(height=256))), atol=12)
-
-    @pytest.mark.parametrize("orientation", range(1, 9))
-    def test_every_exif_orientation_is_undone(self, orientation: int) -> None:
-        turned = [
-            Image.Transpose.FLIP_LEFT_RIGHT,
-            Image.Transpose.ROTATE_180,
-            Image.Transpose.FLIP_TOP_BOTTOM,
-            Image.Transpose.TRANSPOSE,
-            Image.Transpose.ROTATE_90,
-            Image.Transpose.TRANSVERSE,
-            Image.Transpose.ROTATE_270,
-        ]
-        stored = picture() if orientation == 1 else picture().transpose(turned[orientation - 2])
+    @pytest.mark.parametrize(
+        ("orientation", "turned"),
+        [
+            (1, None),
+            (2, Image.Transpose.FLIP_LEFT_RIGHT),
+            (3, Image.Transpose.ROTATE_180),
+            (4, Image.Transpose.FLIP_TOP_BOTTOM),
+            (5, Image.Transpose.TRANSPOSE),
+            (6, Image.Transpose.ROTATE_90),
+            (7, Image.Transpose.TRANSVERSE),
+            (8, Image.Transpose.ROTATE_270),
+        ],
+    )
+    def test_exif_orientation_is_undone(self, orientation: int, turned: Image.Transpose | None) -> None:
+        stored = picture() if turned is None else picture().transpose(turned)
         exif = Image.Exif()
         exif[0x0112] = orientation
         np.testing.assert_array_equal(read(encoded(stored, exif=exif.tobytes())), read(encoded(picture())))
@@ -254,16 +236,11 @@ class TestScans:
 
     @pytest.mark.parametrize("unit", [b"\xff\x00", b"\xff\xff", b"\xff\xd0", b"\xff\x01", b"\xff\xe0\0\2", b"\0"])
     def test_scan_count_takes_linear_time(self, unit: bytes) -> None:
-        def seconds(size: int) -> float:
+        def count(size: int) -> Callable[[], int]:
             content = b"\xff\xd8\xff\xda\0\2" + unit * (size // len(unit))
-            took = []
-            for _ in range(5):
-                begin = time.process_time()
-                count_scans(content, 20)
-                took.append(time.process_time() - begin)
-            return min(took)
+            return lambda: count_scans(content, 20)
 
-        assert seconds(4_000_000) < 2.5 * seconds(2_000_000) + 1e-3
+        assert_no_worse_than_linear(count, 2_000_000)
 
     @given(st.binary(max_size=200))
     def test_any_bytes_have_a_scan_count(self, tail: bytes) -> None:
@@ -310,21 +287,15 @@ class TestRefused:
 
     @pytest.mark.parametrize(("width", "height"), [(20_000, 10_000), (14_200, 7_100), (2**31 - 1, 2**30)])
     def test_decompression_bomb_is_refused_by_header(self, width: int, height: int) -> None:
-        begin = time.perf_counter()
+        # The file has almost no pixels.
         with pytest.raises(InvalidPanoramaError, match=r"pixels|damaged"):
-            read(png_header(width, height))
-        assert time.perf_counter() - begin < 1.0
+            read(png(width, height, b"\0" * 100))
 
-    def test_jpeg_with_many_scans_is_refused_early(self) -> None:
+    def test_jpeg_with_many_scans_is_refused(self) -> None:
         content = of_scans(14_000, 7_000, 400)
         assert len(content) < 700_000
-        begin = time.perf_counter()
-        with pytest.raises(
-            InvalidPanoramaError, match=r"a JPEG with more than 20 scans, the limit \(LALALOC_MAX_SCANS\)"
-        ):
+        with pytest.raises(InvalidPanoramaError, match=r"JPEG with more than 20 scans, the limit \(LALALOC_MAX_SCANS"):
             read(content)
-        # Decoding it takes most of a minute.
-        assert time.perf_counter() - begin < 1.0
 
     @pytest.mark.parametrize("kind", [b"VP8X", b"VP8L", b"VP8 "])
     def test_webp_bomb_is_refused_before_allocation(self, kind: bytes) -> None:

@@ -17,13 +17,7 @@ from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import Layouts, SeenThrough
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, precisions
-from lalaloc_core.localise.poses import (
-    PredictedCeiling,
-    PredictedOpenings,
-    PredictedProfile,
-    PredictedRoomType,
-    Query,
-)
+from lalaloc_core.localise.poses import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType, Query
 from tests.strategies import seeds
 
 CONFIG = MatchingConfig(tail=2.0)
@@ -36,10 +30,7 @@ PLAN = FloorPlan.from_dict(
             {"name": "hall", "type": "corridor", "ceiling_height_m": 2.5, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]},
             {"name": "den", "ceiling_height_m": 3.5, "polygon": [[4.1, 0], [8, 0], [8, 3], [4.1, 3]]},
         ],
-        "openings": [
-            {"kind": "door", "line": [[4, 1], [4, 2]]},
-            {"kind": "window", "line": [[1, 0], [2, 0]]},
-        ],
+        "openings": [{"kind": "door", "line": [[4, 1], [4, 2]]}, {"kind": "window", "line": [[1, 0], [2, 0]]}],
     }
 )
 
@@ -78,15 +69,6 @@ class TestWalls:
                     total += math.log(1.0 + ((math.log(d) - mu) / (2.0 * s)) ** 2)
                 assert cost == pytest.approx(total / columns, rel=1e-4, abs=1e-5)
 
-    @given(seeds())
-    def test_cost_is_zero_at_the_prediction_and_never_negative(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        query = make_query(rng.normal(size=(1, 8)).astype(np.float32), rng.normal(size=(1, 8)))
-        assert query.profile is not None
-        found = costs(query, hall_layouts(np.concatenate([query.profile.log_m, rng.normal(size=(20, 8))])))[0]
-        assert found[0] == 0.0
-        assert found.min() == 0.0
-
     def test_open_door_costs_less_than_a_wrong_room(self) -> None:
         query = make_query(np.zeros((1, 128)), np.full((1, 128), math.log(0.05)))
         door, other_room = np.zeros(128), np.full(128, 0.3)
@@ -105,12 +87,6 @@ class TestWalls:
         np.testing.assert_allclose(
             precisions(make_query(np.zeros((1, 4)), np.full((1, 4), -80.0)), 0.0, CONFIG), 1.0 / (2.0 * 1e-3)
         )
-
-    def test_profiles_are_compared_if_predicted_and_enabled(self) -> None:
-        query = make_query(np.zeros((1, 4)), np.zeros((1, 4)))
-        assert MatchingConfig().compares_profiles(query)
-        assert not MatchingConfig(use_profile=False).compares_profiles(query)
-        assert not MatchingConfig().compares_profiles(dataclasses.replace(query, profile=None))
 
     def test_opening_fits_the_wall_or_the_room_behind(self) -> None:
         columns, wall, behind = 16, np.zeros((3, 16)), math.log(4.0)

@@ -12,7 +12,6 @@ import torch
 
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.nets import load_layout_encoder
-from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder, pad_around
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperImageEncoder, PaperLayoutEncoder, ResNet
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
@@ -104,12 +103,6 @@ class TestPaper:
         assert "fc.weight" in state
         load_layout_encoder("paper", old, safetensors.torch.save(state))
 
-    @pytest.mark.parametrize("depth", [18, 50])
-    def test_narrow_backbone_has_the_same_layers(self, depth: int) -> None:
-        narrow, usual = ResNet(depth, width=16), ResNet(depth)
-        assert narrow.state_dict().keys() == usual.state_dict().keys()
-        assert 4 * narrow.channels == usual.channels
-
 
 class TestRing:
     def test_latents_are_unit_vectors_of_the_configured_size(self) -> None:
@@ -166,13 +159,6 @@ class TestRing:
             RingLayoutEncoder(dataclasses.replace(TINY, profile_columns=33))
         with pytest.raises(ValueError, match="sectors"):
             RingImageEncoder(dataclasses.replace(TINY, sectors=24, profile_columns=48))
-
-
-class TestDecoder:
-    @pytest.mark.parametrize("batch", [1, 3])
-    def test_decoder_output_shape(self, batch: int) -> None:
-        decoded = LayoutDecoder(16).eval()(torch.randn(batch, 16))
-        assert decoded.shape == (batch, 32, 64)
 
 
 class TestLoading:

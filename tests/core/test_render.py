@@ -23,7 +23,7 @@ from lalaloc_core.floorplan import FloorPlan, pad_walls
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.profile import cast_rays, wall_profile
 from lalaloc_core.render.reference import reference_depth, room_mesh
-from tests.strategies import Scene, plan_of, plans, rectangle, scenes
+from tests.strategies import Scene, plan_of, plans, present, rectangle, scenes
 
 COLUMNS = 64
 CAMERA_M = 1.4
@@ -125,8 +125,7 @@ class TestTorch:
         position = torch.tensor(scene.poses.position_m, requires_grad=True)
         profile = wall_profile(position, heading.double().requires_grad_(), torch.tensor(scene.walls_m), COLUMNS)
         profile.sum().backward()
-        assert position.grad is not None
-        assert bool(torch.isfinite(position.grad).all())
+        assert bool(torch.isfinite(present(position.grad)).all())
 
     def test_layout_depth_gradient_is_through_walls_only(self) -> None:
         profile = torch.full((1, 4), 2.0, dtype=torch.float64, requires_grad=True)
@@ -154,11 +153,6 @@ class TestPixelContract:
             assert profile[column] == pytest.approx(distance / half_pixel, rel=1e-9)
             # The axis lies between two pixels.
             assert profile[column - 1] == pytest.approx(distance / half_pixel, rel=1e-9)
-
-    def test_heading_east_centres_the_east_wall(self) -> None:
-        profile = self.profile(math.pi / 2, 1024)
-        assert profile[512] == pytest.approx(self.right, rel=1e-4)
-        assert profile[256] == pytest.approx(self.ahead, rel=1e-4)
 
     @given(scenes(), st.integers(-COLUMNS, COLUMNS))
     def test_turning_rolls_the_profile_left(self, scene: Scene, columns: int) -> None:

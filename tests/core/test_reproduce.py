@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import pytest
+import safetensors.torch
+import torch
 
 from lalaloc_core.cli import main
-from lalaloc_core.errors import RunError
-from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS
-from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, draw_vogel_samples, markdown
+from lalaloc_core.errors import CheckpointError, ConfigError, RunError
+from lalaloc_core.evaluate.reproduce import ablations
+from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
+from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, markdown
 from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
 from lalaloc_core.evaluate.reproduce.tables import TABLES
 from lalaloc_core.evaluate.runs.factories import build_method
-from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.evaluate.runs.score import Scores, StageScores
 from lalaloc_core.floorplan import FloorPlan
-from tests.core.questions import question_at
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.data import TrainingData
+from lalaloc_core.learn.training.run import train_layout
+from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
+from tests.core.questions import question_at, run_info
 from tests.strategies import plan_document, rectangle
 
 
@@ -76,15 +84,8 @@ class TestTables:
     def test_every_row_has_a_valid_method(self, table, tiny_bundle: Path) -> None:
         for row in table.rows:
             ask = row.query
-            info = RunInfo(
-                label=row.name,
-                method=ask.method,
-                kind=ask.kind,
-                dataset="",
-                split=table.split,
-                settings=dict(ask.settings),
-                bundle=None if ask.model is None else str(tiny_bundle),
-            )
+            bundle = None if ask.model is None else str(tiny_bundle)
+            info = run_info(method=ask.method, kind=ask.kind, settings=dict(ask.settings), bundle=bundle)
             assert build_method(info) is not None
 
     def test_main_table_has_both_architectures(self) -> None:
@@ -106,22 +107,13 @@ class TestPaperSetting:
         assert RowQuery(method="icp").run_settings == {}
 
     def test_plan_openings_are_ignored(self, tiny_bundle: Path) -> None:
-        bare = plan_document(rectangle(4.0, 3.0), rectangle(4.3, 3.6, at=(4.2, 0.0)))
+        bare = plan_document(rectangle(4.0, 3.0), rectangle(4.3, 3.6, corner=(4.2, 0.0)))
         door = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
         window = {"kind": "window", "line": [[1.0, 0.0], [2.5, 0.0]]}
         plans = [FloorPlan.from_dict(bare), FloorPlan.from_dict({**bare, "openings": [door, window]})]
         costs = []
         for settings in (RowQuery().run_settings, {}):
-            info = RunInfo(
-                label="a row",
-                method="lalaloc",
-                kind="layout",
-                dataset="",
-                split="test",
-                settings=settings,
-                bundle=str(tiny_bundle),
-            )
-            method = build_method(info)
+            method = build_method(run_info(settings=settings, bundle=str(tiny_bundle)))
             answers = [method.locate(question_at(plan, (1.3, 1.4))) for plan in plans]
             costs.append([[candidate.pose.distance for candidate in answer.candidates] for answer in answers])
         in_the_paper, usual = costs
@@ -158,20 +150,6 @@ class TestCommand:
         printed = capsys.readouterr().out
         assert all(f"{table.name} " in printed for table in TABLES)
 
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (["--table", "roof"], "unknown table 'roof'; --table is one of localisation"),
-            ([], "no table is chosen"),
-            (["--table", "similarity"], "--data is missing"),
-        ],
-    )
-    def test_invalid_request_has_exit_code_2(
-        self, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert main(["reproduce", *arguments]) == 2
-        assert message in capsys.readouterr().err
-
     def test_tables_share_runs(self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
         data, out = str(tmp_path / "scenes"), tmp_path / "out"
         for split in ("validation", "test"):
@@ -195,6 +173,116 @@ class TestCommand:
         assert len(list((out / "runs").iterdir())) == 11
 
 
-def test_vogel_figure_needs_its_rows(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not enough values"):
-        draw_vogel_samples(result(), tmp_path / "figure.png")
+CPU = torch.device("cpu")
+HOMES = GeneratedScenes(homes=3, shots_per_home=2)
+
+
+def differences(first: dict[str, object], second: dict[str, object], path: str = "") -> set[str]:
+    """Return the paths of the settings in which two configurations differ."""
+    found: set[str] = set()
+    for key, value in first.items():
+        other = second[key]
+        if isinstance(value, dict) and isinstance(other, dict):
+            found |= differences(value, other, f"{path}{key}.")
+        elif value != other:
+            found.add(path + key)
+    return found
+
+
+class TestTable:
+    @pytest.mark.parametrize(
+        ("name", "changed"),
+        [
+            ("layout-log-ratio", {"layout.decode_weight"}),
+            ("layout-decode", {"layout.log_ratio_weight"}),
+            ("layout-resnet50", {"paper.layout_depth"}),
+            ("layout-mlp", {"paper.layout_predictor"}),
+            ("image-log-ratio", {"image.l2_weight", "image.log_ratio_weight"}),
+            ("image-l2-log-ratio", {"image.log_ratio_weight"}),
+            ("image-l2-kd", {"image.kd_weight"}),
+            ("end-to-end", set()),
+        ],
+    )
+    def test_small_variant_differs_only_in_its_setting(self, name: str, changed: set[str]) -> None:
+        base, config = ABLATIONS[BASE].config["small"], ABLATIONS[name].config["small"]
+        assert differences(base.to_dict(), config.to_dict()) == changed | {"name"}
+
+    def test_full_variants_follow_the_paper(self) -> None:
+        base = ABLATIONS[BASE].config["full"]
+        assert (base.paper.width, base.paper.layout_depth, base.paper.image_depth) == (64, 18, 50)
+        assert (base.image.batch, base.image.optimiser.learning_rate) == (64, 0.1)
+        # "When trained with a variant of the log-ratio, the training routine follows that of the layout branch."
+        for name in ("image-log-ratio", "image-l2-log-ratio", "image-l2-kd", "end-to-end"):
+            image, layout = ABLATIONS[name].config["full"].image, ABLATIONS[name].config["full"].layout
+            assert (image.batch, image.steps, image.optimiser) == (4, layout.steps, layout.optimiser)
+
+    @pytest.mark.parametrize("budget", BUDGETS)
+    def test_variants_share_networks_of_the_base(self, budget: Budget) -> None:
+        for ablation in ABLATIONS.values():
+            if ablation.layout_from is not None:
+                teacher = ABLATIONS[ablation.layout_from].config[budget]
+                assert (teacher.paper, teacher.turns) == (ablation.config[budget].paper, ablation.config[budget].turns)
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shrink every small variant so that it trains in a second."""
+
+    sizes = {"paper.width": 8, "paper.image_depth": 18, "paper.image_height": 64, "paper.image_width": 128}
+    sizes |= {"layout.steps": 3, "layout.homes_per_step": 2, "image.steps": 3, "image.batch": 2}
+    sizes |= {"layout.triplets.positives": 1, "layout.triplets.negatives": 3}
+    small = {
+        name: dataclasses.replace(ablation, config={"small": ablation.config["small"].with_settings(sizes)})
+        for name, ablation in ABLATIONS.items()
+    }
+    monkeypatch.setattr(ablations, "ABLATIONS", small)
+    monkeypatch.setattr(ablations, "_VALIDATION_SCENES", 1)
+
+
+def train(name: str, out: Path, *, homes: GeneratedScenes = HOMES) -> Bundle:
+    return train_ablation(name, "small", homes, out, device=CPU, workers=0)
+
+
+def written(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.usefixtures("brief")
+class TestTraining:
+    def test_image_variants_share_stage_one(self, tmp_path: Path) -> None:
+        first = train("image-l2-kd", tmp_path)
+        assert first.folder == tmp_path / "image-l2-kd" / "bundle"
+        assert first.manifest.training["budget"] == "small"
+        assert first.manifest.training["image"]["data"]["description"] == HOMES.description
+        assert not (tmp_path / "image-l2-kd" / "layout.pt").exists()
+        teacher = Checkpoint.load(tmp_path / BASE / "layout.pt", stage="layout")
+        decoder = safetensors.torch.load(first.read(DECODER_WEIGHTS))
+        bias = decoder["to_depth.bias"]
+        torch.testing.assert_close(bias, teacher.inference_weights["decoder"]["to_depth.bias"])
+        before = written(tmp_path)
+        assert train("image-l2-kd", tmp_path).sha256 == first.sha256
+        assert written(tmp_path) == before
+
+    def test_layout_variant_has_no_image_encoder(self, tmp_path: Path) -> None:
+        bundle = train("layout-log-ratio", tmp_path)
+        assert not {IMAGE_ONNX, DECODER_WEIGHTS} & set(bundle.manifest.files)
+        # An interrupted export is repeated without training.
+        before = written(tmp_path)["layout-log-ratio/layout.pt"]
+        (bundle.folder / MANIFEST_NAME).unlink()
+        assert train("layout-log-ratio", tmp_path).sha256 == bundle.sha256
+        assert written(tmp_path)["layout-log-ratio/layout.pt"] == before
+
+    def test_variant_resumes_on_its_own_data_set_only(self, tmp_path: Path) -> None:
+        config = ablations.ABLATIONS["layout-mlp"].config["small"]
+        shorter = config.with_settings({"layout.steps": 2})
+        train_layout(shorter, tmp_path / "layout-mlp", device=CPU, data=TrainingData(dataset=HOMES), workers=0)
+        with pytest.raises(CheckpointError, match="not on"):
+            train("layout-mlp", tmp_path, homes=dataclasses.replace(HOMES, seed=1))
+        resumed = train("layout-mlp", tmp_path)
+        assert Checkpoint.load(tmp_path / "layout-mlp" / "layout.pt").step == 3
+        assert resumed.manifest.training["layout"]["steps"] == 3
+        assert resumed.manifest.layout_config["layout_predictor"] == "mlp"
+
+    def test_unknown_variant_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="unknown variant 'layout-resnet34'"):
+            train("layout-resnet34", tmp_path)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -25,8 +25,7 @@ from lalaloc_core.learn.data.structured3d_splits import ERRATA, EXCLUDED_BY_PAPE
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import random_poses
-from tests.polygons import same_ring
-from tests.strategies import crooked_flat, plan_of, plans, rectangle, room_polygons, seeds
+from tests.strategies import crooked_flat, plan_of, plans, rectangle, room_polygons, same_ring, seeds
 from tests.structured3d_scene import (
     HEIGHT,
     WIDTH,
@@ -93,10 +92,6 @@ class TestRings:
         rings = chain_rings([(0, 1), (5, 6), (1, 2), (6, 7), (2, 0), (7, 5)])
         assert [sorted(ring) for ring in rings] == [[0, 1, 2], [5, 6, 7]]
 
-    def test_two_parallel_lines_are_no_ring(self) -> None:
-        with pytest.raises(OpenRingError, match=r"2 junctions \[4, 5\]; the minimum is three"):
-            chain_rings([(4, 5), (5, 4)])
-
     @pytest.mark.parametrize("lines", [[(0, 1), (1, 2)], [(0, 1), (1, 2), (2, 0), (2, 3)], [(4, 4)] * 2])
     def test_open_ring_error_names_the_junction(self, lines: list[tuple[int, int]]) -> None:
         with pytest.raises(OpenRingError, match=r"junction \d joins \d of its lines"):
@@ -124,7 +119,7 @@ class TestRings:
 
 
 class TestPlan:
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+    @settings(max_examples=40)
     @given(plans(), seeds(), st.floats(-3.0, 3.0))
     def test_plan_round_trip(self, tmp_path: Path, plan: FloorPlan, seed: int, floor_m: float) -> None:
         rng = np.random.default_rng(seed)
@@ -163,7 +158,7 @@ class TestPlan:
     def test_room_with_two_floors_becomes_two_rooms(self, tmp_path: Path) -> None:
         drawing = Drawing()
         planes = drawing.prism(1000.0 * np.array(rectangle(3.0, 3.0)), 0.0, 2500.0)
-        planes += drawing.prism(1000.0 * np.array(rectangle(2.0, 3.0, at=(3.0, 0.0))), 300.0, 2500.0)[:1]
+        planes += drawing.prism(1000.0 * np.array(rectangle(2.0, 3.0, corner=(3.0, 0.0))), 300.0, 2500.0)[:1]
         drawing.semantics.append({"ID": 4, "type": "studio", "planeID": planes})
         annotation = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0)))
         assert [room.name for room in annotation.plan.rooms] == ["studio 4", "studio 4 (2)"]
@@ -214,75 +209,42 @@ def without(*keys: Any) -> Callable[[dict[str, Any]], None]:
     return change
 
 
-def scaled(factor: float) -> Callable[[dict[str, Any]], None]:
-    def change(document: dict[str, Any]) -> None:
-        for junction in document["junctions"]:
-            junction["coordinate"] = [factor * value for value in junction["coordinate"]]
+def redrawn(change: Callable[[Drawing], object]) -> Callable[[dict[str, Any]], None]:
+    def changed(document: dict[str, Any]) -> None:
+        drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
+        change(drawing)
+        document.update(drawing.to_document(np.random.default_rng(0)))
 
-    return change
-
-
-def spread(document: dict[str, Any]) -> None:
-    """Scale the plan to 10 km without its ceilings."""
-    for junction in document["junctions"]:
-        x, y, z = junction["coordinate"]
-        junction["coordinate"] = [2000.0 * x, 2000.0 * y, z]
+    return changed
 
 
-def empty_first_plane(document: dict[str, Any]) -> None:
-    document["planeLineMatrix"][0] = [0] * len(document["planeLineMatrix"][0])
+def scaled(*factors: float) -> Callable[[dict[str, Any]], None]:
+    return redrawn(lambda drawing: setattr(drawing, "junctions", (np.array(drawing.junctions) * factors).tolist()))
 
 
-def first_floor_line(document: dict[str, Any]) -> int:
-    return document["planeLineMatrix"][0].index(1)
+def first_line(*junctions: int) -> Callable[[dict[str, Any]], None]:
+    """Return the change of the junctions of the first line of the first floor."""
+    return redrawn(lambda drawing: drawing.lines.__setitem__(drawing.planes[0][1][0], junctions))
 
 
-def open_ring(document: dict[str, Any]) -> None:
-    document["planeLineMatrix"][0][first_floor_line(document)] = 0
-
-
-def branching_ring(document: dict[str, Any]) -> None:
-    """Add a line of another room to the floor."""
-    upright = next(k for k, value in enumerate(document["planeLineMatrix"][2]) if value)
-    row = document["planeLineMatrix"][0]
-    foreign = next(k for k, value in enumerate(document["planeLineMatrix"][2]) if value and not row[k])
-    row[foreign if row[upright] else upright] = 1
-
-
-def two_sided(document: dict[str, Any]) -> None:
+def two_sided(drawing: Drawing) -> None:
     """Reduce the floor to two lines between the same junctions."""
-    first, second, *rest = (line for line, value in enumerate(document["planeLineMatrix"][0]) if value)
-    document["lineJunctionMatrix"][second] = document["lineJunctionMatrix"][first]
-    for line in rest:
-        document["planeLineMatrix"][0][line] = 0
-
-
-def line_with_one_junction(document: dict[str, Any]) -> None:
-    row = document["lineJunctionMatrix"][first_floor_line(document)]
-    row[row.index(1)] = 0
-
-
-def line_with_three_junctions(document: dict[str, Any]) -> None:
-    row = document["lineJunctionMatrix"][first_floor_line(document)]
-    row[row.index(0)] = 1
+    floor = drawing.planes[0][1]
+    del floor[2:]
+    drawing.lines[floor[1]] = drawing.lines[floor[0]]
 
 
 def short_line_matrix(document: dict[str, Any]) -> None:
-    del document["lineJunctionMatrix"][first_floor_line(document) :]
+    del document["lineJunctionMatrix"][document["planeLineMatrix"][0].index(1) :]
 
 
 def bad_coordinate(value: Any) -> Callable[[dict[str, Any]], None]:
-    def change(document: dict[str, Any]) -> None:
-        junction = document["lineJunctionMatrix"][first_floor_line(document)].index(1)
-        document["junctions"][junction]["coordinate"] = value
-
-    return change
+    return redrawn(lambda drawing: drawing.junctions.__setitem__(0, value))
 
 
 def bow_tie(document: dict[str, Any]) -> None:
     drawing = Drawing()
-    corners = np.array([[0.0, 0.0], [4000.0, 3000.0], [4000.0, 0.0], [0.0, 3000.0]])
-    planes = drawing.prism(corners, 0.0, 2500.0)
+    planes = drawing.prism(1000.0 * np.array([[0.0, 0.0], [4.0, 3.0], [4.0, 0.0], [0.0, 3.0]]), 0.0, 2500.0)
     drawing.semantics.append({"ID": 1007, "type": "living room", "planeID": planes})
     document.update(drawing.to_document(np.random.default_rng(0)))
 
@@ -311,12 +273,17 @@ class TestBadAnnotation:
             (change_semantic(planeID=[1, 2]), FIRST, ["no floor among its planes [1, 2]"]),
             (change_semantic(planeID=[0, 2]), FIRST, ["no ceiling among its planes [0, 2]"]),
             (without("planes", 0, "type"), FIRST, ["plane 0 has no 'type'"]),
-            (empty_first_plane, FIRST, ["floor plane 0 has no lines"]),
-            (open_ring, FIRST, ["does not close", "joins 1 of its lines, not two", "floor plane 0"]),
-            (branching_ring, FIRST, ["does not close", "junction"]),
-            (two_sided, FIRST, ["a ring has 2 junctions", "the minimum is three"]),
-            (line_with_one_junction, FIRST, ["has 1 junctions; two are required"]),
-            (line_with_three_junctions, FIRST, ["has 3 junctions; two are required"]),
+            (redrawn(lambda drawing: drawing.planes[0][1].clear()), FIRST, ["floor plane 0 has no lines"]),
+            (
+                redrawn(lambda drawing: drawing.planes[0][1].pop()),
+                FIRST,
+                ["does not close", "joins 1 of its lines, not two", "floor plane 0"],
+            ),
+            # An upright line of a wall joins the floor.
+            (redrawn(lambda drawing: drawing.planes[0][1].append(drawing.planes[2][1][1])), FIRST, ["does not close"]),
+            (redrawn(two_sided), FIRST, ["a ring has 2 junctions", "the minimum is three"]),
+            (first_line(0, 0), FIRST, ["has 1 junctions; two are required"]),
+            (first_line(0, 1, 2), FIRST, ["has 3 junctions; two are required"]),
             (short_line_matrix, FIRST, ["'lineJunctionMatrix' has no entry"]),
             (bad_coordinate([0.0, 1.0]), FIRST, ["[0.0, 1.0]", "three numbers"]),
             (bad_coordinate([0.0, 1.0, float("nan")]), FIRST, ["nan", "three numbers"]),
@@ -324,7 +291,8 @@ class TestBadAnnotation:
             (bad_coordinate("origin"), FIRST, ["origin", "three numbers"]),
             (bow_tie, FIRST, ["crosses itself", "50%", "90%"]),
             (scaled(0.001), "bedroom 1033", ["every room is smaller than 0.2 m²", "read as millimetres"]),
-            (spread, None, ["m across; the limit is 1000 m", "read as millimetres"]),
+            # The plan is 10 km wide, and its ceilings stay.
+            (scaled(2000.0, 2000.0, 1.0), None, ["m across; the limit is 1000 m", "read as millimetres"]),
             (scaled(1000.0), FIRST, ["ceiling_height_m is 2500", "read as millimetres"]),
         ],
     )
@@ -336,12 +304,6 @@ class TestBadAnnotation:
         write_annotation(root / NAME, document)
         error = refused(root, *reasons, room=room)
         assert error.path == root / NAME / "annotation_3d.json"
-
-    def test_error_keeps_its_cause(self, root: Path) -> None:
-        document = read_document(root)
-        spread(document)
-        write_annotation(root / NAME, document)
-        assert refused(root).__cause__ is not None
 
     @pytest.mark.parametrize(
         ("content", "reason"),
@@ -385,7 +347,7 @@ class TestCameras:
         cameras = Structured3D(tmp_path).load(NAME).cameras
         assert [camera.camera_height_m for camera in cameras] == pytest.approx([1.4, 1.7])
 
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10, deadline=None)
+    @settings(max_examples=10)
     @given(room_polygons(), seeds())
     def test_depth_matches_the_layout_at_heading_zero(
         self, tmp_path_factory: pytest.TempPathFactory, polygon: list[list[float]], seed: int

@@ -11,7 +11,6 @@ import pytest
 import shapely
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
@@ -27,14 +26,9 @@ from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
+from tests.strategies import seeds
 
 ROWS, COLUMNS = 64, 128
-seeds = st.integers(0, 2**32 - 1)
-
-
-@pytest.fixture(scope="module")
-def materials() -> MaterialLibrary:
-    return MaterialLibrary.create(np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +49,8 @@ def shut(home: Home) -> Home:
     return Home(home.plan, openings)
 
 
-@given(seed=seeds)
-@settings(max_examples=40, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=40)
 def test_homes_are_valid_plans_within_their_size_range(seed: int) -> None:
     plan = home_of(seed).plan
     assert plan.warnings == ()
@@ -67,8 +61,8 @@ def test_homes_are_valid_plans_within_their_size_range(seed: int) -> None:
     assert FloorPlan.from_dict(plan.to_dict()).to_dict() == plan.to_dict()
 
 
-@given(seed=seeds)
-@settings(max_examples=40, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=40)
 def test_openings_lie_in_their_walls_without_overlap(seed: int) -> None:
     home = home_of(seed)
     taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
@@ -83,8 +77,8 @@ def test_openings_lie_in_their_walls_without_overlap(seed: int) -> None:
         assert all(before[1] < after[0] for before, after in itertools.pairwise(intervals))
 
 
-@given(seed=seeds)
-@settings(max_examples=20, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=20)
 def test_door_has_one_place_in_both_rooms(seed: int) -> None:
     home = home_of(seed)
 
@@ -137,9 +131,8 @@ def test_training_homes_are_more_varied_than_test_homes() -> None:
     assert wing_walls(varied) > 2 * wing_walls(usual)
 
 
-def test_night_has_dark_windows_and_lit_lamps() -> None:
+def test_night_has_dark_windows_and_lit_lamps(materials: MaterialLibrary) -> None:
     home, rng = home_of(3), np.random.default_rng(3)
-    materials = MaterialLibrary.create(np.random.default_rng(0))
     assert not any(shot.is_night for shot in sample_shots(home, 8, rng))
     for shot in sample_shots(home, 4, rng, night_share=1.0):
         scene, by_day = (build_scene(dataclasses.replace(shot, is_night=night), materials) for night in (True, False))
@@ -169,8 +162,8 @@ def test_homes_are_varied() -> None:
     assert 0.1 < turned / len(homes) < 0.7
 
 
-@given(seed=seeds)
-@settings(max_examples=25, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=25)
 def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = shut(generate_home(rng))
@@ -188,8 +181,8 @@ def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: in
         np.testing.assert_allclose(depth[index][bare], expected[bare], atol=1e-3)
 
 
-@given(seed=seeds)
-@settings(max_examples=10, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=10)
 def test_rays_end_at_walls_except_through_openings(renderer: PanoramaRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
@@ -243,8 +236,8 @@ def test_furniture_hides_the_layout(renderer: PanoramaRenderer) -> None:
     assert shares[0] + 0.03 < shares[1] < shares[2] - 0.03
 
 
-@given(seed=seeds)
-@settings(max_examples=20, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=20)
 def test_pieces_stay_within_their_footprints(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for makers in ROOM_PIECES.values():
@@ -255,8 +248,8 @@ def test_pieces_stay_within_their_footprints(seed: int) -> None:
                 assert abs(part.y) + part.half_y <= 0.5 * piece.depth_m + 0.06, maker.__name__
 
 
-@given(seed=seeds)
-@settings(max_examples=25, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=25)
 def test_furniture_stays_in_its_room_clear_of_the_camera(seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
@@ -274,8 +267,8 @@ def test_furniture_stays_in_its_room_clear_of_the_camera(seed: int) -> None:
             assert shapely.distance(footprint, shapely.Point(shot.position_m)) > CAMERA_CLEARANCE_M - 0.1
 
 
-@given(seed=seeds)
-@settings(max_examples=25, deadline=None)
+@given(seed=seeds())
+@settings(max_examples=25)
 def test_camera_is_outside_all_objects(materials: MaterialLibrary, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for shot in sample_shots(generate_home(rng), 2, rng, "full"):

@@ -44,7 +44,7 @@ from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_features import ImageFeatures
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.sampling import TripletSampling, random_poses
+from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.render.sweep import profiles_at
 from tests.strategies import crooked_flat, seeds
 
@@ -60,6 +60,10 @@ def layout_batches(config: TrainConfig = TINY, first: int = 0) -> Iterator[Batch
 def panorama_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
     """Yield stage 2's batches of generated homes, made in this process."""
     return load_batches(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
+
+
+def changed(part: str, config: TrainConfig, **settings: Any) -> TrainConfig:
+    return config.with_settings({f"{part}.{name}": value for name, value in settings.items()})
 
 
 def layout_stage(config: TrainConfig = TINY) -> LayoutStage:
@@ -158,10 +162,6 @@ class TestLoop:
         with pytest.raises(CheckpointError, match="another configuration"):
             run_stage(LineStage(batch=64), tmp_path, device=CPU, resume=True)
 
-    def test_run_can_be_extended(self, tmp_path: Path) -> None:
-        run_stage(LineStage(), tmp_path, device=CPU)
-        assert run_stage(LineStage(15), tmp_path, device=CPU, resume=True).step == 15
-
     def test_resuming_without_a_checkpoint_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint"):
             run_stage(LineStage(), tmp_path, device=CPU, resume=True)
@@ -180,11 +180,6 @@ class TestLoop:
         saved = Checkpoint.load(tmp_path / "line.pt")
         assert saved.step == 4
         assert all(bool(torch.isfinite(value).all()) for value in saved.weights["line"].values())
-
-    def test_time_budget_ends_the_run(self, tmp_path: Path) -> None:
-        done = run_stage(LineStage(10**9, minutes=0.2 / 60.0), tmp_path, device=CPU)
-        assert done.seconds >= 0.2
-        assert done.step < 10**6
 
     def test_progress_bar_counts_steps(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         run_stage(LineStage(), tmp_path, device=CPU)
@@ -272,11 +267,6 @@ class _Evil:
 
 
 class TestStreams:
-    def test_equal_seeds_generate_equal_homes(self) -> None:
-        first, second = (home_of(TRAIN, 5, 17) for _ in range(2))
-        assert first[0].plan.to_dict() == second[0].plan.to_dict()
-        assert first[1].integers(1 << 30) == second[1].integers(1 << 30)
-
     def test_splits_share_no_home(self) -> None:
         plans = [home_of(split, 0, index)[0].plan for split in (TRAIN, VALIDATION, TEST) for index in range(15)]
         outlines = {np.concatenate([room.polygon_m for room in plan.rooms]).tobytes() for plan in plans}
@@ -300,12 +290,11 @@ class TestStreams:
         assert bool((batch["camera_height_m"] == batch["camera_height_m"][:, :1]).all())
 
     def test_turned_negatives_are_near_at_other_headings(self) -> None:
-        layout = dataclasses.replace(TINY.layout, turned_share=0.5)
-        batches = layout_batches(dataclasses.replace(TINY, layout=layout))
+        batches = layout_batches(TINY.with_settings({"layout.turned_share": 0.5}))
         profile = torch.cat([next(batches)["profile_m"] for _ in range(6)]).sort(dim=2).values
         # Rotation permutes the columns, so sorted profiles of near positions are similar.
         change = (profile[:, 1:] - profile[:, :1]).abs().median(dim=2).values
-        negatives = layout.triplets.positives
+        negatives = TINY.layout.triplets.positives
         far, turned = change[:, negatives : negatives + 2], change[:, negatives + 2 :]
         assert turned.median() < 0.5 * far.median()
 
@@ -394,7 +383,6 @@ class TestStreams:
 
 class TestStages:
     def repeated(self, stage: TrainingStage, monkeypatch: pytest.MonkeyPatch) -> Batch:
-        """Make a stage repeat one batch."""
         batch = next(stage.batches(0, 0))
         monkeypatch.setattr(stage, "batches", lambda first_step, workers: itertools.repeat(batch))
         return batch
@@ -414,8 +402,7 @@ class TestStages:
         batch = next(layout_batches())
 
         def terms(**changes: Any) -> dict[str, Tensor]:
-            config = dataclasses.replace(TINY, layout=dataclasses.replace(TINY.layout, **changes))
-            return layout_stage(config).losses(batch)
+            return layout_stage(changed("layout", TINY, **changes)).losses(batch)
 
         assert set(terms()) == {"log_ratio", "scale", "decode"}
         assert set(terms(scale_weight=0.0, decode_weight=0.0)) == {"log_ratio"}
@@ -425,9 +412,7 @@ class TestStages:
     def test_image_encoder_learns_and_teacher_stays_frozen(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        config = dataclasses.replace(
-            TINY, image=dataclasses.replace(TINY.image, steps=60, optimiser=OptimiserConfig(learning_rate=5e-3))
-        )
+        config = TINY.with_settings({"image.steps": 60, "image.optimiser.learning_rate": 5e-3})
         teacher = build_layout_encoder(config)
         before = {key: value.clone() for key, value in teacher.state_dict().items()}
         stage = image_stage(config, teacher)
@@ -453,19 +438,11 @@ class TestStages:
         monkeypatch.setattr(stage, "encoder", lambda image, height: perfect)
         assert all(abs(term.item()) < 1e-5 for term in stage.losses(batch).values())
 
-    def test_paper_image_loss_is_the_latent_distance(self) -> None:
-        config = small_paper()
-        teacher = build_layout_encoder(config)
-        stage = image_stage(config, teacher)
-        terms = stage.losses(next(stage.batches(0, 0)))
-        assert set(terms) == {"l2"}
-        assert 0.0 < terms["l2"].item() < 2.0
-        terms["l2"].backward()
-
     @pytest.mark.parametrize("architecture", ["paper", "ring"])
     @pytest.mark.parametrize(
         ("weights", "names"),
         [
+            ({}, {"l2"}),
             ({"l2_weight": 0.0, "log_ratio_weight": 1.0}, {"log_ratio"}),
             ({"log_ratio_weight": 2.0}, {"l2", "log_ratio"}),
             ({"kd_weight": 1.0}, {"l2", "kd"}),
@@ -475,7 +452,7 @@ class TestStages:
         self, architecture: Any, weights: dict[str, float], names: set[str]
     ) -> None:
         config = dataclasses.replace(small_paper(), ring=TINY.ring, architecture=architecture)
-        config = dataclasses.replace(config, image=dataclasses.replace(config.image, **weights))
+        config = changed("image", config, **weights)
         stage = image_stage(config, build_layout_encoder(config))
         terms = stage.losses(next(stage.batches(0, 0)))
         assert set(terms) == names
@@ -484,9 +461,7 @@ class TestStages:
         assert any(bool(p.grad.abs().sum() > 0) for p in stage.encoder.parameters() if p.grad is not None)
 
     def test_image_losses_match_the_equations(self) -> None:
-        config = small_paper()
-        weights = {"l2_weight": 0.0, "log_ratio_weight": 0.5, "kd_weight": 0.25}
-        config = dataclasses.replace(config, image=dataclasses.replace(config.image, **weights))
+        config = changed("image", small_paper(), l2_weight=0.0, log_ratio_weight=0.5, kd_weight=0.25)
         stage = image_stage(config, build_layout_encoder(config))
         batch = next(stage.batches(0, 0))
         stage.encoder.eval()
@@ -518,12 +493,10 @@ class TestStages:
             raise AssertionError("the Chamfer distance was computed")
 
         monkeypatch.setattr(layout_stage_module, "chamfer_to_anchors", refused)
-        layout = dataclasses.replace(TINY.layout, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0)
-        stage = layout_stage(dataclasses.replace(TINY, layout=layout))
+        stage = layout_stage(changed("layout", TINY, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0))
         assert set(stage.losses(next(layout_batches()))) == {"decode"}
         assert "neighbour_profile_m" not in next(image_stage(TINY, build_layout_encoder(TINY)).batches(0, 0))
-        layout = dataclasses.replace(TINY.layout, decode_weight=0.0)
-        assert set(layout_stage(dataclasses.replace(TINY, layout=layout)).modules) == {"layout_encoder"}
+        assert set(layout_stage(changed("layout", TINY, decode_weight=0.0)).modules) == {"layout_encoder"}
 
     def test_end_to_end_branches_have_separate_gradients(self) -> None:
         config = small_paper()
@@ -545,8 +518,7 @@ class TestStages:
             EndToEndStage(TINY, GeneratedSource(TINY))
 
     def test_end_to_end_run_is_exported(self, tmp_path: Path) -> None:
-        config = small_paper()
-        config = dataclasses.replace(config, image=dataclasses.replace(config.image, steps=1))
+        config = changed("image", small_paper(), steps=1)
         stage = EndToEndStage(config, GeneratedSource(config))
         run_stage(stage, tmp_path, device=CPU, workers=0)
         bundle = export_run(tmp_path, tmp_path / "bundle", name="both", version="1")
@@ -559,15 +531,6 @@ class TestStages:
 
 def small_paper() -> TrainConfig:
     """Return the `paper` architecture at small sizes."""
-    paper = dataclasses.replace(
-        PRESETS["paper"].paper,
-        image_depth=18,
-        width=8,
-        layout_height=32,
-        profile_columns=64,
-        image_height=64,
-        image_width=128,
-    )
-    layout = dataclasses.replace(PRESETS["paper"].layout, triplets=TripletSampling(positives=1, negatives=4))
-    image = dataclasses.replace(PRESETS["paper"].image, batch=2)
-    return dataclasses.replace(PRESETS["paper"], paper=paper, layout=layout, image=image)
+    sizes = {"image_depth": 18, "width": 8, "layout_height": 32, "profile_columns": 64}
+    config = changed("paper", PRESETS["paper"], **sizes, image_height=64, image_width=128)
+    return changed("layout.triplets", changed("image", config, batch=2), positives=1, negatives=4)

@@ -23,7 +23,6 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_layout
@@ -31,16 +30,14 @@ from lalaloc_core.learn.training.sources import SceneSource
 from lalaloc_core.learn.training.validate import ImageValidation, LayoutValidation
 from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.render.sweep import profiles_at
-from tests.strategies import crooked_flat
+from tests.strategies import crooked_flat, present
 
 CPU = torch.device("cpu")
 SCENES, CAMERAS, HEADING_DEG = 5, 3, 30.0
 # Small batches without rotation, so that samples can be identified.
-CONFIG = dataclasses.replace(
-    PRESETS["tiny"],
-    turns="none",
-    layout=dataclasses.replace(PRESETS["tiny"].layout, homes_per_step=2, anchors_per_home=1, steps=2),
-    image=dataclasses.replace(PRESETS["tiny"].image, batch=4, shots_per_home=1, steps=2),
+CONFIG = PRESETS["tiny"].with_settings(
+    {"turns": "none", "layout.homes_per_step": 2, "layout.anchors_per_home": 1, "layout.steps": 2}
+    | {"image.batch": 4, "image.shots_per_home": 1, "image.steps": 2}
 )
 
 
@@ -70,7 +67,6 @@ def panoramas(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batc
 
 
 def greys(batches: Iterator[Batch], count: int) -> list[int]:
-    """Return the greys of the panoramas in the first batches."""
     return torch.cat([batch["image"][:, 0, 0, 0] for batch in itertools.islice(batches, count)]).tolist()
 
 
@@ -98,14 +94,10 @@ class TestDrawing:
             assert height.item() == pytest.approx(camera.camera_height_m)
 
     def test_epochs_visit_every_scene_in_new_orders(self, data: OwnData) -> None:
-        config = dataclasses.replace(CONFIG, image=dataclasses.replace(CONFIG.image, batch=SCENES))
+        config = CONFIG.with_settings({"image.batch": SCENES})
         scenes = np.array(greys(panoramas(SceneSource(config, data)), 6)).reshape(6, SCENES) // 40
         assert all(sorted(epoch) == list(range(SCENES)) for epoch in scenes.tolist())
         assert len({tuple(epoch) for epoch in scenes.tolist()}) > 3
-
-    def test_every_camera_is_drawn(self, data: OwnData) -> None:
-        drawn = set(greys(panoramas(SceneSource(CONFIG, data)), 40))
-        assert drawn == {40 * scene + 10 * camera for scene in range(SCENES) for camera in range(CAMERAS)}
 
     def test_seed_determines_the_samples(self, data: OwnData) -> None:
         first, again = (greys(panoramas(SceneSource(CONFIG, data)), 5) for _ in range(2))
@@ -158,8 +150,7 @@ class TestBadFiles:
         named = self.damaged(data)
         with pytest.raises(DatasetError) as raised:
             greys(panoramas(SceneSource(CONFIG, data)), 40)
-        assert raised.value.path is not None
-        assert raised.value.path.name in named
+        assert present(raised.value.path).name in named
 
     def test_skipped_files_are_logged_once(self, data: OwnData, caplog: pytest.LogCaptureFixture) -> None:
         named = self.damaged(data)
@@ -199,10 +190,7 @@ class TestRuns:
         assert (
             Checkpoint.load(folder / "layout.pt").data
             == trained.data
-            == {
-                "description": data.description,
-                "scenes": SCENES,
-            }
+            == {"description": data.description, "scenes": SCENES}
         )
         assert {"val_within_1m", "val_median_cm"} <= set(trained.metrics)
         with pytest.raises(CheckpointError, match="homes generated while training"):
@@ -216,11 +204,6 @@ class TestRuns:
         assert main(words) == 2
         assert "plan.json" in capsys.readouterr().err
         assert main([*words, "--skip-bad"]) == 0
-
-    @pytest.mark.parametrize("words", [["--skip-bad"], ["--data", "x", "--textures", "y"]])
-    def test_conflicting_options_are_refused(self, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["train", "layout", "--out", "nowhere", *words]) == 2
-        assert words[0] in capsys.readouterr().err or "--textures" in words
 
 
 class TestValidation:
@@ -250,11 +233,5 @@ class TestValidation:
 
 
 class PerfectLayouts(torch.nn.Module):
-    """Encoder whose latent is the layout itself."""
-
     def forward(self, profile_m: torch.Tensor, camera_m: torch.Tensor, ceiling_m: torch.Tensor) -> torch.Tensor:
         return torch.cat([profile_m, camera_m[:, None], ceiling_m[:, None]], dim=1)
-
-
-def test_test_configuration_is_valid() -> None:
-    assert TrainConfig.from_dict(CONFIG.to_dict()) == CONFIG

@@ -34,6 +34,7 @@ from lalaloc_core.nets.trunk import (
     _PadAround,
     load_pretrained,
 )
+from tests.strategies import present
 
 TINY = PRESETS["tiny-trunk"]
 WIDE = TrunkEncoderConfig(
@@ -193,17 +194,13 @@ class TestEncoder:
         """Check that an error of the stated height is one offset of the log profile and the log ceiling."""
         image, height = pictures(2), torch.tensor([1.2, 1.6])
         plain, scaled = encoder(image, height), encoder(image, factor * height)
-        assert plain.structure is not None
-        assert scaled.structure is not None
+        before, after = present(plain.structure), present(scaled.structure)
         offset = torch.log(torch.tensor(factor))
         torch.testing.assert_close(scaled.log_profile, plain.log_profile + offset, atol=1e-6, rtol=0.0)
-        torch.testing.assert_close(
-            scaled.structure.log_ceiling, plain.structure.log_ceiling + offset, atol=1e-6, rtol=0.0
-        )
+        torch.testing.assert_close(after.log_ceiling, before.log_ceiling + offset, atol=1e-6, rtol=0.0)
         assert torch.equal(plain.log_scale, scaled.log_scale)
-        assert torch.equal(plain.structure.opening_logits, scaled.structure.opening_logits)
-        assert torch.equal(plain.structure.log_ceiling_scale, scaled.structure.log_ceiling_scale)
-        assert torch.equal(plain.structure.room_type_logits, scaled.structure.room_type_logits)
+        for name in ("opening_logits", "log_ceiling_scale", "room_type_logits"):
+            assert torch.equal(getattr(before, name), getattr(after, name))
         # Layouts are compared in metres, so the ring must know.
         assert not torch.allclose(plain.ring, scaled.ring)
 
@@ -213,15 +210,16 @@ class TestEncoder:
         image, height = pictures(2), torch.tensor([1.2, 1.6])
         pixels = turns * TAP_STRIDES[-1]
         plain, rolled = encoder(image, height), encoder(image.roll(pixels, 2), height)
-        assert plain.structure is not None
-        assert rolled.structure is not None
+        before, after = present(plain.structure), present(rolled.structure)
         sectors, columns = (n * pixels // WIDE.image_width for n in (TINY.ring.sectors, TINY.profile_columns))
-        torch.testing.assert_close(rolled.ring, plain.ring.roll(sectors, 2), atol=1e-5, rtol=1e-5)
-        for name, shift in (("log_profile", columns), ("log_scale", columns)):
-            torch.testing.assert_close(getattr(rolled, name), getattr(plain, name).roll(shift, 1), atol=1e-5, rtol=1e-5)
-        openings = plain.structure.opening_logits.roll(columns, 1)
-        torch.testing.assert_close(rolled.structure.opening_logits, openings, atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(rolled.structure.log_ceiling, plain.structure.log_ceiling, atol=1e-5, rtol=1e-5)
+        for found, expected in (
+            (rolled.ring, plain.ring.roll(sectors, 2)),
+            (rolled.log_profile, plain.log_profile.roll(columns, 1)),
+            (rolled.log_scale, plain.log_scale.roll(columns, 1)),
+            (after.opening_logits, before.opening_logits.roll(columns, 1)),
+            (after.log_ceiling, before.log_ceiling),
+        ):
+            torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
     def test_sectors_align_with_their_pixels(self) -> None:
         """Check that interpolation maps the centre of a column's receptive field to its sector."""
@@ -314,44 +312,29 @@ class TestBundle:
 
     def test_query_has_openings_ceiling_and_room_type(self, service: Encoders) -> None:
         query = service.query(panorama(), None, CameraHeight(1.5))
-        assert query.openings is not None
-        assert query.ceiling is not None
-        assert query.room_type is not None
         shape = (TINY.ring.sectors, TINY.profile_columns, len(OPENING_CLASSES))
-        assert query.openings.log_probability.shape == shape
-        np.testing.assert_allclose(np.exp(query.openings.log_probability).sum(axis=2), 1.0, rtol=1e-5)
-        np.testing.assert_allclose(query.openings.prior.sum(), 1.0)
-        assert np.exp(query.room_type.log_probability).sum() == pytest.approx(1.0, rel=1e-5)
-        assert np.isfinite([query.ceiling.log_m, query.ceiling.log_scale]).all()
+        assert present(query.openings).log_probability.shape == shape
+        np.testing.assert_allclose(np.exp(present(query.openings).log_probability).sum(axis=2), 1.0, rtol=1e-5)
+        np.testing.assert_allclose(present(query.openings).prior.sum(), 1.0)
+        assert np.exp(present(query.room_type).log_probability).sum() == pytest.approx(1.0, rel=1e-5)
+        assert np.isfinite([present(query.ceiling).log_m, present(query.ceiling).log_scale]).all()
 
     def test_openings_rotate_with_the_hypotheses(self, service: Encoders) -> None:
         query = service.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
-        assert query.profile is not None
         shifts = np.arange(TINY.ring.sectors) * (TINY.profile_columns // TINY.ring.sectors)
-        np.testing.assert_array_equal(query.profile.log_m, rolled(query.profile.log_m[0], shifts))
+        np.testing.assert_array_equal(present(query.profile).log_m, rolled(present(query.profile).log_m[0], shifts))
         np.testing.assert_array_equal(query.openings.log_probability, rolled(query.openings.log_probability[0], shifts))
         assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
 
     def test_mirrored_panorama_gives_mirrored_predictions(self, service: Encoders) -> None:
         plain, mirrored = (service.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1]))
-        assert plain.profile is not None
-        assert mirrored.profile is not None
-        assert plain.openings is not None
-        assert mirrored.openings is not None
-        np.testing.assert_allclose(mirrored.profile.log_m, plain.profile.log_m[:, ::-1], atol=1e-5)
-        np.testing.assert_allclose(
-            mirrored.openings.log_probability, plain.openings.log_probability[:, ::-1], atol=1e-5
-        )
-        assert plain.ceiling is not None
-        assert mirrored.ceiling is not None
-        assert mirrored.ceiling.log_m == pytest.approx(plain.ceiling.log_m, abs=1e-5)
-
-    def test_stated_height_is_one_offset(self, service: Encoders) -> None:
-        low, high = (service.query(panorama(), 0.0, CameraHeight(height)) for height in (1.0, 2.0))
-        assert low.profile is not None
-        assert high.profile is not None
-        np.testing.assert_allclose(high.profile.log_m, low.profile.log_m + np.log(2.0), atol=1e-5)
+        for found, expected in (
+            (present(mirrored.profile).log_m, present(plain.profile).log_m[:, ::-1]),
+            (present(mirrored.openings).log_probability, present(plain.openings).log_probability[:, ::-1]),
+            (present(mirrored.ceiling).log_m, present(plain.ceiling).log_m),
+        ):
+            np.testing.assert_allclose(found, expected, atol=1e-5)
 
     @pytest.mark.parametrize(
         ("key", "value", "message"),

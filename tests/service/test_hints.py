@@ -23,8 +23,8 @@ from tests.strategies import rectangle
 PLAN: dict[str, Any] = FLAT | {
     "rooms": [
         {"name": "Bedroom", "polygon": rectangle(4.0, 3.0)},
-        {"name": "Bedroom", "polygon": rectangle(4.0, 3.0, at=(5.0, 0.0))},
-        {"name": "hall", "polygon": rectangle(9.0, 1.5, at=(0.0, 4.0))},
+        {"name": "Bedroom", "polygon": rectangle(4.0, 3.0, corner=(5.0, 0.0))},
+        {"name": "hall", "polygon": rectangle(9.0, 1.5, corner=(0.0, 4.0))},
     ]
 }
 

@@ -1,4 +1,4 @@
-"""Tests of plan prototypes, their costs, and the index that selects plans."""
+"""Tests of venues: plan prototypes, the index that selects plans, merged plans, and the probability of a plan."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import (
     PoseGrid,
     PredictedCeiling,
@@ -22,6 +22,7 @@ from lalaloc_core.localise.poses import (
     Query,
     rolled,
 )
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
 from lalaloc_core.localise.venue.prototype_codes import CodeScan, lookup_tables, product_codes
@@ -30,38 +31,51 @@ from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
     Prototypes,
     joined,
+    most_probable,
     packed_openings,
     prototypes_of,
+    share_searched,
     unpacked_openings,
 )
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
+from tests.strategies import plan_document, present, rectangle
 
 COLUMNS, STEP_M = 64, 0.5
 WEIGHTS, CONFIG = MatchingWeights(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), MatchingConfig()
 CLASSES = len(OPENING_CLASSES)
 
 
-def plan_of(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -> FloorPlan:
-    """Two rooms side by side, with a door between them and a window."""
-    width_m, depth_m, second_m = rng.uniform(2.5, 7.0, 3).tolist()
-    wall_m = 0.1
-    end_m = width_m + wall_m + second_m
-    document = {
-        "ceiling_height_m": float(rng.uniform(2.3, 3.0)),
-        "rooms": [
-            {"name": "a", "type": "kitchen", "polygon": [[0, 0], [width_m, 0], [width_m, depth_m], [0, depth_m]]},
-            {"name": "b", "polygon": [[width_m + wall_m, 0], [end_m, 0], [end_m, 3], [width_m + wall_m, 3]]},
-        ],
-        "openings": [
-            {"kind": "door", "line": [[width_m + 0.05, 1.0], [width_m + 0.05, 1.9]]},
-            {"kind": "window", "line": [[0.5, 0], [1.7, 0]], "sill_m": 0.9, "head_m": 2.0},
-        ],
-    }
+def two_rooms(
+    width_m: float,
+    depth_m: float,
+    second_m: float = 2.9,
+    *,
+    x_m: float = 0.0,
+    ceiling_m: float = 2.5,
+    kinds: tuple[str, ...] | None = None,
+) -> FloorPlan:
+    """Return two rooms side by side from `x_m`, with those of a door between them and a window that are of `kinds`."""
+    (first, second), door_m = (x_m, x_m + width_m + 0.1), x_m + width_m + 0.05
+    document = plan_document(
+        rectangle(width_m, depth_m, corner=(first, 0.0)),
+        rectangle(second_m, 3.0, corner=(second, 0.0)),
+        ceiling_m=ceiling_m,
+    )
+    document["rooms"][0]["type"] = "kitchen"
+    document["openings"] = [
+        {"kind": "door", "line": [[door_m, 1.0], [door_m, 1.9]]},
+        {"kind": "window", "line": [[x_m + 0.5, 0], [x_m + 1.7, 0]], "sill_m": 0.9, "head_m": 2.0},
+    ]
     if kinds is not None:
         document["opening_kinds"] = list(kinds)
         document["openings"] = [opening for opening in document["openings"] if opening["kind"] in kinds]
     return FloorPlan.from_dict(document)
+
+
+def random_plan(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -> FloorPlan:
+    sizes_m = rng.uniform(2.5, 7.0, 3).tolist()
+    return two_rooms(*sizes_m, ceiling_m=float(rng.uniform(2.3, 3.0)), kinds=kinds)
 
 
 def grid_of(plan: FloorPlan) -> PoseGrid:
@@ -94,12 +108,12 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
 @pytest.fixture(scope="module")
 def prototype_sets() -> list[Prototypes]:
     rng = np.random.default_rng(0)
-    plans = [plan_of(rng) for _ in range(20)]
+    plans = [random_plan(rng) for _ in range(20)]
     return [prototypes_of(grid_of(plan), plan) for plan in plans]
 
 
 def test_prototypes_cover_the_floor() -> None:
-    plan = plan_of(np.random.default_rng(1), kinds=("door",))
+    plan = random_plan(np.random.default_rng(1), kinds=("door",))
     grid = grid_of(plan)
     prototypes = prototypes_of(grid, plan)
     assert len(prototypes) == pytest.approx(len(grid.poses) / 2, rel=0.1)
@@ -159,7 +173,7 @@ def reference_cost(row: Any, query: Query, hypothesis: int, delta: float) -> flo
 @pytest.mark.parametrize("kinds", [None, ("door",), ()], ids=["all claimed", "doors claimed", "none claimed"])
 def test_prototype_cost_is_the_documented_formula(kinds: tuple[str, ...] | None) -> None:
     rng = np.random.default_rng(3)
-    plan = plan_of(rng, kinds=kinds)
+    plan = random_plan(rng, kinds=kinds)
     prototypes = prototypes_of(grid_of(plan), plan)
     query = replace(query_at(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
@@ -182,7 +196,7 @@ def unpacked_codes(code: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kinds", [None, ("door",), ()], ids=["all claimed", "doors claimed", "none claimed"])
 def test_code_cost_approximates_the_prototype_cost(kinds: tuple[str, ...] | None) -> None:
     rng = np.random.default_rng(11)
-    plan = plan_of(rng, kinds=kinds)
+    plan = random_plan(rng, kinds=kinds)
     prototypes = prototypes_of(grid_of(plan), plan)
     query = replace(query_at(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
     # A small ceiling weight keeps the bounded ceiling term from mattering.
@@ -247,9 +261,8 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) ->
 def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> None:
     rng = np.random.default_rng(6)
     query = query_at(prototype_sets[7], 4, rng)
-    assert query.profile is not None
     # The camera stood at 1.95 m, not at 1.5 m, so predicted distances are too small.
-    smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
+    smaller = replace(present(query.profile), log_m=present(query.profile).log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
     index = PlanIndex.from_prototypes(prototype_sets, shipped_cells())
     assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
@@ -270,7 +283,7 @@ def test_plans_with_and_without_openings_are_found() -> None:
     rng, cells = np.random.default_rng(8), shipped_cells()
     whole, prototype_sets = list[Prototypes](), list[Prototypes]()
     for number in range(12):
-        complete, bare = (plan_of(np.random.default_rng(number), kinds=kinds) for kinds in (None, ()))
+        complete, bare = (random_plan(np.random.default_rng(number), kinds=kinds) for kinds in (None, ()))
         whole.append(prototypes_of(grid_of(complete), complete))
         prototype_sets.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
     rows = joined(prototype_sets).rows.copy()
@@ -300,3 +313,99 @@ def test_cell_cost_approximates_the_prototype_cost(prototype_sets: list[Prototyp
     for hypothesis in range(4):
         exact = costs.pairs(rows, np.full(50, hypothesis), np.zeros(50, int))
         np.testing.assert_allclose(by_cell[:, hypothesis, 0], exact, atol=0.1)
+
+
+PLANS = [
+    two_rooms(4.0, 3.0, kinds=("door",)),
+    two_rooms(7.0, 2.0, x_m=1e6, kinds=()),
+    two_rooms(5.0, 5.0, kinds=("door",)),
+]
+
+
+@pytest.fixture(scope="module")
+def merged_plans() -> MergedPlans:
+    return MergedPlans.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
+
+
+def test_merged_costs_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:
+    position = np.array([[1.3, 1.1]])
+    profile = profiles_at(PLANS[0], position, np.zeros(1, int), np.zeros(1), COLUMNS)
+    predicted = PredictedProfile(np.log(profile), np.full_like(profile, np.log(0.05)))
+    query = Query(np.zeros((1, 1)), np.zeros(1), 0.0, True, CameraHeight(1.5), predicted)
+    whole, _ = MatchingCost(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
+        merged_plans.grid.layouts(merged_plans.plan)
+    )
+    parts = []
+    for plan in PLANS:
+        grid = grid_of(plan)
+        # Only opening kinds that every plan shows are compared; one plan shows none.
+        compared = replace(plan, opening_kinds=frozenset())
+        parts.append(MatchingCost(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
+    np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
+
+
+def test_merged_layouts_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:
+    separate = [grid_of(plan).layouts(plan) for plan in PLANS]
+    merged = merged_plans.grid.layouts(merged_plans.plan)
+    assert merged.kind is not None
+    assert merged.seen is not None
+    assert len(merged) == sum(map(len, separate))
+    first = 0
+    for layouts in separate:
+        rows = merged.rows(np.arange(first, first + len(layouts)))
+        assert rows.kind is not None
+        np.testing.assert_array_equal(rows.log_profile, layouts.log_profile)
+        np.testing.assert_array_equal(rows.kind, np.zeros_like(rows.kind) if layouts.kind is None else layouts.kind)
+        seen = 0 if layouts.seen is None else len(layouts.seen.row)
+        assert seen == (0 if rows.seen is None else len(rows.seen.row))
+        first += len(layouts)
+
+
+def test_merged_plan_renders_like_each_plan(merged_plans: MergedPlans) -> None:
+    grid = merged_plans.grid
+    seen = profiles_at(
+        merged_plans.plan, grid.poses.position_m, grid.poses.room_index, np.zeros(len(grid.poses)), COLUMNS, np.float32
+    )
+    np.testing.assert_allclose(seen, grid.profile_m, atol=2e-3)
+
+
+def test_merged_rooms_map_to_their_plans(merged_plans: MergedPlans) -> None:
+    separate = [grid_of(plan).poses for plan in PLANS]
+    sizes = [len(poses) for poses in separate]
+    room_index, last = merged_plans.grid.poses.room_index, np.cumsum(sizes)
+    expected = np.repeat(np.arange(len(sizes)), sizes).tolist()
+    assert [merged_plans.plan_of(int(room)) for room in room_index] == expected
+    np.testing.assert_array_equal(merged_plans.by_plan(np.ones(len(room_index))), sizes)
+    # No two plans are near each other.
+    parts = np.split(merged_plans.grid.poses.position_m, last[:-1])
+    for k, part in enumerate(parts):
+        for later in parts[k + 1 :]:
+            assert np.linalg.norm(part[:, None] - later[None], axis=-1).min() > 9.0
+    assert np.abs(merged_plans.grid.poses.position_m).max() < 100.0
+
+
+def test_most_probable_plans_are_searched_within_limits() -> None:
+    log_mass, poses = np.array([-3.0, -1.0, -2.0, -9.0]), np.array([10, 500, 20, 30])
+    assert most_probable(log_mass, poses, max_plans=3, max_poses=1000).tolist() == [1, 2, 0]
+    assert most_probable(log_mass, poses, max_plans=2, max_poses=1000).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=525).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=5).tolist() == [1]
+    # Plans without mass are skipped.
+    log_mass = np.array([-np.inf, -1.0, -np.inf, -9.0])
+    assert most_probable(log_mass, poses, max_plans=4, max_poses=1000).tolist() == [1, 3]
+
+
+def test_plans_left_out_keep_their_share() -> None:
+    copies = np.full(10, -2.0)
+    assert share_searched(copies, np.arange(10), np.full(10, 0.1)) == 1.0
+    # Four of ten copies were searched: each has a quarter of their mass, a tenth of all.
+    assert share_searched(copies, np.arange(4), np.full(4, 0.25)) == pytest.approx(0.4)
+    # One plan dominates the full search, so plans left out count as wrong.
+    sharp = np.array([1.0 - 3e-5, 1e-5, 1e-5, 1e-5])
+    assert share_searched(copies, np.arange(4), sharp) > 0.99
+    # A wrong plan and one of four copies of the right plan were searched.
+    mixed = np.array([-1.0, -2.0, -2.0, -2.0, -2.0, -7.0])
+    assert share_searched(mixed, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)
+    # Plans without mass change nothing.
+    more = np.append(mixed, [-np.inf, -np.inf])
+    assert share_searched(more, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)

@@ -1,9 +1,10 @@
-"""Replay of panoramas, camera height errors, photometric changes and single settings."""
+"""Streams of panoramas: replay, camera height errors, photometric changes and deferred rendering."""
 
 from __future__ import annotations
 
 import itertools
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,23 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.errors import ConfigError
+from lalaloc_core.cli import main
 from lalaloc_core.learn.synth.augmentation.photometric import jittered
 from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
+from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.deferred import DeferredRenderer, rotate_images
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
+from lalaloc_core.learn.training.rotation import Rotation
 from lalaloc_core.learn.training.sources import GeneratedSource
-from lalaloc_core.learn.training.stages import build_layout_encoder
+from lalaloc_core.learn.training.stages import build_layout_encoder, panorama_batches
 from tests.strategies import seeds
 
 TINY = PRESETS["tiny"]
+CPU = torch.device("cpu")
 
 
 def used(uses: int, limit: int, count: int) -> list[int]:
@@ -140,28 +145,63 @@ class TestPhotometric:
         assert len({round(float(value), 1) for value in brightness}) == 3
 
 
-@pytest.mark.parametrize(
-    ("setting", "value", "message"),
-    [
-        ("image.uses_per_panorama", 0, "uses_per_panorama is 0"),
-        ("image.replay_panoramas", 0, "replay_panoramas is 0"),
-        ("image.photometric", 1.5, "photometric is 1.5"),
-        ("image.camera_height_error_m", -0.1, "camera_height_error_m is -0.1"),
-        ("image.supersample", [2], "supersample"),
-        ("image.supersample", [0, 2], "supersample"),
-        ("image.optimiser.decay", 1.0, "decay is 1"),
-        ("image.uses", 2, "no key 'uses'"),
-        ("pictures.uses", 2, "no part 'pictures'"),
-        ("image.batch", "many", "batch is 'many'"),
-    ],
-)
-def test_invalid_settings_are_refused_by_name(setting: str, value: Any, message: str) -> None:
-    with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
-        TINY.with_settings({setting: value})
+def config_of(uses: int) -> TrainConfig:
+    return TINY.with_settings(
+        {"image.batch": 6, "image.shots_per_home": 2, "image.uses_per_panorama": uses, "image.replay_panoramas": 6}
+    )
 
 
-def test_single_settings_are_replaced() -> None:
-    changed_config = TINY.with_settings({"image.supersample": [2, 1], "image.optimiser.learning_rate": 1})
-    assert changed_config.image.supersample == (2, 1)
-    assert changed_config.image.optimiser.learning_rate == 1.0
-    assert TrainConfig.from_dict(changed_config.to_dict()) == changed_config
+def deferrable_batches(
+    uses: int, *, deferred: bool, neighbours: bool = False, workers: int = 0, textures: Path | None = None
+) -> list[Batch]:
+    source = GeneratedSource(config_of(uses), textures, deferred)
+    found = panorama_batches(source.config, source, neighbours=neighbours, first_step=1, workers=workers, device=CPU)
+    return list(itertools.islice(found, 6))
+
+
+@pytest.mark.parametrize(("uses", "neighbours", "workers"), [(1, False, 0), (3, False, 1), (3, True, 0)])
+def test_deferred_batches_equal_rendered_ones(uses: int, neighbours: bool, workers: int) -> None:
+    rendered = deferrable_batches(uses, deferred=False, neighbours=neighbours, workers=workers)
+    deferred = deferrable_batches(uses, deferred=True, neighbours=neighbours, workers=workers)
+    for a, b in zip(rendered, deferred, strict=True):
+        assert a.keys() == b.keys()
+        for key in a.keys() - {"image"}:
+            assert torch.equal(a[key], b[key])
+        # Batch sizes affect rounding.
+        assert (a["image"].int() - b["image"].int()).abs().max() <= 1
+
+
+def test_scenes_are_rendered_once_and_evicted() -> None:
+    source = GeneratedSource(config_of(3), deferred=True)
+    renderer, shown, seen = DeferredRenderer(source.renderer(CPU)), set(), 0
+    deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
+    for batch, _ in zip(deferred, renderer.render_batches(deferred), strict=True):
+        assert not shown & batch.scenes.keys()
+        shown |= batch.scenes.keys()
+        seen += len(batch.number)
+        # Scenes waiting for their next use, and scenes of the unfinished next batch.
+        assert len(renderer) <= source.config.image.replay_panoramas + source.config.image.batch
+    assert len(shown) < seen / 2
+
+
+@given(shift=st.integers(-40, 40), mirrored=st.booleans())
+def test_batches_rotate_like_single_pictures(shift: int, mirrored: bool) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 3), dtype=np.uint8)
+    found = rotate_images(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
+    expected = [
+        Rotation(shift=shift, heading=0.0, mirrored=mirrored).picture(images[0]),
+        Rotation(shift=1, heading=0.0, mirrored=True).picture(images[1]),
+    ]
+    assert np.array_equal(found.numpy(), np.stack(expected))
+
+
+def test_training_does_not_depend_on_the_rendering_place(tmp_path: Path) -> None:
+    common = ["--preset", "tiny", "--workers", "0", "--steps", "3", "--validation-homes", "1"]
+    weights = []
+    for place in ("workers", "device"):
+        out = tmp_path / place
+        assert main(["train", "layout", "--out", str(out), *common]) == 0
+        assert main(["train", "image", "--out", str(out), *common, "--render", place, "--device", "cpu"]) == 0
+        weights.append(Checkpoint.load(out / "image.pt").inference_weights["image_encoder"])
+    for name, value in weights[0].items():
+        assert torch.allclose(value.float(), weights[1][name].float(), atol=1e-3), name
