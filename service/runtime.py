@@ -156,6 +156,8 @@ def start_runtime(
     # As many threads as converter processes. Closed after the converter, because its waiting jobs must end first.
     file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.imports.workers)))
     converter = _closing(cleanup, Converter(settings, telemetry))
+    # A file can take its worker longer than the service may take to stop.
+    components.admission.at_stop(converter.close)
     grids, localiser = components.grids, _closing(cleanup, components.localiser())
     sweeper = Sweeper(store, grids, sweep_s=settings.grids.sweep_s, keep_answers_s=settings.storage.keep_answers_s)
     _closing(cleanup, sweeper).start()

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Iterator
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from time import monotonic
@@ -209,6 +210,7 @@ class Admission:
         self.reading = FairSemaphore(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
+        self._at_stop: list[Callable[[], None]] = []
         telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in progress.", lambda: self.requests.in_use)
         telemetry.gauge(
             "lalaloc_queries_in_work",
@@ -223,9 +225,15 @@ class Admission:
         """Announce that the service will stop soon. Safe to call in a signal handler."""
         self.draining = True
 
+    def at_stop(self, action: Callable[[], None]) -> None:
+        """Run an action on a thread of its own when the service stops, for work that requests must not wait for."""
+        self._at_stop.append(action)
+
     def stop(self) -> None:
         """Refuse new requests; running requests continue. Safe to call in a signal handler."""
         self.draining = self.stopping = True
+        while self._at_stop:
+            threading.Thread(target=self._at_stop.pop(), daemon=True).start()
 
     @property
     def idle(self) -> bool:

@@ -132,15 +132,16 @@ class JobQueue:
         """Queue a job again whose worker died, if it has tries and time left; fail it otherwise, and if it stalled."""
         reason: LostReason | None = None
         with self._changed:
-            if pending.stalled:
+            if self._closed:
+                # Its worker was killed for that.
+                reason = "closing"
+            elif pending.stalled:
                 # Not retried, because it would take as long again. A new submission is tried: the machine may have
                 # been busy.
                 reason = "stalled"
             elif pending.deaths >= _TRIES_PER_JOB:
                 reason = "poisoned"
                 self._poisoned[pending.digest] = True
-            elif self._closed:
-                reason = "closing"
             elif not pending.wanted or not self._served_by(pending.deadline):
                 reason = "died"
             else:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
 
 import httpx
+from ezdxf.filemanagement import new as new_dxf
 
+from tests.importers.conftest import dxf_file
 from tests.service.conftest import FLAT, assert_problem, tiled_plan, upload, wait_for
 from tests.service.test_process import ROOT, alive, children, environment_of
 
@@ -82,6 +86,30 @@ def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> No
             assert upload.recv(4096).startswith(b"HTTP/1.1 201 ")
         assert service.process.wait(10.0) == 0
         assert not any(alive(worker) for worker in workers)
+
+
+def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], close=True, dxfattribs={"layer": "ROOM"})
+    content = dxf_file(document)
+    # Requests in progress could take a minute of this.
+    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="100") as service:
+        others = children(service.process.pid)
+        headers = {"Content-Type": "image/vnd.dxf"}
+        assert service.client.post("/floorplans", content=content, headers=headers).status_code == 201
+        importers = [worker for worker in children(service.process.pid) if worker not in others]
+        assert importers
+        for importer in importers:
+            # As a library that does not return.
+            os.kill(importer, signal.SIGSTOP)
+        with ThreadPoolExecutor(1) as threads:
+            running = threads.submit(service.client.post, "/floorplans", content=content, headers=headers)
+            wait_for(lambda: _in_flight(service.client))
+            service.process.send_signal(signal.SIGTERM)
+            assert_problem(running.result(30.0), 503, "stopping")
+        assert service.process.wait(30.0) == 0
+        assert not any(alive(importer) for importer in importers)
 
 
 def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
