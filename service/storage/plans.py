@@ -325,24 +325,6 @@ class Plans:
         return PlanRecord(**row._mapping, plan=plan)
 
 
-def _record(self, found: _StoredPlan) -> PlanRecord:
-    """Parse a plan; call it outside of transactions, because it is slow.
-
-    Raises:
-        DamagedDataError: the document is damaged.
-    """
-    row, plan = found.row, found.plan
-    if isinstance(plan, PlanDocument):
-        plan = plan.plan()
-        if plan is None:
-            raise _damaged("document", row.id, row.revision_id)
-    return PlanRecord(**row._mapping, plan=plan)
-
-
-def _digest(document: str) -> str:
-    return hashlib.sha256(document.encode("utf-8", "surrogatepass")).hexdigest()
-
-
 def _document(connection: Connection, revision_id: str) -> PlanDocument:
     columns = REVISIONS.c
     query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == revision_id)
