@@ -5,7 +5,7 @@ LaLaLocError
 │   ├── InvalidFloorPlanError    a floor plan is invalid; names the room
 │   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
 │   ├── MissingExtraError        a format needs a package that is not installed; names the extra
-│   ├── InvalidPanoramaError     a picture is not a usable 360° panorama
+│   ├── InvalidPanoramaError     a picture is not a usable panorama or photograph, or a statement about it is invalid
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
 │   ├── InvalidHintError         a hint is invalid; names the hint
 │   ├── InvalidMotionError       a motion between two photographs is invalid
@@ -78,7 +78,7 @@ class MissingExtraError(InvalidInputError):
 
 
 class InvalidPanoramaError(InvalidInputError):
-    """A picture is not a readable equirectangular panorama."""
+    """A picture is not a usable panorama or photograph, or a statement about it is invalid."""
 
 
 class InvalidPoseError(InvalidInputError):

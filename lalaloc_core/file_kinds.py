@@ -21,9 +21,10 @@ _MAGIC = (
     (b"AC10", "a DWG drawing"),
     (b"ISO-10303-21;", "an IFC or STEP model"),
 )
+HEIC = "a HEIC picture"
 # Bytes 8 to 12 of an ISO media file are its brand; unlisted brands are videos.
 _BRANDS = {
-    **dict.fromkeys((b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1"), "a HEIC picture"),
+    **dict.fromkeys((b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1"), HEIC),
     **dict.fromkeys((b"avif", b"avis"), "an AVIF picture"),
 }
 _GEOJSON = re.compile(rb'"type"\s{0,20}:\s{0,20}"(FeatureCollection|Feature|GeometryCollection|MultiPolygon|Polygon)"')

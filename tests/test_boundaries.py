@@ -29,6 +29,7 @@ LAYERS = {
     "lalaloc_core.floorplan": 1,
     "lalaloc_core.localise.bundle": 2,
     "lalaloc_core.panorama": 2,
+    "lalaloc_core.photograph": 3,
     "lalaloc_core.render": 2,
     "lalaloc_core.nets": 3,
     "lalaloc_core.localise": 4,
@@ -75,7 +76,7 @@ LAYERS = {
     "lalaloc_client.blocking": 1,
 }
 # Forbidden imports of a package, regardless of layers.
-QUERY_SIDE = ("floorplan", "importers", "panorama", "render", "nets", "localise", "draw")
+QUERY_SIDE = ("floorplan", "importers", "panorama", "photograph", "render", "nets", "localise", "draw")
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),

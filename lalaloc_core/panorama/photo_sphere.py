@@ -47,7 +47,9 @@ class PhotoSphere:
     Attributes:
         part: visible part of the sphere, None for all of it or if unknown.
         fault: problem with the metadata of `part`, None if they are valid or missing.
-        refusal: reason that the metadata rule the picture out, None if they do not.
+        refusal: reason that the metadata rule the picture out as a sphere, None if they do not.
+        declared: the metadata state that the picture shows a sphere or a part of it.
+        cylinder: horizontal field of view of a picture that the metadata state to be cylindrical; None if they do not.
         roll: clockwise rotation of the camera about its viewing direction; the horizon rotates counterclockwise.
         compass_heading: azimuth of the centre, clockwise from true north; None if missing.
     """
@@ -55,6 +57,8 @@ class PhotoSphere:
     part: SpherePart | None = None
     fault: str | None = None
     refusal: str | None = None
+    declared: bool = False
+    cylinder: float | None = None
     pitch: float = 0.0
     roll: float = 0.0
     compass_heading: float | None = None
@@ -70,7 +74,10 @@ def read_photo_sphere(xmp: bytes | str | None, *, width: int, height: int) -> Ph
     values = _properties(xmp)
     projection = values.get("ProjectionType", "equirectangular")
     if projection.lower() != "equirectangular":
-        return PhotoSphere(refusal=f"the projection is '{projection[:50]}'; only 'equirectangular' is supported")
+        return PhotoSphere(
+            refusal=f"the projection is '{projection[:50]}'; only 'equirectangular' is supported",
+            cylinder=_cylinder(values) if projection.lower() == "cylindrical" else None,
+        )
     part, fault = _part(values, width, height)
     share = 1.0 if part is None else part.width * part.height
     if share < _MIN_SHARE:
@@ -78,6 +85,7 @@ def read_photo_sphere(xmp: bytes | str | None, *, width: int, height: int) -> Ph
     return PhotoSphere(
         part=part,
         fault=fault,
+        declared="ProjectionType" in values or any(name in values for name in _CROP),
         pitch=_angle(values, "PosePitchDegrees", -90.0, 90.0) or 0.0,
         roll=_angle(values, "PoseRollDegrees", -180.0, 180.0) or 0.0,
         compass_heading=_angle(values, "PoseHeadingDegrees", 0.0, 360.0),
@@ -113,6 +121,12 @@ def _number(text: str | None) -> float | None:
 def _angle(values: dict[str, str], name: str, low_deg: float, high_deg: float) -> float | None:
     degrees = _number(values.get(name))
     return math.radians(degrees) if degrees is not None and low_deg <= degrees <= high_deg else None
+
+
+def _cylinder(values: dict[str, str]) -> float | None:
+    """Return the angle that a part of a cylinder shows."""
+    full, part = (_number(values.get(name)) for name in ("FullPanoWidthPixels", "CroppedAreaImageWidthPixels"))
+    return math.tau * part / full if full and part and 0.0 < part <= full else None
 
 
 def _part(values: dict[str, str], width: int, height: int) -> tuple[SpherePart | None, str | None]:

@@ -79,11 +79,11 @@ def _check_jpeg(content: bytes) -> None:
         exif += marker == APP1 and content.startswith(b"Exif\0\0", position + 2)
         if segments > _MAX_SEGMENTS:
             raise InvalidPanoramaError(
-                f"the panorama is a JPEG with more than {_MAX_SEGMENTS} segments, the limit; save it again"
+                f"the photograph is a JPEG with more than {_MAX_SEGMENTS} segments, the limit; save it again"
             )
         if exif > _MAX_EXIF_SEGMENTS:
             raise InvalidPanoramaError(
-                f"the panorama is a JPEG with more than {_MAX_EXIF_SEGMENTS} Exif segments, the limit; save it again"
+                f"the photograph is a JPEG with more than {_MAX_EXIF_SEGMENTS} Exif segments, the limit; save it again"
             )
 
 
@@ -94,5 +94,5 @@ def _check_png(content: bytes) -> None:
         position += _CHUNK_FRAME + int.from_bytes(content[position : position + 4], "big")
         if chunks > _MAX_CHUNKS:
             raise InvalidPanoramaError(
-                f"the panorama is a PNG with more than {_MAX_CHUNKS} chunks, the limit; save it again"
+                f"the photograph is a PNG with more than {_MAX_CHUNKS} chunks, the limit; save it again"
             )

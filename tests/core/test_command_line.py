@@ -67,7 +67,7 @@ def test_several_photographs_give_rows_and_pictures(
     [
         (["gone.json", KITCHEN], "'gone.json' cannot be read"),
         ([PLAN, "gone.jpg"], "'gone.jpg' cannot be read"),
-        ([PLAN, PLAN], "flat.json': the panorama is"),
+        ([PLAN, PLAN], "flat.json': the photograph is"),
         ([PLAN, KITCHEN, "--out", "answer.gif"], "'answer.gif'; it must end in .png or .svg"),
         ([PLAN, KITCHEN, "--out", "/gone/answer.svg", "--picture", "plan"], "cannot be written"),
         ([PLAN, KITCHEN, "--camera-height", "3"], "--camera-height is 3 m; it must be at least 0.1 m and below"),

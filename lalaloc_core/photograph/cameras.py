@@ -1,0 +1,287 @@
+"""Camera models: from rays to pixels and back.
+
+Rays are in the camera's frame (right, forward, up). Pixel coordinates are continuous: x to the right and y down from
+the picture's top left corner, so the centre of pixel (row i, column j) is (j + 0.5, i + 0.5). OpenCV counts from the
+centre of that pixel instead; `stated.py` converts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# Newton steps that undo distortions; each doubles the number of correct digits.
+_STEPS = 12
+_TINY = 1e-12
+# Angle from the optical axis within which a perspective camera sees.
+_MAX_PERSPECTIVE = math.radians(85.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Perspective:
+    """Pinhole camera with OpenCV's radial and tangential distortion.
+
+    Attributes:
+        width, height: size of the picture, pixels.
+        fx, fy: focal lengths, pixels.
+        cx, cy: optical centre, pixels from the top left corner.
+        radial: coefficients k1, k2, k3.
+        tangential: coefficients p1, p2.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, float] = (0.0, 0.0)
+    _limit: float = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        k1, k2, k3 = self.radial
+        turn = _first_root([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        object.__setattr__(self, "_limit", min(math.tan(_MAX_PERSPECTIVE), math.sqrt(turn)))
+
+    @classmethod
+    def of_hfov(cls, width: int, height: int, hfov: float) -> Perspective:
+        """Return the camera without distortion that has a horizontal field of view (radians)."""
+        focal = 0.5 * width / math.tan(0.5 * hfov)
+        return cls(width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
+
+    @property
+    def hfov(self) -> float:
+        """Horizontal field of view, radians: between the ends of the row of the optical axis."""
+        sides = self.rays(np.array([[0.0, self.cy], [float(self.width), self.cy]]))
+        left, right = np.arctan2(sides[:, 0], sides[:, 1])
+        return float(right - left)
+
+    @property
+    def resolution(self) -> float:
+        """Pixels per radian at the optical axis."""
+        return self.fx
+
+    def pixels(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return the pixel coordinates (x, y) of rays of any length, and which of them the picture shows."""
+        right, forward, up = rays[..., 0], rays[..., 1], rays[..., 2]
+        # Rays from behind are not seen; any positive number avoids dividing by zero.
+        depth = np.where(forward > _TINY, forward, 1.0)
+        x, y = right / depth, -up / depth
+        in_front = (forward > _TINY) & (x * x + y * y < self._limit**2)
+        if self._distorted:
+            x, y = self._distort(np.where(in_front, x, 0.0), np.where(in_front, y, 0.0))[:2]
+        pixels = np.stack([x * self.fx + self.cx, y * self.fy + self.cy], axis=-1)
+        return pixels, in_front & _inside(pixels, self.width, self.height)
+
+    def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the unit rays of pixel coordinates (x, y)."""
+        wanted_x, wanted_y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        x, y = wanted_x, wanted_y
+        for _ in range(_STEPS if self._distorted else 0):
+            found_x, found_y, xx, xy, yy = self._distort(x, y)
+            error_x, error_y = found_x - wanted_x, found_y - wanted_y
+            determinant = xx * yy - xy * xy
+            determinant = np.where(np.abs(determinant) > _TINY, determinant, _TINY)
+            x = x - (yy * error_x - xy * error_y) / determinant
+            y = y - (xx * error_y - xy * error_x) / determinant
+        return _unit(x, np.ones_like(x), -y)
+
+    def scaled(self, width: int, height: int) -> Perspective:
+        """Return the camera of the picture scaled to another size."""
+        across, down = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * across,
+            cx=self.cx * across,
+            fy=self.fy * down,
+            cy=self.cy * down,
+        )
+
+    @property
+    def _distorted(self) -> bool:
+        return any((*self.radial, *self.tangential))
+
+    def _distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the distorted coordinates, and their derivatives xx, xy = yx and yy."""
+        (k1, k2, k3), (p1, p2) = self.radial, self.tangential
+        square = x * x + y * y
+        gain = 1.0 + square * (k1 + square * (k2 + square * k3))
+        slope = 2.0 * (k1 + square * (2.0 * k2 + square * 3.0 * k3))
+        return (
+            x * gain + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+            y * gain + 2.0 * p2 * x * y + p1 * (square + 2.0 * y * y),
+            gain + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
+            x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y,
+            gain + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fisheye:
+    """OpenCV's fisheye camera: the angle θ from the axis lies at f θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸).
+
+    Attributes:
+        width, height: size of the picture, pixels.
+        fx, fy: focal lengths, pixels per radian.
+        cx, cy: optical centre, pixels from the top left corner.
+        radial: coefficients k1 to k4.
+        max_angle: largest angle from the axis that the lens shows, radians.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    max_angle: float = math.pi
+    _limit: float = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        k1, k2, k3, k4 = self.radial
+        turn = _first_root([9.0 * k4, 7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        object.__setattr__(self, "_limit", min(self.max_angle, math.sqrt(turn)))
+
+    @classmethod
+    def of_hfov(cls, width: int, height: int, hfov: float) -> Fisheye:
+        """Return the equidistant camera that has a horizontal field of view (radians).
+
+        A square picture shows a circle, because no lens fills its corners beyond 180°.
+        """
+        focal = width / hfov
+        circular = abs(width / height - 1.0) < 0.1
+        return cls(
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=0.5 * width,
+            cy=0.5 * height,
+            max_angle=0.5 * hfov if circular else math.pi,
+        )
+
+    @property
+    def hfov(self) -> float:
+        """Horizontal field of view, radians: between the ends of the row of the optical axis."""
+        sides = np.array([[0.0, self.cy], [self.width, self.cy]])
+        return float(np.minimum(self._angles(sides)[0], self._limit).sum())
+
+    @property
+    def resolution(self) -> float:
+        """Pixels per radian at the optical axis."""
+        return self.fx
+
+    def pixels(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return the pixel coordinates (x, y) of rays of any length, and which of them the picture shows."""
+        right, forward, up = rays[..., 0], rays[..., 1], rays[..., 2]
+        across = np.hypot(right, up)
+        angle = np.arctan2(across, forward)
+        gain = self._radius(angle)[0] / np.maximum(across, _TINY)
+        pixels = np.stack([right * gain * self.fx + self.cx, -up * gain * self.fy + self.cy], axis=-1)
+        return pixels, (angle <= self._limit) & _inside(pixels, self.width, self.height)
+
+    def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the unit rays of pixel coordinates (x, y)."""
+        angle, x, y = self._angles(pixels)
+        share = np.sin(angle) / np.maximum(np.hypot(x, y), _TINY)
+        return _unit(x * share, np.cos(angle), -y * share)
+
+    def scaled(self, width: int, height: int) -> Fisheye:
+        """Return the camera of the picture scaled to another size."""
+        across, down = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * across,
+            cx=self.cx * across,
+            fy=self.fy * down,
+            cy=self.cy * down,
+        )
+
+    def _angles(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return angles from the axis, and the normalised coordinates that they were computed from."""
+        x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        wanted = np.hypot(x, y)
+        angle = np.minimum(wanted, self._limit)
+        for _ in range(_STEPS if any(self.radial) else 0):
+            radius, slope = self._radius(angle)
+            angle = np.clip(angle - (radius - wanted) / np.maximum(slope, 1e-3), 0.0, self._limit)
+        return angle, x, y
+
+    def _radius(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance from the centre, in focal lengths, and its derivative."""
+        k1, k2, k3, k4 = self.radial
+        square = angle * angle
+        radius = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+        slope = 1.0 + square * (3.0 * k1 + square * (5.0 * k2 + square * (7.0 * k3 + square * 9.0 * k4)))
+        return radius, slope
+
+
+@dataclass(frozen=True, kw_only=True)
+class Around:
+    """Picture of a cylinder or a sphere around the camera, centred on the horizon, with square pixels there.
+
+    Attributes:
+        width, height: size of the picture, pixels.
+        hfov: horizontal field of view, radians; at most 2π.
+        spherical: rows are elevations (equirectangular) instead of their tangents (cylindrical).
+    """
+
+    width: int
+    height: int
+    hfov: float
+    spherical: bool = False
+
+    @property
+    def resolution(self) -> float:
+        """Pixels per radian at the optical axis."""
+        return self.width / self.hfov
+
+    def pixels(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return the pixel coordinates (x, y) of rays of any length, and which of them the picture shows."""
+        azimuth = np.arctan2(rays[..., 0], rays[..., 1])
+        across = np.hypot(rays[..., 0], rays[..., 1])
+        rise = np.arctan2(rays[..., 2], across) if self.spherical else rays[..., 2] / np.maximum(across, _TINY)
+        pixels = np.stack(
+            [0.5 * self.width + azimuth * self.resolution, 0.5 * self.height - rise * self.resolution], axis=-1
+        )
+        return pixels, _inside(pixels, self.width, self.height)
+
+    def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the unit rays of pixel coordinates (x, y)."""
+        azimuth = (pixels[..., 0] - 0.5 * self.width) / self.resolution
+        rise = (0.5 * self.height - pixels[..., 1]) / self.resolution
+        return _unit(np.sin(azimuth), np.cos(azimuth), np.tan(rise) if self.spherical else rise)
+
+    def scaled(self, width: int, height: int) -> Around:
+        """Return the camera of the picture scaled to another size."""
+        return dataclasses.replace(self, width=width, height=height)
+
+
+Camera = Perspective | Fisheye | Around
+
+
+def _first_root(coefficients: list[float]) -> float:
+    """Return the smallest positive root of a polynomial, infinity without one; highest power first."""
+    roots = np.roots(coefficients)
+    positive = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
+    return float(positive.min()) if len(positive) else math.inf
+
+
+def _inside(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    x, y = pixels[..., 0], pixels[..., 1]
+    return (x >= 0.0) & (x <= width) & (y >= 0.0) & (y <= height)
+
+
+def _unit(right: np.ndarray, forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+    rays = np.stack([right, forward, up], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)

@@ -1,0 +1,148 @@
+"""Focal length of a photograph by its EXIF metadata.
+
+Phones write `FocalLengthIn35mmFilm`, which is preferred: it holds after scaling, and phones include digital zoom.
+Otherwise `FocalLength` is divided by the width of the sensor, from `FocalPlaneXResolution` or a table, and multiplied
+by `DigitalZoomRatio`. Values are not trusted: a zero means unknown by the standard (CIPA DC-008), and values out of
+range are ignored with a warning.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from PIL import ExifTags, Image
+
+# Diagonal of 35 mm film (36 x 24 mm), which equivalent focal lengths refer to (CIPA DC-008, FocalLengthIn35mmFilm).
+_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+# Sides of a 4:3 sensor with that diagonal.
+_LONG_MM, _SHORT_MM = 0.8 * _FILM_DIAGONAL_MM, 0.6 * _FILM_DIAGONAL_MM
+# Phones that write no equivalent focal length, at least with their first software: focal length of the rear camera (mm,
+# as in its files) and longer side of the sensor (mm, openMVG's CameraSensorSizeDatabase).
+_SENSORS_MM = {
+    "iphone 4": (3.85, 4.54),
+    "iphone 4s": (4.28, 4.54),
+    "iphone 5": (4.13, 4.54),
+    "iphone 5s": (4.15, 4.89),
+    "iphone 6": (4.15, 4.89),
+    "iphone 6 plus": (4.15, 4.89),
+}
+_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FILM_RANGE_MM = (4.0, 250.0)
+_FOCAL_RANGE_MM = (0.5, 250.0)
+_SENSOR_RANGE_MM = (1.5, 60.0)
+_ZOOM_RANGE = (1.0, 20.0)
+# Relative difference of aspect ratios from which a picture counts as cropped after it was taken.
+_CROPPED = 0.03
+# `CustomRendered` of Apple's panorama mode, in which the focal length is that of the moving camera.
+_PANORAMA = 6
+# Relative standard deviations of the focal length: rounding and lens of the usual shapes, and of cropped sensors.
+_SD, _CROPPED_SD = 0.03, 0.06
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExifLens:
+    """Statements of the EXIF metadata about the lens.
+
+    Attributes:
+        focal: focal length, pixels of the full picture; None if unknown.
+        focal_sd: relative standard deviation of `focal`.
+        panorama: the picture is a strip of a phone's panorama mode.
+        warnings: values that were ignored, and why.
+    """
+
+    focal: float | None = None
+    focal_sd: float = 0.0
+    panorama: bool = False
+    warnings: tuple[str, ...] = ()
+
+
+def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
+    """Read the focal length of a picture of `width` x `height` pixels, in either orientation."""
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    warnings: list[str] = []
+    if tags.get(ExifTags.Base.CustomRendered) == _PANORAMA:
+        return ExifLens(panorama=True)
+    zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
+    film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
+    lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
+    if _is_cropped(tags, width, height):
+        if film is not None or lens is not None:
+            warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
+        return ExifLens(warnings=tuple(warnings))
+    long, ratio = max(width, height), max(width, height) / min(width, height)
+    usual = min(abs(ratio - 4.0 / 3.0), abs(ratio - 1.5)) < 0.05
+    focal = None
+    if film is not None:
+        focal = film / _film_side_mm(ratio) * long
+    elif lens is not None and (side_mm := _sensor_side_mm(exif, tags, lens, warnings)) is not None:
+        focal = zoom * lens / side_mm * long
+    # Makers disagree whether the equivalent focal length includes digital zoom.
+    doubt = 0.5 * math.log(zoom) if film is not None else 0.0
+    return ExifLens(focal=focal, focal_sd=max(_SD if usual else _CROPPED_SD, doubt), warnings=tuple(warnings))
+
+
+def _film_side_mm(ratio: float) -> float:
+    """Return the longer side of the picture on film, filled at 3:2; other shapes are crops of a 4:3 sensor."""
+    if abs(ratio - 1.5) < 0.05:
+        return 36.0
+    return _LONG_MM if ratio >= 4.0 / 3.0 else _SHORT_MM * ratio
+
+
+def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, warnings: list[str]) -> float | None:
+    """Return the longer side of the sensor, from the pixels per unit on it or the model."""
+    density = _number(tags.get(ExifTags.Base.FocalPlaneXResolution))
+    unit_mm = _UNITS_MM.get(_integer(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)))
+    sides = [_number(tags.get(tag)) or 0.0 for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    if density and unit_mm and max(sides) > 0.0:
+        side_mm = max(sides) / density * unit_mm
+        if _SENSOR_RANGE_MM[0] <= side_mm <= _SENSOR_RANGE_MM[1]:
+            return side_mm
+        warnings.append(
+            f"EXIF FocalPlaneXResolution gives a sensor of {side_mm:.3g} mm; it must be between "
+            f"{_SENSOR_RANGE_MM[0]:g} and {_SENSOR_RANGE_MM[1]:g} mm, so it is ignored"
+        )
+    model = str(exif.get(ExifTags.Base.Model, "")).strip("\0 ").lower()
+    known_mm, side_mm = _SENSORS_MM.get(model, (0.0, 0.0))
+    # The front camera has another sensor.
+    return side_mm if abs(lens_mm - known_mm) < 0.05 * lens_mm else None
+
+
+def _is_cropped(tags: dict[int, object], width: int, height: int) -> bool:
+    sides = [_number(tags.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    if not sides[0] or not sides[1] or min(sides[0], sides[1]) < 1.0:
+        return False
+    taken = max(sides[0], sides[1]) / min(sides[0], sides[1])
+    return abs(taken * min(width, height) / max(width, height) - 1.0) > _CROPPED
+
+
+def _in_range(
+    tags: dict[int, object], tag: ExifTags.Base, limits: tuple[float, float], unit: str, warnings: list[str]
+) -> float | None:
+    """Return a tag's value; None if it is missing, zero (unknown) or out of range (with a warning)."""
+    if tags.get(tag) is None:
+        return None
+    value = _number(tags[tag])
+    if value == 0.0:
+        return None
+    if value is None or not limits[0] <= value <= limits[1]:
+        shown = "not a number" if value is None else f"{value:g}{unit}"
+        warnings.append(
+            f"EXIF {tag.name} is {shown}; it must be between {limits[0]:g} and {limits[1]:g}{unit}, so it is ignored"
+        )
+        return None
+    return value
+
+
+def _number(value: object) -> float | None:
+    """Return a finite number; None for text, several values and fractions with a denominator of zero."""
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _integer(value: object) -> int:
+    number = _number(value)
+    return 0 if number is None else round(number)

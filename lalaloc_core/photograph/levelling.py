@@ -1,0 +1,195 @@
+"""Tilt of a camera, and its field of view if unknown, estimated from straight lines.
+
+Most lines of interiors are vertical or run along one of two horizontal directions at right angles (Manhattan world). A
+line's image points to the vanishing point of its direction. The likelihood of an attitude is a mixture per segment: one
+of the three directions, with a small angular error, or any direction. Sources: Coughlan and Yuille, "Manhattan World",
+ICCV 1999; von Gioi et al., "LSD", PAMI 2010.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.panorama.levelling import camera_axes
+from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.lines import Lines, lines_of
+
+# Angular error of a segment: modelling, and of its ends in pixels.
+_SIGMA = math.radians(0.6)
+_SIGMA_PIXELS = 0.6
+# Prior shares of vertical segments, of each horizontal direction, and of others.
+_SHARES = np.array([0.3, 0.2, 0.2])
+_OUTLIERS = 0.3 / math.pi
+# Handheld cameras: standard deviations of pitch and roll.
+_PRIOR = np.radians([12.0, 4.0])
+# Tilts with a larger standard deviation (radians) are assumed rather than estimated.
+MAX_ESTIMATED_SD = math.radians(4.0)
+_PITCHES = np.radians(np.arange(-40.0, 40.1, 2.5))
+_ROLLS = np.radians(np.arange(-17.5, 17.6, 2.5))
+_YAWS = np.radians(np.arange(0.0, 90.0, 3.0))
+# Angular error of the coarse search, which steps over narrow peaks.
+_COARSE_SIGMA = math.radians(2.0)
+_STARTS = 12
+_REFINED = 4
+_STEPS = 12
+# Likelihoods of segments are not independent: one edge gives several.
+_TEMPERATURE = 0.2
+# Errors that lines do not show: lenses, edges that are not quite upright. Fitted on views cut from spheres.
+_FLOOR = np.radians([0.45, 0.3])
+
+
+# Field of view of the longer side, if unknown: values to try, and the prior of log focal length of phones.
+_LONG_FOVS = np.radians([44.0, 48.0, 52.0, 57.0, 62.0, 67.0, 73.0, 79.0, 86.0, 93.0, 100.0, 108.0, 116.0])
+_USUAL_FOV, _FOV_SD = math.radians(72.0), 0.35
+# Steps between values, lenses.
+_FOCAL_FLOOR = 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attitude:
+    """Tilt of a camera.
+
+    Attributes:
+        pitch: elevation of the optical axis, radians.
+        roll: clockwise rotation about it, radians.
+        pitch_sd, roll_sd: standard deviations, radians.
+    """
+
+    pitch: float
+    roll: float
+    pitch_sd: float
+    roll_sd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Field of view and tilt of a camera about which nothing is known.
+
+    Attributes:
+        hfov: horizontal field of view, radians.
+        focal_sd: relative standard deviation of the focal length.
+        attitude: the tilt.
+    """
+
+    hfov: float
+    focal_sd: float
+    attitude: Attitude
+
+
+def estimate_attitude(lines: Lines) -> Attitude:
+    """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
+    if not len(lines.length):
+        return _attitude([(np.zeros(3), 0.0, np.diag(_PRIOR**2))])
+    return _attitude([_refined(lines, start) for start in _starts(lines)[:_REFINED]])
+
+
+def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
+    """Return the most probable field of view and tilt of a perspective camera without distortion.
+
+    Args:
+        segments: segments of `lines.find_segments`.
+        width: columns of the picture.
+        height: rows of the picture.
+    """
+    focals = 0.5 * max(width, height) / np.tan(0.5 * _LONG_FOVS)
+    modes = []
+    for focal in focals:
+        camera = Perspective(width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
+        lines = lines_of(segments, camera)
+        modes.append(_refined(lines, _starts(lines)[0]) if len(lines.length) else (np.zeros(3), 0.0, np.eye(3)))
+    log_focal = np.log(focals)
+    usual = math.log(0.5 * max(width, height) / math.tan(0.5 * _USUAL_FOV))
+    scores = np.array([score for _, score, _ in modes]) - 0.5 * ((log_focal - usual) / _FOV_SD) ** 2
+    weights = np.exp(scores - scores.max())
+    weights /= weights.sum()
+    mean = float(weights @ log_focal)
+    attitude = _attitude([(angles, score, cov) for (angles, _, cov), score in zip(modes, scores, strict=True)])
+    return Calibration(
+        hfov=2.0 * math.atan(0.5 * width / math.exp(mean)),
+        focal_sd=math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2),
+        attitude=attitude,
+    )
+
+
+def _attitude(modes: list[tuple[np.ndarray, float, np.ndarray]]) -> Attitude:
+    """Return the best of several modes (angles, score, covariance), with the spread of all."""
+    best, score, covariance = max(modes, key=lambda mode: mode[1])
+    weights = np.array([math.exp(mode[1] - score) for mode in modes])
+    offsets = np.array([mode[0][:2] - best[:2] for mode in modes])
+    spread = (weights[:, None] * offsets**2).sum(axis=0) / weights.sum()
+    sd = np.minimum(np.sqrt(np.diag(covariance)[:2] + _FLOOR**2 + spread), _PRIOR)
+    return Attitude(pitch=float(best[0]), roll=float(best[1]), pitch_sd=float(sd[0]), roll_sd=float(sd[1]))
+
+
+def _directions(angles: np.ndarray) -> np.ndarray:
+    """Return the vertical and the two horizontal directions (3, 3) in the camera's frame, one per row."""
+    pitch, roll, yaw = angles
+    axes = camera_axes(pitch=pitch, roll=roll)
+    level = np.array([[0.0, 0.0, 1.0], [math.sin(yaw), math.cos(yaw), 0.0], [math.cos(yaw), -math.sin(yaw), 0.0]])
+    return level @ axes.T
+
+
+def _errors(lines: Lines, directions: np.ndarray) -> np.ndarray:
+    """Return the sine of the angle between each segment and the great circle to each direction, (n, d)."""
+    along = lines.middle @ directions.T
+    return (lines.normal @ directions.T) / np.sqrt(np.maximum(1.0 - along * along, 1e-3))
+
+
+def _sigmas(lines: Lines, least: float) -> np.ndarray:
+    return np.hypot(least, _SIGMA_PIXELS * lines.pixel / lines.length)
+
+
+def _weights(lines: Lines) -> np.ndarray:
+    return _TEMPERATURE * np.sqrt(lines.length / np.median(lines.length))
+
+
+def _densities(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    return np.exp(-0.5 * (error / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
+
+
+def _starts(lines: Lines) -> list[np.ndarray]:
+    """Return the best attitudes (pitch, roll, yaw) of a coarse search."""
+    sigma = _sigmas(lines, _COARSE_SIGMA)[:, None]
+    weight = _weights(lines)
+    pitch, roll = (grid.ravel() for grid in np.meshgrid(_PITCHES, _ROLLS, indexing="ij"))
+    vertical = np.stack([-np.sin(roll) * np.cos(pitch), np.sin(pitch), np.cos(roll) * np.cos(pitch)], axis=-1)
+    upright = _SHARES[0] * _densities(_errors(lines, vertical), sigma)
+    prior = -0.5 * ((pitch / _PRIOR[0]) ** 2 + (roll / _PRIOR[1]) ** 2)
+    score = weight @ np.log(upright + _OUTLIERS + 0.4 / math.pi) + prior
+    found = []
+    for index in np.argsort(-score)[:_STARTS]:
+        axes = camera_axes(pitch=float(pitch[index]), roll=float(roll[index]))
+        level = np.stack([np.sin(_YAWS), np.cos(_YAWS), np.zeros_like(_YAWS)], axis=-1)
+        first = _densities(_errors(lines, level @ axes.T), sigma)
+        across = np.stack([np.cos(_YAWS), -np.sin(_YAWS), np.zeros_like(_YAWS)], axis=-1)
+        second = _densities(_errors(lines, across @ axes.T), sigma)
+        full = weight @ np.log(upright[:, index, None] + _SHARES[1] * first + _SHARES[2] * second + _OUTLIERS)
+        best = int(np.argmax(full))
+        found.append((full[best] + prior[index], np.array([pitch[index], roll[index], _YAWS[best]])))
+    found.sort(key=lambda start: -start[0])
+    return [start for _, start in found]
+
+
+def _refined(lines: Lines, angles: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Refine an attitude by expectation maximisation; return it with its score and covariance."""
+    prior = np.array([*(1.0 / _PRIOR**2), 0.0])
+    weight = _weights(lines)
+    for step in range(_STEPS):
+        least = max(_SIGMA, _COARSE_SIGMA * 0.7**step)
+        sigma = _sigmas(lines, least)[:, None]
+        error = _errors(lines, _directions(angles))
+        density = _SHARES * _densities(error, sigma)
+        share = weight[:, None] * density / (density.sum(axis=1, keepdims=True) + _OUTLIERS) / sigma**2
+        slopes = np.stack(
+            [(_errors(lines, _directions(angles + delta)) - error) / 1e-5 for delta in 1e-5 * np.eye(3)], axis=-1
+        )
+        information = np.einsum("nd,ndi,ndj->ij", share, slopes, slopes) + np.diag(prior) + 1e-3 * np.eye(3)
+        gradient = np.einsum("nd,ndi,nd->i", share, slopes, error) + prior * angles
+        angles = angles - np.linalg.solve(information, gradient)
+    density = _SHARES * _densities(_errors(lines, _directions(angles)), sigma)
+    score = float(weight @ np.log(density.sum(axis=1) + _OUTLIERS) - 0.5 * (prior * angles * angles).sum())
+    return angles, score, np.linalg.inv(information)

@@ -1,0 +1,142 @@
+"""Gravity-aligned patches of photographs, as the network for photographs expects them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.panorama.levelling import camera_axes
+from lalaloc_core.photograph.cameras import Camera
+
+# Colour of pixels that the photograph does not show.
+UNSEEN = 127
+# Samples per pixel of a patch along each axis.
+_FINER = 2
+# A field of view that is wider than a patch by less than this factor gets one patch.
+_SLACK = 1.03
+# Least overlap of neighbouring patches, as a share of their width.
+_OVERLAP = 0.2
+# cv2.remap counts from the centre of the first pixel.
+_HALF_PIXEL = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchSize:
+    """Size of a patch: equirectangular, with as many pixels per degree of azimuth as of elevation.
+
+    Attributes:
+        height, width: pixels.
+        hfov_deg: range of azimuths.
+        bottom_deg: elevation of the lower border.
+    """
+
+    height: int = 192
+    width: int = 256
+    hfov_deg: float = 112.5
+    bottom_deg: float = -45.0
+
+    @property
+    def top_deg(self) -> float:
+        """Elevation of the upper border."""
+        return self.bottom_deg + self.hfov_deg * self.height / self.width
+
+    @property
+    def hfov(self) -> float:
+        """Range of azimuths, radians."""
+        return math.radians(self.hfov_deg)
+
+    @property
+    def resolution(self) -> float:
+        """Pixels per radian."""
+        return self.width / self.hfov
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Patch:
+    """Part of the level sphere around a camera.
+
+    Attributes:
+        pixels: (h, w, 3) RGB; `UNSEEN` where the photograph shows nothing.
+        seen: (h, w) pixels that the photograph shows.
+        azimuth_rad: azimuth of the centre column relative to the photograph's centre, clockwise.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    seen: Bool[np.ndarray, "h w"]
+    azimuth_rad: float
+
+
+def cut_patches(
+    picture: UInt8[np.ndarray, "h w 3"], camera: Camera, *, pitch: float, roll: float, size: PatchSize
+) -> tuple[Patch, ...]:
+    """Cut the patches that cover a photograph, from left to right.
+
+    Args:
+        picture: the photograph, of the camera's size.
+        camera: its camera.
+        pitch: elevation of the optical axis, radians.
+        roll: clockwise rotation of the camera about it, radians.
+        size: size of the patches.
+    """
+    picture, camera = _reduced(picture, camera, _FINER * size.resolution)
+    axes = camera_axes(pitch=pitch, roll=roll).astype(np.float32)
+    return tuple(_patch(picture, camera, axes, azimuth, size) for azimuth in patch_azimuths(camera.hfov, size))
+
+
+def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
+    """Return the azimuths of the patches that cover a horizontal field of view, relative to its centre."""
+    if hfov <= _SLACK * size.hfov:
+        return [0.0]
+    step = (1.0 - _OVERLAP) * size.hfov
+    if hfov > TWO_PI - 0.5 * size.hfov:
+        count = math.ceil(TWO_PI / step)
+        return [((index + 0.5) / count - 0.5) * TWO_PI for index in range(count)]
+    count = 1 + math.ceil((hfov - size.hfov) / step)
+    return [float(azimuth) for azimuth in np.linspace(-0.5, 0.5, count) * (hfov - size.hfov)]
+
+
+def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float, size: PatchSize) -> Patch:
+    turn = np.array(
+        [
+            [math.cos(azimuth), math.sin(azimuth), 0.0],
+            [-math.sin(azimuth), math.cos(azimuth), 0.0],
+            [0.0, 0.0, 1.0],
+        ],
+        np.float32,
+    )
+    rays = _level_rays(size) @ (axes @ turn).T
+    pixels, seen = camera.pixels(rays)
+    where = (np.where(seen[..., None], pixels, 0.0) - _HALF_PIXEL).astype(np.float32)
+    fine = cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = cv2.resize(fine, (size.width, size.height), interpolation=cv2.INTER_AREA)
+    all_seen = np.logical_and.reduce(seen.reshape(size.height, _FINER, size.width, _FINER), axis=(1, 3))
+    colours[~all_seen] = UNSEEN
+    return Patch(pixels=colours, seen=all_seen, azimuth_rad=azimuth)
+
+
+@lru_cache(maxsize=4)
+def _level_rays(size: PatchSize) -> Float[np.ndarray, "h w 3"]:
+    """Return the rays (right, forward, up) of a patch's samples."""
+    columns, rows = _FINER * size.width, _FINER * size.height
+    azimuth = ((np.arange(columns) + 0.5) / columns - 0.5) * size.hfov
+    share = (np.arange(rows) + 0.5) / rows
+    elevation = np.radians(size.top_deg + (size.bottom_deg - size.top_deg) * share)[:, None]
+    rays = np.broadcast_arrays(
+        np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
+    )
+    return np.stack(rays, axis=-1).astype(np.float32)
+
+
+def _reduced(picture: np.ndarray, camera: Camera, resolution: float) -> tuple[np.ndarray, Camera]:
+    """Scale a photograph down to a resolution (pixels per radian) at its axis, so that sampling does not alias."""
+    share = resolution / camera.resolution
+    if share > 0.85:
+        return picture, camera
+    width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), camera.scaled(width, height)

@@ -1,0 +1,212 @@
+"""Decision which projection and lens a photograph has: statements, metadata, or the picture itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.panorama.photo_sphere import PhotoSphere
+from lalaloc_core.photograph.cameras import Camera, Perspective
+from lalaloc_core.photograph.exif import ExifLens
+from lalaloc_core.photograph.stated import (
+    AUTO,
+    HFOV_RANGE_DEG,
+    Projection,
+    StatedView,
+    camera_of_hfov,
+    camera_of_intrinsics,
+)
+
+# Origins of a value: the caller, GPano metadata, EXIF metadata, the picture, or a usual value.
+Source = Literal["given", "gpano", "exif", "estimated", "assumed"]
+# A wider stated field of view of a photograph is a strip of a phone's panorama mode.
+_WIDEST_LENS = math.radians(120.0)
+# Sides of photographs differ at most by this factor; longer ones are strips.
+_LONGEST = 2.25
+# Relative deviation of a sphere from twice as wide as high.
+_SPHERE_TOLERANCE = 0.01
+# `is_sphere`: limits of the product of seam and poles, of the seam, of the more uniform pole, and of the contrast (grey
+# levels). Fitted on photographs and rendered spheres: all photographs pass, with a margin of two.
+_MAX_PRODUCT, _MAX_SEAM, _MAX_POLE, _MIN_CONTRAST = 0.2, 8.0, 0.5, 2.0
+# Relative standard deviation of a stated focal length.
+_GIVEN_SD = 0.01
+# Advice for photographs without a known field of view.
+_HELP = (
+    "send hfov_deg, its horizontal field of view (a phone's main lens has about 67° in landscape and 53° in portrait "
+    "format), or intrinsics"
+)
+NO_FIELD_OF_VIEW = f"nothing tells the photograph's field of view, and its lines do not show it; {_HELP}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Projection of a photograph.
+
+    Attributes:
+        projection: the projection.
+        projection_source: its origin.
+        camera: camera of the full upright picture; None if the field of view is to be estimated.
+        hfov_source: origin of the field of view.
+        focal_sd: relative standard deviation of the focal length.
+        warnings: metadata that were ignored.
+    """
+
+    projection: Projection
+    projection_source: Source
+    camera: Camera | None = None
+    hfov_source: Source = "estimated"
+    focal_sd: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def is_sphere(self) -> bool:
+        """True for the full sphere, or a part that the GPano metadata place on it."""
+        return self.projection == "equirectangular" and self.camera is None
+
+
+def find_lens(
+    width: int,
+    height: int,
+    *,
+    stated: StatedView,
+    sphere: PhotoSphere,
+    exif: ExifLens,
+    looks_spherical: Callable[[], bool],
+) -> Lens:
+    """Return the projection of a picture: as stated, by GPano, by the picture itself, or by its EXIF focal length.
+
+    Args:
+        width: columns of the upright picture.
+        height: rows of the upright picture.
+        stated: the caller's statements.
+        sphere: GPano metadata.
+        exif: EXIF metadata.
+        looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
+
+    Raises:
+        InvalidPanoramaError: a statement is invalid, or nothing says what the picture shows.
+    """
+    stated.check()
+    projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
+    if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
+        camera = camera_of_intrinsics(projection, width, height, stated.intrinsics)
+        return Lens(
+            projection=projection,
+            projection_source=source,
+            camera=camera,
+            hfov_source="given",
+            focal_sd=_GIVEN_SD,
+        )
+    is_full = projection == "equirectangular" and _is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
+    if stated.hfov_deg is not None and not is_full:
+        camera = camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg))
+        return Lens(
+            projection=projection,
+            projection_source=source,
+            camera=camera,
+            hfov_source="given",
+            focal_sd=_GIVEN_SD,
+        )
+    if projection == "equirectangular":
+        return Lens(projection=projection, projection_source=source, hfov_source=source)
+    if projection == "cylindrical" and sphere.cylinder is not None:
+        camera = camera_of_hfov(projection, width, height, sphere.cylinder)
+        return Lens(
+            projection=projection, projection_source=source, camera=camera, hfov_source="gpano", focal_sd=_GIVEN_SD
+        )
+    if projection == "cylindrical":
+        raise InvalidPanoramaError(
+            f"nothing tells which angle the strip of {width} x {height} shows; send hfov_deg, its horizontal field of "
+            "view (up to 360)"
+        )
+    if projection == "fisheye":
+        raise InvalidPanoramaError(
+            "a fisheye photograph needs hfov_deg, its horizontal field of view, or intrinsics (OpenCV's fisheye model)"
+        )
+    return _perspective(width, height, source, exif)
+
+
+def is_sphere(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
+    """Return whether a picture twice as wide as high looks like a full sphere.
+
+    Its left and right border continue each other, and its first and last row, around the poles, hardly vary. Pictures
+    of less than 128 rows have too wide rows.
+    """
+    values = pixels.astype(np.float32)
+    rows = len(values)
+    body = slice(rows // 8, rows - rows // 8)
+    spread = values.std(axis=1).mean(axis=-1)
+    contrast = float(np.median(spread[body]))
+    if contrast < _MIN_CONTRAST:
+        return False
+    step = float(np.abs(np.diff(values[body], axis=1)).mean())
+    seam = float(np.abs(values[body, 0] - values[body, -1]).mean()) / (step + 0.5)
+    top, bottom = ((float(spread[row]) + 0.5) / (contrast + 0.5) for row in (0, -1))
+    return seam < _MAX_SEAM and min(top, bottom) < _MAX_POLE and seam * top * bottom < _MAX_PRODUCT
+
+
+def _is_twice_as_wide(width: int, height: int) -> bool:
+    return abs(width / height - 2.0) <= 2.0 * _SPHERE_TOLERANCE
+
+
+def _projection(
+    width: int,
+    height: int,
+    stated: StatedView,
+    sphere: PhotoSphere,
+    exif: ExifLens,
+    looks_spherical: Callable[[], bool],
+) -> tuple[Projection, Source]:
+    if stated.projection != AUTO:
+        return stated.projection, "given"  # pyright: ignore[reportReturnType]
+    if sphere.declared:
+        return "equirectangular", "gpano"
+    if sphere.cylinder is not None:
+        return "cylindrical", "gpano"
+    if stated.intrinsics is not None:
+        return "perspective", "assumed"
+    hfov = TWO_PI if stated.hfov_deg is None else math.radians(stated.hfov_deg)
+    twice_as_wide = _is_twice_as_wide(width, height)
+    if twice_as_wide and hfov == TWO_PI and looks_spherical():
+        return "equirectangular", "estimated"
+    if stated.hfov_deg is not None:
+        return ("cylindrical" if exif.panorama or hfov > _WIDEST_LENS else "perspective"), "assumed"
+    if exif.panorama:
+        return "cylindrical", "exif"
+    if exif.focal is None and twice_as_wide:
+        raise InvalidPanoramaError(
+            f"the photograph of {width} x {height} is not a full 360° sphere: its borders do not continue each other, "
+            f"or its poles are not uniform; {_HELP}, or projection=equirectangular if it is one"
+        )
+    if max(width, height) > _LONGEST * min(width, height):
+        raise InvalidPanoramaError(
+            f"the photograph of {width} x {height} is a strip; send projection=cylindrical and hfov_deg, its "
+            "horizontal field of view (up to 360)"
+        )
+    return "perspective", "exif" if exif.focal is not None else "assumed"
+
+
+def _perspective(width: int, height: int, source: Source, exif: ExifLens) -> Lens:
+    """Return the lens of an ordinary photograph by its EXIF focal length, if that is plausible."""
+    if exif.focal is None:
+        return Lens(projection="perspective", projection_source=source, warnings=exif.warnings)
+    camera = Perspective(width=width, height=height, fx=exif.focal, fy=exif.focal, cx=0.5 * width, cy=0.5 * height)
+    low, high = HFOV_RANGE_DEG["perspective"]
+    if not low <= math.degrees(camera.hfov) <= high:
+        warning = f"the EXIF focal length gives a field of view of {math.degrees(camera.hfov):.3g}° and is ignored"
+        return Lens(projection="perspective", projection_source=source, warnings=(*exif.warnings, warning))
+    return Lens(
+        projection="perspective",
+        projection_source=source,
+        camera=camera,
+        hfov_source="exif",
+        focal_sd=exif.focal_sd,
+        warnings=exif.warnings,
+    )

@@ -1,0 +1,58 @@
+"""Photographs with a known camera, cut from the example panoramas."""
+
+from __future__ import annotations
+
+import io
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.panorama.levelling import camera_axes
+from lalaloc_core.photograph.cameras import Camera
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@cache
+def sphere(name: str) -> np.ndarray:
+    with Image.open(EXAMPLES / f"{name}.jpg") as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def take(
+    panorama: np.ndarray, camera: Camera, *, pitch_deg: float = 0.0, roll_deg: float = 0.0, heading_deg: float = 0.0
+) -> np.ndarray:
+    """Return the picture that a camera in the middle of a panorama takes; black where the camera sees nothing."""
+    height, width = panorama.shape[:2]
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    rays = rays @ camera_axes(pitch=math.radians(pitch_deg), roll=math.radians(roll_deg))
+    azimuth = np.arctan2(rays[..., 0], rays[..., 1]) + math.radians(heading_deg)
+    column = (azimuth / TWO_PI + 0.5) % 1.0 * width - 0.5
+    row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height - 0.5
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    return cv2.remap(
+        wrapped,
+        (column + 1.0).astype(np.float32),
+        row.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+def jpeg(pixels: np.ndarray, exif: dict[Any, Any] | None = None, orientation: int | None = None) -> bytes:
+    """Return a JPEG file with tags of the EXIF IFD as phones write them."""
+    image = Image.fromarray(pixels)
+    tags = Image.Exif()
+    if orientation is not None:
+        tags[0x0112] = orientation
+    tags.get_ifd(0x8769).update(exif or {})
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=92, exif=tags)
+    return buffer.getvalue()

@@ -1,0 +1,120 @@
+"""Focal lengths by EXIF metadata: as phones write them, and absurd ones."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+
+from lalaloc_core.photograph.exif import ExifLens, read_exif_lens
+
+Tag = ExifTags.Base
+
+
+def read(tags: dict[Any, Any], model: str = "", size: tuple[int, int] = (4032, 3024)) -> ExifLens:
+    exif = Image.Exif()
+    exif[Tag.Model] = model
+    exif.get_ifd(ExifTags.IFD.Exif).update(tags)
+    return read_exif_lens(exif, width=size[0], height=size[1])
+
+
+def hfov_deg(lens: ExifLens, width: int) -> float:
+    assert lens.focal is not None
+    return math.degrees(2.0 * math.atan(0.5 * width / lens.focal))
+
+
+@pytest.mark.parametrize(
+    ("film_mm", "size", "expected_deg"),
+    [
+        (26, (4032, 3024), 67.3),
+        (26, (3024, 4032), 53.1),
+        (13, (4032, 3024), 106.2),
+        # 16:9 keeps the width of the 4:3 sensor, a square its height.
+        (26, (4032, 2268), 67.3),
+        (26, (3024, 3024), 53.1),
+        (24, (6000, 4000), 73.7),
+    ],
+)
+def test_equivalent_focal_length_gives_the_field_of_view(
+    film_mm: int, size: tuple[int, int], expected_deg: float
+) -> None:
+    lens = read({Tag.FocalLengthIn35mmFilm: film_mm}, size=size)
+    assert hfov_deg(lens, size[0]) == pytest.approx(expected_deg, abs=0.1)
+    assert lens.warnings == ()
+
+
+def test_sensor_by_resolution_or_model_replaces_the_equivalent() -> None:
+    by_model = read({Tag.FocalLength: IFDRational(415, 100)}, model="iPhone 6")
+    assert hfov_deg(by_model, 4032) == pytest.approx(61.0, abs=0.2)
+    by_plane = read(
+        {
+            Tag.FocalLength: 4.15,
+            Tag.FocalPlaneXResolution: IFDRational(4_032_000, 489),
+            Tag.FocalPlaneResolutionUnit: 3,
+            Tag.ExifImageWidth: 4032,
+            Tag.ExifImageHeight: 3024,
+            Tag.DigitalZoomRatio: 1.0,
+        }
+    )
+    assert by_plane.focal == pytest.approx(by_model.focal, rel=1e-6)
+    zoomed = read({Tag.FocalLength: 4.15, Tag.DigitalZoomRatio: 2.0}, model="iPhone 6")
+    assert zoomed.focal == pytest.approx(2.0 * (by_model.focal or 0.0))
+
+
+def test_front_camera_has_another_sensor() -> None:
+    assert read({Tag.FocalLength: 2.65}, model="iPhone 6").focal is None
+
+
+def test_digital_zoom_widens_the_uncertainty() -> None:
+    plain = read({Tag.FocalLengthIn35mmFilm: 52})
+    zoomed = read({Tag.FocalLengthIn35mmFilm: 52, Tag.DigitalZoomRatio: 2.0})
+    assert zoomed.focal == plain.focal
+    assert zoomed.focal_sd > 5.0 * plain.focal_sd
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "shown"),
+    [
+        (Tag.FocalLengthIn35mmFilm, 65535, "FocalLengthIn35mmFilm is 65535 mm; it must be between 4 and 250 mm"),
+        (Tag.FocalLength, IFDRational(4, 0), "FocalLength is not a number"),
+        (Tag.FocalLength, -4.0, "FocalLength is -4 mm"),
+        (Tag.FocalLengthIn35mmFilm, "wide", "FocalLengthIn35mmFilm is not a number"),
+        (Tag.FocalLengthIn35mmFilm, (26, 26), "FocalLengthIn35mmFilm is not a number"),
+        (Tag.DigitalZoomRatio, 1e9, "DigitalZoomRatio is 1e+09; it must be between 1 and 20"),
+    ],
+)
+def test_absurd_values_are_ignored_with_a_warning(tag: Tag, value: object, shown: str) -> None:
+    lens = read({tag: value})
+    assert lens.focal is None
+    assert len(lens.warnings) == 1
+    assert shown in lens.warnings[0]
+
+
+def test_zero_means_unknown() -> None:
+    tags = {Tag.FocalLength: IFDRational(0, 1), Tag.FocalLengthIn35mmFilm: 0, Tag.DigitalZoomRatio: IFDRational(0, 1)}
+    assert read(tags) == ExifLens(focal_sd=read({}).focal_sd)
+
+
+def test_absurd_sensor_is_ignored_with_a_warning() -> None:
+    tags = {Tag.FocalLength: 4.2, Tag.FocalPlaneXResolution: 0.001, Tag.ExifImageWidth: 4032, Tag.ExifImageHeight: 3024}
+    lens = read(tags)
+    assert lens.focal is None
+    assert "FocalPlaneXResolution gives a sensor" in lens.warnings[0]
+
+
+def test_picture_cropped_later_has_no_focal_length() -> None:
+    tags = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 4032, Tag.ExifImageHeight: 3024}
+    assert read(tags, size=(2016, 1512)).focal is not None
+    assert read(tags, size=(1512, 2016)).focal is not None
+    cropped = read(tags, size=(1800, 1512))
+    assert cropped.focal is None
+    assert "was cropped" in cropped.warnings[0]
+
+
+def test_panorama_mode_has_no_focal_length() -> None:
+    lens = read({Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26})
+    assert lens.panorama
+    assert lens.focal is None

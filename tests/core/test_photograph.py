@@ -1,0 +1,310 @@
+"""Photographs of any projection: decisions, errors, tilt, and patches."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.panorama.levelling import level
+from lalaloc_core.panorama.pictures import PanoramaLimits
+from lalaloc_core.photograph import Intrinsics, PatchSize, StatedView, View, open_view
+from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
+from lalaloc_core.photograph.patches import UNSEEN, patch_azimuths
+from lalaloc_core.photograph.projection import is_sphere
+from tests.core.taken import EXAMPLES, jpeg, sphere, take
+
+Tag = ExifTags.Base
+MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
+ULTRAWIDE = Perspective.of_hfov(640, 480, math.radians(106.2))
+PHONE: dict[Any, Any] = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 640, Tag.ExifImageHeight: 480}
+GPANO = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}/></rdf:RDF></x:xmpmeta>'
+)
+
+
+def opened(content: bytes, **stated: Any) -> View:
+    return open_view(content, sphere_size=(128, 256), stated=StatedView(**stated))
+
+
+def view_of(camera: Camera, name: str = "living_room", heading_deg: float = 0.0) -> np.ndarray:
+    return take(sphere(name), camera, heading_deg=heading_deg)
+
+
+def with_xmp(pixels: np.ndarray, properties: str) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", xmp=GPANO.format(properties).encode())
+    return buffer.getvalue()
+
+
+class TestProjection:
+    def test_phone_photograph_is_perspective_by_exif(self) -> None:
+        view = opened(jpeg(view_of(MAIN), PHONE))
+        assert (view.projection, view.projection_source, view.hfov.source) == ("perspective", "exif", "exif")
+        assert math.degrees(view.hfov.value) == pytest.approx(67.3, abs=0.1)
+        assert 0.0 < math.degrees(view.hfov.sd) < 3.0
+        assert view.panorama is None
+
+    def test_orientation_is_applied_before_the_lens(self) -> None:
+        upright = take(sphere("living_room"), Perspective.of_hfov(480, 640, math.radians(53.1)))
+        view = opened(jpeg(np.rot90(upright).copy(), PHONE, orientation=6))
+        assert math.degrees(view.hfov.value) == pytest.approx(53.1, abs=0.1)
+        assert view.camera is not None
+        assert (view.camera.width, view.camera.height) == (480, 640)
+        same = opened(jpeg(upright, PHONE))
+        assert np.abs(view.patches[0].pixels.astype(int) - same.patches[0].pixels).mean() < 4.0
+
+    @pytest.mark.parametrize("name", ["bedroom", "kitchen", "living_room", "study"])
+    def test_sphere_without_metadata_is_recognised(self, name: str) -> None:
+        view = opened((EXAMPLES / f"{name}.jpg").read_bytes())
+        assert (view.projection, view.projection_source) == ("equirectangular", "estimated")
+        assert view.panorama is not None
+        assert view.panorama.pixels.shape == (128, 256, 3)
+        assert view.patches == ()
+
+    @pytest.mark.parametrize("name", ["bedroom", "kitchen", "living_room", "study"])
+    def test_pictures_twice_as_wide_as_high_are_no_spheres(self, name: str) -> None:
+        panorama = sphere(name)
+        pictures = {
+            "crop": panorama[64:320, 300:812],
+            "half": panorama[128:384, :512],
+            "photograph": view_of(Perspective.of_hfov(600, 300, math.radians(90.0)), name),
+            "white": np.full((256, 512, 3), 255, np.uint8),
+            "ramp": np.broadcast_to(np.linspace(0, 255, 512).astype(np.uint8)[:, None], (256, 512, 3)),
+            "noise": np.random.default_rng(0).integers(0, 256, (256, 512, 3)).astype(np.uint8),
+        }
+        for pixels in pictures.values():
+            with pytest.raises(InvalidPanoramaError, match=r"not a full 360° sphere.*send hfov_deg"):
+                opened(jpeg(np.ascontiguousarray(pixels)))
+
+    def test_stated_field_of_view_makes_a_crop_usable(self) -> None:
+        crop = jpeg(view_of(Perspective.of_hfov(600, 300, math.radians(90.0))))
+        view = opened(crop, hfov_deg=90.0)
+        assert (view.projection, view.projection_source, view.hfov.source) == ("perspective", "assumed", "given")
+
+    def test_explicit_projection_overrides_the_picture(self) -> None:
+        content = (EXAMPLES / "kitchen.jpg").read_bytes()
+        assert opened(content, projection="cylindrical", hfov_deg=180.0).projection == "cylindrical"
+        white = jpeg(np.full((256, 512, 3), 255, np.uint8))
+        assert opened(white, projection="equirectangular").panorama is not None
+
+    def test_gpano_metadata_decide(self) -> None:
+        panorama = sphere("kitchen")
+        part = (
+            'GPano:ProjectionType="{}" GPano:FullPanoWidthPixels="1024" GPano:FullPanoHeightPixels="512" '
+            'GPano:CroppedAreaImageWidthPixels="512" GPano:CroppedAreaImageHeightPixels="256" '
+            'GPano:CroppedAreaLeftPixels="256" GPano:CroppedAreaTopPixels="128"'
+        )
+        view = opened(with_xmp(panorama[128:384, 256:768].copy(), part.format("equirectangular")))
+        assert (view.projection, view.projection_source) == ("equirectangular", "gpano")
+        assert view.azimuths == pytest.approx((-0.5 * math.pi, 0.5 * math.pi))
+        strip = take(panorama, Around(width=512, height=256, hfov=math.pi))
+        view = opened(with_xmp(strip, part.format("cylindrical")))
+        assert (view.projection, view.hfov.source) == ("cylindrical", "gpano")
+        assert view.hfov.value == pytest.approx(math.pi)
+
+    def test_strip_asks_for_its_angle(self) -> None:
+        strip = view_of(Around(width=1200, height=300, hfov=math.radians(240.0)))
+        with pytest.raises(InvalidPanoramaError, match="is a strip; send projection=cylindrical and hfov_deg"):
+            opened(jpeg(strip))
+        with pytest.raises(InvalidPanoramaError, match="which angle the strip of 1200 x 300 shows; send hfov_deg"):
+            opened(jpeg(strip, {Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26}))
+        view = opened(jpeg(strip), hfov_deg=240.0)
+        assert (view.projection, view.projection_source) == ("cylindrical", "assumed")
+        assert len(view.patches) > 1
+
+    def test_unknown_field_of_view_is_estimated_or_refused(self) -> None:
+        view = opened(jpeg(view_of(MAIN, "living_room", 45.0)))
+        assert view.hfov.source == "estimated"
+        assert abs(view.hfov.value - MAIN.hfov) < 3.0 * view.hfov.sd
+        assert "was estimated from straight lines" in view.warnings[-1]
+        with pytest.raises(InvalidPanoramaError, match="nothing tells the photograph's field of view"):
+            opened(jpeg(np.full((480, 640, 3), 200, np.uint8)))
+
+    def test_absurd_focal_length_counts_as_missing(self) -> None:
+        content = jpeg(np.full((480, 640, 3), 200, np.uint8), {Tag.FocalLengthIn35mmFilm: 65535})
+        with pytest.raises(InvalidPanoramaError, match="nothing tells the photograph's field of view"):
+            opened(content)
+
+    def test_similar_borders_alone_make_no_sphere(self) -> None:
+        tile = np.random.default_rng(0).integers(0, 256, (8, 16, 3)).astype(np.uint8)
+        smooth = cv2.resize(np.concatenate([tile, tile[:, ::-1]], axis=1), (256, 128))
+        assert not is_sphere(smooth)
+
+
+class TestStatements:
+    @pytest.mark.parametrize(
+        ("stated", "message"),
+        [
+            ({"projection": "mercator"}, "projection is 'mercator'; it must be one of auto, equirect"),
+            ({"hfov_deg": math.nan}, "hfov_deg is nan; it must be between 10 and 360"),
+            ({"hfov_deg": -60.0}, "hfov_deg is -60"),
+            ({"projection": "perspective", "hfov_deg": 170.0}, "hfov_deg is 170; it must be between 10 and 150"),
+            ({"pitch_deg": 80.0}, "pitch_deg is 80; it must be between -60 and 60"),
+            ({"roll_deg": math.inf}, "roll_deg is inf"),
+            ({"hfov_deg": 60.0, "intrinsics": Intrinsics(fx=500.0, fy=500.0)}, "exclude each other"),
+            ({"projection": "cylindrical", "intrinsics": Intrinsics(fx=500.0, fy=500.0)}, "do not apply"),
+            ({"intrinsics": Intrinsics(fx=0.0, fy=500.0)}, "fx is 0; it must be positive"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=math.nan)}, "fy is nan; it must be finite"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=100.0)}, "must agree within a factor of 2"),
+            ({"intrinsics": Intrinsics(fx=20.0, fy=20.0)}, "a field of view of .*; it must be between 10° and 150°"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=500.0, cx=700.0)}, "cx is 700, outside of the upright picture of"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=500.0, k4=0.1)}, "k4 does not belong"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=500.0, k1=-2.0)}, "distortion is not invertible"),
+            ({"intrinsics": Intrinsics(fx=500.0, fy=500.0, k1=1e9)}, "k1 is 1e\\+09; it must be between"),
+            (
+                {"projection": "fisheye", "intrinsics": Intrinsics(fx=300.0, fy=300.0, p1=0.1)},
+                "p1 does not belong to the projection 'fisheye'",
+            ),
+            ({"projection": "fisheye"}, "a fisheye photograph needs hfov_deg"),
+        ],
+    )
+    def test_invalid_values_are_refused(self, stated: dict[str, Any], message: str) -> None:
+        with pytest.raises(InvalidPanoramaError, match=message):
+            opened(jpeg(view_of(MAIN), PHONE), **stated)
+
+    def test_small_and_large_pictures_are_refused(self) -> None:
+        with pytest.raises(InvalidPanoramaError, match="50 x 40; the minimum is 64 pixels"):
+            opened(jpeg(np.zeros((40, 50, 3), np.uint8)), hfov_deg=60.0)
+        content = jpeg(np.zeros((200, 300, 3), np.uint8))
+        with pytest.raises(InvalidPanoramaError, match="LALALOC_MAX_PIXELS"):
+            open_view(content, sphere_size=(128, 256), limits=PanoramaLimits(max_pixels=1000))
+
+    def test_intrinsics_are_used_with_their_distortion(self) -> None:
+        camera = Perspective(width=640, height=480, fx=420.0, fy=420.0, cx=330.5, cy=230.5, radial=(-0.2, 0.03, 0.0))
+        intrinsics = Intrinsics(fx=420.0, fy=420.0, cx=330.0, cy=230.0, k1=-0.2, k2=0.03)
+        view = opened(jpeg(view_of(camera)), intrinsics=intrinsics, pitch_deg=0.0, roll_deg=0.0)
+        assert view.camera == camera
+        assert patch_error(view, "living_room") < 6.0
+
+
+class TestTilt:
+    @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0.0, 0.0), (15.0, 4.0), (-15.0, -4.0)])
+    def test_tilt_is_estimated_within_its_uncertainty(self, pitch_deg: float, roll_deg: float) -> None:
+        errors, deviations = [], []
+        for name in ("bedroom", "kitchen", "living_room", "study"):
+            for heading_deg in (20.0, 140.0, 260.0):
+                pixels = take(sphere(name), ULTRAWIDE, pitch_deg=pitch_deg, roll_deg=roll_deg, heading_deg=heading_deg)
+                view = opened(jpeg(pixels), hfov_deg=106.2)
+                errors.append(np.degrees([view.pitch.value, view.roll.value]) - (pitch_deg, roll_deg))
+                deviations.append(np.degrees([view.pitch.sd, view.roll.sd]))
+        assert np.median(np.abs(errors), axis=0).max() < 1.0
+        assert (np.abs(errors) < 3.0 * np.array(deviations)).mean() > 0.85
+
+    def test_blank_wall_tells_nothing_about_the_tilt(self) -> None:
+        view = opened(jpeg(np.full((480, 640, 3), 200, np.uint8)), hfov_deg=67.0)
+        assert view.pitch.source == view.roll.source == "assumed"
+        assert math.degrees(view.pitch.sd) > 10.0
+
+    def test_stated_tilt_is_used(self) -> None:
+        pixels = take(sphere("kitchen"), MAIN, pitch_deg=12.0, roll_deg=-3.0)
+        view = opened(jpeg(pixels, PHONE), pitch_deg=12.0, roll_deg=-3.0)
+        assert view.pitch.source == view.roll.source == "given"
+        assert patch_error(view, "kitchen") < 6.0
+
+    def test_stated_tilt_levels_a_sphere(self) -> None:
+        tilted = sphere("kitchen")
+        content = jpeg(tilted)
+        view = opened(content, projection="equirectangular", pitch_deg=10.0, roll_deg=0.0)
+        assert view.panorama is not None
+        expected = cv2.resize(
+            level(tilted, pitch=math.radians(10.0), roll=0.0), (256, 128), interpolation=cv2.INTER_AREA
+        )
+        assert np.abs(view.panorama.pixels.astype(int) - expected).mean() < 4.0
+
+
+def patch_error(view: View, name: str, heading_deg: float = 0.0) -> float:
+    """Return the mean difference (grey levels) of the patches from the panorama that the photograph was taken from."""
+    size = PatchSize()
+    camera = Around(width=size.width, height=2 * size.height, hfov=size.hfov, spherical=True)
+    errors = []
+    for patch in view.patches:
+        whole = take(sphere(name), camera, heading_deg=heading_deg + math.degrees(patch.azimuth_rad))
+        bottom = camera.height // 2 - round(math.radians(size.bottom_deg) * camera.resolution)
+        expected = whole[bottom - size.height : bottom]
+        errors.append(np.abs(patch.pixels[patch.seen].astype(int) - expected[patch.seen]).mean())
+    return float(np.mean(errors))
+
+
+class TestPatches:
+    def test_size_has_square_pixels(self) -> None:
+        size = PatchSize()
+        assert (size.bottom_deg, size.top_deg) == (-45.0, 39.375)
+        assert size.resolution == pytest.approx(size.height / math.radians(size.top_deg - size.bottom_deg))
+
+    @pytest.mark.parametrize(
+        ("camera", "stated"),
+        [
+            (ULTRAWIDE, {"hfov_deg": 106.2}),
+            (Around(width=1400, height=400, hfov=math.radians(250.0)), {"hfov_deg": 250.0}),
+            (Around(width=1600, height=400, hfov=2.0 * math.pi), {"projection": "cylindrical", "hfov_deg": 360.0}),
+            (Fisheye.of_hfov(800, 800, math.radians(180.0)), {"projection": "fisheye", "hfov_deg": 180.0}),
+            (
+                Around(width=1000, height=400, hfov=math.radians(200.0), spherical=True),
+                {"projection": "equirectangular", "hfov_deg": 200.0},
+            ),
+        ],
+    )
+    def test_patches_show_the_panorama(self, camera: Camera, stated: dict[str, Any]) -> None:
+        view = opened(jpeg(view_of(camera)), pitch_deg=0.0, roll_deg=0.0, **stated)
+        assert patch_error(view, "living_room") < 6.0
+        assert view.azimuths == pytest.approx((-0.5 * camera.hfov, 0.5 * camera.hfov), abs=0.02)
+
+    def test_unseen_pixels_are_grey(self) -> None:
+        (patch,) = opened(jpeg(view_of(MAIN), PHONE), pitch_deg=0.0, roll_deg=0.0).patches
+        assert (patch.pixels[~patch.seen] == UNSEEN).all()
+        seen_columns = np.flatnonzero(patch.seen.any(axis=0))
+        resolution = PatchSize().width / PatchSize().hfov_deg
+        assert len(seen_columns) / resolution == pytest.approx(67.3, abs=1.0)
+        assert seen_columns.mean() == pytest.approx(127.5, abs=1.0)
+
+    @pytest.mark.parametrize("hfov_deg", [60.0, 112.5, 140.0, 200.0, 300.0, 359.0, 360.0])
+    def test_patches_cover_every_azimuth(self, hfov_deg: float) -> None:
+        size = PatchSize()
+        centres = np.degrees(patch_azimuths(math.radians(hfov_deg), size))
+        azimuth = np.linspace(-0.5, 0.5, 721) * hfov_deg
+        offset = np.abs((azimuth[:, None] - centres + 180.0) % 360.0 - 180.0)
+        assert offset.min(axis=1).max() <= 0.5 * size.hfov_deg + 1e-6
+        assert len(centres) <= 1 + hfov_deg / 80.0
+
+    def test_fine_stripes_become_grey(self) -> None:
+        """Sampling without filtering would turn stripes into moiré."""
+        stripes = np.zeros((1512, 2016, 3), np.uint8)
+        stripes[:, ::2] = 254
+        buffer = io.BytesIO()
+        Image.fromarray(stripes).save(buffer, "PNG")
+        (patch,) = opened(buffer.getvalue(), hfov_deg=67.0, pitch_deg=0.0, roll_deg=0.0).patches
+        assert patch.pixels[patch.seen].std() < 4.0
+
+    def test_verticals_of_a_tilted_photograph_become_vertical(self) -> None:
+        """A white stripe on one meridian stays in one column."""
+        panorama = np.zeros((512, 1024, 3), np.uint8)
+        panorama[:, 590:598] = 255
+        pixels = take(panorama, ULTRAWIDE, pitch_deg=15.0, roll_deg=5.0)
+        (patch,) = opened(jpeg(pixels), hfov_deg=106.2, pitch_deg=15.0, roll_deg=5.0).patches
+        rows = np.flatnonzero(patch.seen[:, 180:206].all(axis=1))
+        weights = patch.pixels[rows, 180:206, 0].astype(float)
+        centres = weights @ np.arange(180, 206) / weights.sum(axis=1)
+        expected = 127.5 + (594.0 / 1024.0 - 0.5) * 360.0 * 256.0 / 112.5
+        assert len(rows) > 100
+        np.testing.assert_allclose(centres, expected, atol=1.0)
+
+
+def test_heic_photograph_is_read() -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pixels = view_of(MAIN)
+    tags = Image.Exif()
+    tags[Tag.Orientation] = 1
+    tags.get_ifd(ExifTags.IFD.Exif).update(PHONE)
+    buffer = io.BytesIO()
+    pillow_heif.from_pillow(Image.fromarray(pixels)).save(buffer, exif=tags.tobytes(), quality=90)
+    view = opened(buffer.getvalue())
+    assert view.hfov.source == "exif"
+    assert np.abs(view.patches[0].pixels.astype(int) - opened(jpeg(pixels, PHONE)).patches[0].pixels).mean() < 4.0
