@@ -1,4 +1,4 @@
-"""Command line of the service: `lalaloc-service serve`, `keys create|list|revoke` and `tenants list|limit`.
+"""Command line of the service: `lalaloc-service serve`, `keys create|list|revoke` and `tenants list|limit|purge`.
 
 Keys and tenants are in the database of the settings, so these commands also work while the service runs.
 """

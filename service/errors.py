@@ -19,6 +19,7 @@ LaLaLocError
     ├── PlanNotReadyError           the pose grid was not ready in time
     ├── TooManyFloorPlansError      the tenant's quota of floor plans is used up
     ├── TooManyVenuesError          the tenant's quota of venues is used up
+    ├── StorageQuotaError           the tenant's quota of stored bytes is used up
     ├── VenueUnsearchableError      the venue has no usable plan
     ├── VenueNotReadyError          no plan of the venue is ready yet
     ├── RevisionMismatchError       the plan or venue is not at the expected revision
@@ -128,7 +129,7 @@ class UploadTooLargeError(ServiceError):
 
     def __init__(self, name: str, limit: int, stated: int | None = None) -> None:
         size = "is too large" if stated is None else f"has {stated} bytes"
-        super().__init__(f"the body {size}; the limit is {limit} bytes ({name})")
+        super().__init__(f"the body {size}; the limit is {limit} bytes (LALALOC_{name.upper()})")
 
 
 class UploadTimeoutError(ServiceError):
@@ -196,6 +197,16 @@ class TooManyVenuesError(ServiceError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"the limit of {limit} stored venues is reached (LALALOC_MAX_VENUES); delete one")
+
+
+class StorageQuotaError(ServiceError):
+    """The tenant's quota of stored bytes is used up."""
+
+    def __init__(self, used: int, growth: int, limit: int, setting: str = "LALALOC_MAX_STORED_BYTES") -> None:
+        super().__init__(
+            f"{used} bytes are stored, and this needs {growth} more; the limit is {limit} bytes ({setting}); delete "
+            "floor plans, or raise the limit"
+        )
 
 
 class VenueUnsearchableError(ServiceError):

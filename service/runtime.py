@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 from fastapi import Request
+from sqlalchemy.engine import make_url
 
 from lalaloc_core import __version__
 from lalaloc_core.localise.bundle import Bundle
@@ -159,7 +160,8 @@ def start_runtime(
     # A file can take its worker longer than the service may take to stop.
     components.admission.at_stop(converter.close)
     grids, localiser = components.grids, _closing(cleanup, components.localiser())
-    sweeper = Sweeper(store, grids, sweep_s=settings.grids.sweep_s, keep_answers_s=settings.storage.keep_answers_s)
+    sweep_s, keep_answers_s = settings.grids.sweep_s, settings.storage.keep_answers_s
+    sweeper = Sweeper(store, grids, telemetry, sweep_s=sweep_s, keep_answers_s=keep_answers_s)
     _closing(cleanup, sweeper).start()
     # A thread of its own: a database that does not answer blocks no reads of queries.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
@@ -176,6 +178,9 @@ def start_runtime(
         max_pending=_MAX_PENDING_RENDITIONS,
     )
     _log_start(bundle, grids, telemetry)
+    if not store.plans.any_stored():
+        fields = {"database": make_url(settings.database_url).render_as_string(hide_password=True)}
+        logging.getLogger(LOGGER_NAME).warning("the database has no floor plans", extra={"fields": fields})
     return Runtime(
         settings=settings,
         telemetry=telemetry,

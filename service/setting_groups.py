@@ -267,7 +267,19 @@ class GridSettings(SettingGroup):
 
 
 class StorageSettings(SettingGroup):
-    """Caches and kept answers."""
+    """Storage, caches and kept answers."""
+
+    max_stored_bytes: Count | None = Field(
+        default=None,
+        description="Stored bytes per tenant: floor plans with their revisions and files, pose grids, venues, kept "
+        "answers, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. Default: 10 GiB, "
+        "with SQLite at most half of its volume.",
+    )
+    max_idempotency_bytes: int = Field(
+        default=64 * 2**20,
+        ge=2**16,
+        description="Idempotency keys and their answers per tenant; the oldest are deleted first.",
+    )
 
     plan_cache_bytes: int = Field(
         default=64 * 2**20,

@@ -1,4 +1,4 @@
-"""Commands of the operator about tenants: `lalaloc-service tenants list|limit`."""
+"""Commands about tenants and their data: `lalaloc-service tenants list|limit|purge` and `compact`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from dataclasses import asdict
 from typing import Any
 
 from service.command_parts import configured_store, tenant_name, text_table
+from service.storage.records import OperatorLimits
 
 _DEFAULT = "default"
 
 
 def add_tenant_commands(commands: Any) -> None:
     """Add the group `tenants` to the commands."""
-    tenants = commands.add_parser("tenants", help="list and limit tenants").add_subparsers(required=True)
+    tenants = commands.add_parser("tenants", help="list, limit and purge tenants").add_subparsers(required=True)
 
-    listing = tenants.add_parser("list", help="list the tenants with limits of their own")
+    listing = tenants.add_parser("list", help="list the tenants that stored data or have limits of their own")
     listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
 
@@ -33,16 +34,44 @@ def add_tenant_commands(commands: Any) -> None:
         limit.add_argument(option, dest=name, type=_or_default(kind), default=argparse.SUPPRESS, help=text)
     limit.set_defaults(run=_limit)
 
+    purge = tenants.add_parser("purge", help="delete all that a tenant stored; its API keys and limits stay")
+    purge.add_argument("tenant", type=tenant_name, help="the tenant")
+    purge.add_argument("--yes", action="store_true", required=True, help="confirm the deletion")
+    purge.set_defaults(run=_purge)
+
+    compact = commands.add_parser(
+        "compact",
+        help="write an SQLite file anew, so that it returns space to the disk; once for files of earlier versions",
+    )
+    compact.set_defaults(run=_compact)
+
 
 def _list(arguments: argparse.Namespace) -> int:
     with configured_store() as store:
-        limits = store.tenants.limits()
+        accounts, limits = store.quota.accounts(), store.tenants.limits()
+    listed = [
+        {"tenant": tenant, "used_bytes": accounts[tenant].used.total, **asdict(limits.get(tenant, OperatorLimits()))}
+        for tenant in sorted(accounts)
+    ]
     if arguments.json:
-        print(json.dumps([{"tenant": tenant, **asdict(limits[tenant])} for tenant in sorted(limits)], indent=2))
+        print(json.dumps(listed, indent=2))
         return 0
-    head = ("TENANT", "STORED BYTES", "BYTES IN FLIGHT", "CPU SHARE")
-    rows = [[tenant, *map(_text, asdict(limits[tenant]).values())] for tenant in sorted(limits)]
-    print(text_table(head, rows))
+    head = ("TENANT", "USED BYTES", "STORED BYTES", "BYTES IN FLIGHT", "CPU SHARE")
+    print(text_table(head, [[row["tenant"], *map(_text, list(row.values())[1:])] for row in listed]))
+    return 0
+
+
+def _purge(arguments: argparse.Namespace) -> int:
+    with configured_store() as store:
+        count = store.purge_tenant(arguments.tenant)
+        store.give_back()
+    print(f"deleted {count} floor plans of tenant '{arguments.tenant}', and all else that it stored")
+    return 0
+
+
+def _compact(_arguments: argparse.Namespace) -> int:
+    with configured_store() as store:
+        store.compact()
     return 0
 
 

@@ -15,6 +15,7 @@ from service.errors import (
     PlanFailedError,
     PlanNotReadyError,
     StoppingError,
+    StorageQuotaError,
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
@@ -134,8 +135,14 @@ class GridBuilder:
         with self._telemetry.timed(self._telemetry.grid_seconds):
             grid = self._embed(job, record.plan)
         prototypes = SortedPrototypes.of_grid(grid, record.plan)
-        if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
-            raise UnknownFloorPlanError(job.plan_id)
+        try:
+            if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
+                raise UnknownFloorPlanError(job.plan_id)
+        except StorageQuotaError:
+            if not job.on_demand:
+                raise
+            # Queries can use the grid without its being stored.
+            self._store.leases.release(job.key, self._owner)
         self._cache.put(job.key, grid)
         return grid
 

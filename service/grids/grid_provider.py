@@ -22,7 +22,7 @@ from service.grids.throttle import BackgroundThrottle
 from service.schemas import PlanStatus
 from service.settings import Settings
 from service.storage import Store
-from service.storage.grid_format import SortedPrototypes
+from service.storage.grid_format import SortedPrototypes, packed_bytes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 
@@ -168,6 +168,12 @@ class GridProvider:
             return None
         finally:
             self._inline.release()
+
+    def expected_bytes(self, plan: FloorPlan) -> int:
+        """Estimate the stored bytes of a plan's own grid."""
+        manifest = self._encoders.manifest
+        latent_size = 0 if self._encoders.predicts_profile else manifest.latent_size
+        return packed_bytes(self._estimate(plan), manifest.profile_columns, latent_size)
 
     def on_plan_stored(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
         """Cache the grid that was stored with a plan, or queue its computation."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
+from contextlib import suppress
+from dataclasses import asdict
 from time import monotonic
 
-from service.errors import StoreUnavailableError
+from service.errors import StoreFullError, StoreUnavailableError
 from service.grids.grid_provider import GridProvider
 from service.storage import Store
-from service.telemetry import LOGGER_NAME
+from service.telemetry import LOGGER_NAME, Telemetry
 
 # Revisions per query.
 _BATCH_SIZE = 500
@@ -20,9 +22,12 @@ _PURGE_EVERY_S = 3600.0
 class Sweeper:
     """Thread with a few cheap queries per period; failures of the database are retried."""
 
-    def __init__(self, store: Store, grids: GridProvider, *, sweep_s: float, keep_answers_s: float) -> None:
+    def __init__(
+        self, store: Store, grids: GridProvider, telemetry: Telemetry, *, sweep_s: float, keep_answers_s: float
+    ) -> None:
         self._store = store
         self._grids = grids
+        self._telemetry = telemetry
         self._sweep_s = sweep_s
         self._keep_answers_s = keep_answers_s
         self._stop = threading.Event()
@@ -31,7 +36,9 @@ class Sweeper:
     def start(self) -> None:
         """Read the limits of tenants, clear the failures of earlier runs to try these grids again, start the thread."""
         self._store.tenant_limits.refresh()
-        self._store.plans.clear_failures()
+        # A full disk must not prevent the start, because deleting plans frees it.
+        with suppress(StoreFullError):
+            self._store.plans.clear_failures()
         self._grids.queue_missing()
         self._thread.start()
 
@@ -51,6 +58,13 @@ class Sweeper:
                 self._grids.forget(gone)
                 self._store.plan_cache.forget_revisions(gone)
 
+    def _measure(self) -> None:
+        """Set the metrics of the tenants' stored bytes."""
+        for tenant, account in self._store.quota.accounts().items():
+            self._telemetry.stored_bytes_limit.labels(tenant).set(account.limit)
+            for kind, used in asdict(account.used).items():
+                self._telemetry.stored_bytes.labels(tenant, kind).set(used)
+
     def _run(self) -> None:
         sweep_at = purge_at = monotonic()
         more = True
@@ -61,7 +75,9 @@ class Sweeper:
                 if due:
                     sweep_at = monotonic() + self._sweep_s
                     self._store.tenant_limits.refresh()
+                    self._measure()
                     self.sweep()
+                    self._store.give_back()
                 # A backlog, as after a new model, continues as soon as the queued grids are done.
                 if due or (more and self._grids.pending == 0):
                     more = self._grids.queue_missing()
@@ -69,6 +85,7 @@ class Sweeper:
                     purge_at = monotonic() + _PURGE_EVERY_S
                     self._store.idempotency_keys.purge()
                     self._store.answers.purge(kept_s=self._keep_answers_s)
+                    self._store.quota.recount()
             except StoreUnavailableError:
                 continue
             except Exception:

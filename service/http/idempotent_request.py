@@ -25,6 +25,7 @@ from service.errors import (
     IdempotencyKeyReusedError,
     InvalidRequestError,
     PlanTooLargeError,
+    StorageQuotaError,
     StoreUnavailableError,
     UnknownFloorPlanError,
     UnknownVenueError,
@@ -155,6 +156,9 @@ class IdempotentRequest:
         try:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
             self._claims.finish(*self._place, self._key, token, kept)
+        except StorageQuotaError:
+            # The next attempt executes the request again, under the same token.
+            self._abandon(token)
         except StoreUnavailableError:
             # The work is done; after the lease, the next attempt finds it under the token.
             logging.getLogger(LOGGER_NAME).warning("the answer to an idempotent request was not kept")

@@ -75,7 +75,10 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
     def store(token: str) -> Response:
         plan, original, grid = _prepared(uploaded, runtime, client)
         limit = runtime.settings.plans.max_floorplans
-        record = runtime.store.plans.add(tenant, token, plan, original=original, limit=limit, grid=grid)
+        later_bytes = runtime.grids.expected_bytes(plan) if grid is None else 0
+        record = runtime.store.plans.add(
+            tenant, token, plan, original=original, limit=limit, grid=grid, later_bytes=later_bytes
+        )
         if record.plan is plan:
             runtime.grids.on_plan_stored(record, grid)
             # Not read back, so that a stored plan is confirmed even if the database fails now.
@@ -167,8 +170,16 @@ async def replace_floorplan(
     def store() -> Response:
         plan, original, grid = _prepared(uploaded, runtime, client)
         keep = runtime.settings.plans.max_revisions
+        later_bytes = runtime.grids.expected_bytes(plan) if grid is None else 0
         record = runtime.store.plans.add_revision(
-            tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
+            tenant,
+            current.id,
+            plan,
+            original=original,
+            keep=keep,
+            expected=expected,
+            grid=grid,
+            later_bytes=later_bytes,
         )
         # Before the new grid starts. The old grid stays in memory for queries in progress.
         runtime.grids.cancel(current.revision_id)

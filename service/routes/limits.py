@@ -1,20 +1,22 @@
-"""Limits of requests."""
+"""Limits of the service, and the use that a tenant makes of them."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import asdict
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter
 
+from service.errors import StoreUnavailableError
 from service.fair_share import max_per_client
-from service.runtime import Runtime, get_runtime
-from service.schemas import LimitsAnswer
+from service.http.problems import problem_responses
+from service.routes.dependencies import Running, Tenant
+from service.schemas import LimitsAnswer, StoredBytesAnswer, StoredBytesByKind, UsageAnswer
 
 router = APIRouter(tags=["operations"])
 
 
 @router.get("/limits", summary="Get the limits")
-async def limits(runtime: Annotated[Runtime, Depends(get_runtime)]) -> LimitsAnswer:
+async def limits(runtime: Running) -> LimitsAnswer:
     """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
     # Resolved, because 0 leaves these numbers to the service.
@@ -25,3 +27,13 @@ async def limits(runtime: Annotated[Runtime, Depends(get_runtime)]) -> LimitsAns
     }
     values = settings.values() | resolved
     return LimitsAnswer(**{name: values[name] for name in LimitsAnswer.model_fields})
+
+
+@router.get("/usage", summary="Get the tenant's usage", responses=problem_responses(StoreUnavailableError))
+def usage(runtime: Running, tenant: Tenant) -> UsageAnswer:
+    """Return what the tenant of the API key uses, with its limits."""
+    account = runtime.store.quota.account(tenant)
+    stored = StoredBytesAnswer(
+        used=account.used.total, limit=account.limit, by_kind=StoredBytesByKind(**asdict(account.used))
+    )
+    return UsageAnswer(tenant=tenant, stored_bytes=stored)

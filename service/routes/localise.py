@@ -12,6 +12,7 @@ from lalaloc_core.draw.answer import Picture
 from lalaloc_core.errors import InvalidHintError
 from service.errors import (
     InvalidRequestError,
+    StorageQuotaError,
     StoreUnavailableError,
     UnanchoredPlanError,
     UnknownVenueError,
@@ -168,6 +169,6 @@ async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
     keep = partial(runtime.store.answers.add, limit=runtime.settings.storage.max_kept_answers)
     try:
         return texts[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
-    except StoreUnavailableError:
+    except (StoreUnavailableError, StorageQuotaError):
         # The answer is valid although it could not be kept.
         return texts[""]

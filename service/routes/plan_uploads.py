@@ -16,6 +16,7 @@ from service.errors import (
     InvalidRequestError,
     MalformedRequestError,
     PlanTooLargeError,
+    StorageQuotaError,
     StoreFullError,
     StoreUnavailableError,
     UnsupportedMediaError,
@@ -56,6 +57,7 @@ REFUSED_UPLOADS = (
     ConverterNotReadyError,
     StoreUnavailableError,
     StoreFullError,
+    StorageQuotaError,
 )
 
 

@@ -15,6 +15,7 @@ from service.errors import (
     InvalidRequestError,
     MalformedRequestError,
     RevisionMismatchError,
+    StorageQuotaError,
     StoreFullError,
     StoreUnavailableError,
     TooManyVenuesError,
@@ -65,6 +66,7 @@ _REFUSED_BODIES = (
     UploadTimeoutError,
     StoreUnavailableError,
     StoreFullError,
+    StorageQuotaError,
 )
 
 
@@ -265,7 +267,7 @@ def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[Venue
     limit = runtime.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise InvalidRequestError(
-            [("plans", f"has {len(documents)} floor plans; the limit is {limit} (max_venue_plans)")]
+            [("plans", f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)")]
         )
     counted = Counter(document.floorplan_id for document in documents)
     twice = [plan_id for plan_id, count in counted.items() if count > 1]

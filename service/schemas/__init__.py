@@ -46,7 +46,15 @@ from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, L
 from service.schemas.problem_details import Fault, Problem
 from service.schemas.query_fields import EarthPoint, PlanPoint
 from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading, StatedMotion
-from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
+from service.schemas.service_state import (
+    HealthAnswer,
+    LimitsAnswer,
+    PoolAnswer,
+    ReadyAnswer,
+    StoredBytesAnswer,
+    StoredBytesByKind,
+    UsageAnswer,
+)
 from service.schemas.stored_plans import (
     BoundsAnswer,
     FloorPlanAnswer,
@@ -121,7 +129,10 @@ __all__ = [
     "SequencePoseAnswer",
     "StatedHeading",
     "StatedMotion",
+    "StoredBytesAnswer",
+    "StoredBytesByKind",
     "TimingsAnswer",
+    "UsageAnswer",
     "VenueAnchorAnswer",
     "VenueAnchorDocument",
     "VenueAnswer",

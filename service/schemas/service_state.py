@@ -56,6 +56,31 @@ class LimitsAnswer(ResponseModel):
     request_deadline_s: float = Field(description="Timeout for a query after its upload.")
 
 
+class StoredBytesByKind(ResponseModel):
+    """Stored bytes of a tenant by kind."""
+
+    plans: int = Field(description="Floor plans with their revisions, uploaded files and import reports.")
+    grids: int = Field(description="Pose grids.")
+    venues: int = Field(description="Venues.")
+    answers: int = Field(description="Kept answers.")
+    idempotency: int = Field(description="Idempotency keys and their answers.")
+
+
+class StoredBytesAnswer(ResponseModel):
+    """Stored bytes of a tenant with their limit."""
+
+    used: int = Field(description="Stored bytes, with an estimate for rows and indices.")
+    limit: int = Field(description="Limit of `used`; uploads beyond it get 507.")
+    by_kind: StoredBytesByKind
+
+
+class UsageAnswer(ResponseModel):
+    """Use of the service by a tenant."""
+
+    tenant: str
+    stored_bytes: StoredBytesAnswer
+
+
 class HealthAnswer(ResponseModel):
     """Liveness of the process."""
 

@@ -35,6 +35,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/openapi.json"): Permission.READ,
     ("GET", "/metrics"): Permission.READ,
     ("GET", "/limits"): Permission.READ,
+    ("GET", "/usage"): Permission.READ,
     ("GET", "/floorplans"): Permission.READ,
     ("POST", "/floorplans"): Permission.WRITE,
     ("GET", "/floorplans/{floorplan_id}"): Permission.READ,

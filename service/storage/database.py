@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import logging
 import os
+import sqlite3
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any, TypeVar
 
 from sqlalchemy import (
     Column,
@@ -36,8 +37,10 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from lalaloc_core.errors import ConfigError
 from service.errors import StoreBusyError, StoreFullError, StoreUnavailableError
+from service.storage.disk_reserve import LOG_BYTES, DiskReserve
 from service.telemetry import LOGGER_NAME
 
+Result = TypeVar("Result")
 _WRITER = "lalaloc_writer"
 _SQLITE_WAIT_MS = 5000
 # Time limits of the server, so that a stuck statement or lock never holds a connection for good.
@@ -76,6 +79,9 @@ class Database:
             connect_args=_postgresql_arguments(parsed, wait_s) if self.is_postgresql else {},
         )
         self._path = None if self.is_postgresql else parsed.database
+        self._disk = None if self._path is None else DiskReserve(self._path)
+        if self._disk is not None:
+            self._disk.prepare()
         # Identity of the file when it was first opened.
         self._file: tuple[int, int] | None = None
         if not self.is_postgresql:
@@ -104,14 +110,72 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
+    def writing(self, *, grows_by: int = 0) -> Iterator[Connection]:
         """Run a writing transaction; on SQLite it waits for other writers when it begins, not half-way through.
+
+        Args:
+            grows_by: approximate size of the stored data; 0 for changes that store little.
+
+        Raises:
+            StoreUnavailableError, StoreBusyError: see `reading`.
+            StoreFullError: the disk has no room for the data.
+        """
+        with self._transaction(self.engine_for_writing) as connection:
+            if grows_by and self._disk is not None:
+                self._disk.check(connection, grows_by)
+            yield connection
+
+    def freeing(self, work: Callable[[Connection], Result]) -> Result:
+        """Run a transaction that deletes data; on a full disk it uses the reserve.
+
+        Args:
+            work: deletes the data; called again after a failure for lack of space.
 
         Raises:
             StoreUnavailableError, StoreBusyError: see `reading`.
         """
-        with self._transaction(self.engine_for_writing) as connection:
-            yield connection
+        try:
+            with self.writing() as connection:
+                return work(connection)
+        except StoreFullError:
+            if self._disk is None or not self._disk.release():
+                raise
+        with self.writing() as connection:
+            return work(connection)
+
+    def give_back(self) -> None:
+        """Return free space of an SQLite file to the disk, in short transactions, and restore the reserve.
+
+        Raises:
+            StoreUnavailableError, StoreBusyError: see `reading`.
+        """
+        disk = self._disk
+        if disk is None:
+            return
+        while True:
+            with self.reading() as connection:
+                if not disk.has_surplus(connection):
+                    break
+            self.freeing(disk.return_pages)
+        with closing(self._engine.raw_connection()) as raw:
+            disk.copy_log(raw.cursor())
+        disk.restore()
+
+    def compact(self) -> None:
+        """Write an SQLite file anew without free space, in the mode that `give_back` needs; PostgreSQL does without.
+
+        Raises:
+            StoreUnavailableError: see `reading`; or another process writes.
+            StoreFullError: the disk has no room for a second file.
+        """
+        if self.is_postgresql:
+            return
+        with closing(self._engine.raw_connection()) as raw:
+            cursor = raw.cursor()
+            try:
+                cursor.execute("VACUUM")
+            except sqlite3.OperationalError as error:
+                raise _unavailable(error) from error
 
     def now_s(self) -> ColumnElement[float]:
         """Return the seconds since 1970 by the clock that all replicas share: PostgreSQL's, or this machine's."""
@@ -202,8 +266,18 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     # Otherwise the driver begins transactions itself, only at the first write; see `_begin_sqlite`.
     connection.isolation_level = None
     cursor = connection.cursor()
-    # WAL lets readers continue while a grid is written; SQLite has foreign keys off by default.
-    pragmas = (f"busy_timeout={_SQLITE_WAIT_MS}", "journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL")
+    # WAL lets readers continue while a grid is written; SQLite has foreign keys off by default. `auto_vacuum` is for
+    # new files, before WAL writes their first page. Some builds overwrite deleted data by default (`secure_delete`):
+    # deleting a file would then need as much space as the file.
+    pragmas = (
+        f"busy_timeout={_SQLITE_WAIT_MS}",
+        "auto_vacuum=INCREMENTAL",
+        "journal_mode=WAL",
+        f"journal_size_limit={LOG_BYTES}",
+        "foreign_keys=ON",
+        "synchronous=NORMAL",
+        "secure_delete=FAST",
+    )
     for pragma in pragmas:
         cursor.execute(f"PRAGMA {pragma}")
     cursor.close()

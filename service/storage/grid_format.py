@@ -80,6 +80,12 @@ def pack(grid: PoseGrid, prototypes: SortedPrototypes | None = None) -> PackedGr
     return PackedGrid(count, content, digest_of(content), None if prototypes is None else pack_prototypes(prototypes))
 
 
+def packed_bytes(poses: int, columns: int, latent_size: int) -> int:
+    """Return the size of the blob of a grid; `latent_size` is 0 without latents."""
+    profile_bytes = 4 if latent_size else 2
+    return _HEADER.size + poses * (_POSE_BYTES + _LATENT_BYTES * latent_size + profile_bytes * columns + _ROOM_BYTES)
+
+
 def pack_prototypes(prototypes: SortedPrototypes) -> bytes:
     """Return the blob of a plan's prototypes."""
     rows = prototypes.rows
@@ -112,8 +118,7 @@ def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float)
     if magic not in (_MAGIC, _MAGIC_WITHOUT_LATENTS) or count == 0 or (magic == _MAGIC) != (latent_size > 0):
         return None
     profiles = np.dtype("<f4" if magic == _MAGIC else "<f2")
-    pose_bytes = _POSE_BYTES + _LATENT_BYTES * latent_size + profiles.itemsize * columns + _ROOM_BYTES
-    if len(content) != _HEADER.size + count * pose_bytes:
+    if len(content) != packed_bytes(count, columns, latent_size):
         return None
     view, offset = memoryview(content).toreadonly(), _HEADER.size
 

@@ -7,32 +7,42 @@ import uuid
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, select, update
+from sqlalchemy import ColumnElement, Connection, delete, or_, select, update
 
+from service.errors import StorageQuotaError
 from service.storage.database import Database
 from service.storage.records import Claim, Claimed, Conflict, InProgress, StoredAnswer
+from service.storage.stored_bytes import ROW_BYTES, Account, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import IDEMPOTENCY
 
 KEPT_FOR = timedelta(hours=24)
 # Minimum time (s) that callers wait after a crash.
 MIN_LEASE_S = 15.0
+# Keys per read when old ones are deleted.
+_BATCH_SIZE = 100
 _COLUMNS = IDEMPOTENCY.c
 
 
 class IdempotencyKeys:
-    """Answers by (tenant, route, key), kept for a day."""
+    """Answers by (tenant, route, key), kept for a day, or until newer ones of the tenant need their space."""
 
-    def __init__(self, database: Database, lease_s: float = MIN_LEASE_S) -> None:
+    def __init__(
+        self, database: Database, quota: StorageQuota, lease_s: float = MIN_LEASE_S, *, max_bytes: int = 64 * 2**20
+    ) -> None:
         """Create the access to the table.
 
         Args:
             database: the database.
+            quota: counts the stored bytes.
             lease_s: time limit (s) of a request, after which the next attempt takes over. If the first one is still
                 alive,
                 both work under the same token: work is done twice, nothing is stored twice.
+            max_bytes: limit of the bytes of a tenant's keys and answers; the oldest are deleted first.
         """
         self._database = database
+        self._quota = quota
         self._lease_s = lease_s
+        self._max_bytes = max_bytes
 
     def begin(self, tenant: str, route: str, key: str, body_sha256: str) -> Claim:
         """Claim a request.
@@ -44,9 +54,10 @@ class IdempotencyKeys:
         own = _where(tenant, route, key)
         token, now = uuid.uuid4().hex, datetime.now(UTC)
         until_s = self._database.now_s() + self._lease_s
-        with self._database.writing() as connection:
+        size = ROW_BYTES + 2 * len(key)
+        with self._database.writing(grows_by=size) as connection:
             expired = _COLUMNS.created_at < now - KEPT_FOR
-            connection.execute(delete(IDEMPOTENCY).where(*own, expired))
+            freed = deleted_bytes(connection, delete(IDEMPOTENCY).where(*own, expired))
             statement = self._database.insert(IDEMPOTENCY).values(
                 tenant=tenant,
                 route=route,
@@ -56,17 +67,33 @@ class IdempotencyKeys:
                 lease_until_s=until_s,
                 lease_s=self._lease_s,
                 created_at=now,
+                stored_bytes=size,
             )
             if connection.scalar(statement.on_conflict_do_nothing().returning(_COLUMNS.token)) == token:
+                # Never refused: a few rows of requests in progress can exceed the tenant's limit.
+                change = StoredBytes(idempotency=size - freed)
+                account = self._quota.settle(connection, tenant, change, refuse=False)
+                self._make_room(connection, tenant, account)
                 return Claimed(token)
             return self._repeated(connection, own, body_sha256, until_s)
 
     def finish(self, tenant: str, route: str, key: str, token: str, answer: StoredAnswer) -> None:
-        """Store the answer, unless one is stored already; later attempts get it."""
+        """Store the answer, unless one is stored already; later attempts get it.
+
+        Raises:
+            StorageQuotaError: the answer does not fit, even without older ones; it is not stored.
+        """
         values = {"status": answer.status, "headers": json.dumps(answer.headers), "body": answer.body}
+        size = len(values["headers"]) + len(answer.body)
         own = (*_where(tenant, route, key), _COLUMNS.token == token, _COLUMNS.status.is_(None))
-        with self._database.writing() as connection:
-            connection.execute(update(IDEMPOTENCY).where(*own).values(**values))
+        with self._database.writing(grows_by=size) as connection:
+            counted = {"stored_bytes": _COLUMNS.stored_bytes + size}
+            if connection.execute(update(IDEMPOTENCY).where(*own).values(**values, **counted)).rowcount == 1:
+                account = self._quota.settle(connection, tenant, StoredBytes(idempotency=size), refuse=False)
+                others = account.used.total - account.used.idempotency
+                if size > min(self._max_bytes, account.limit - others):
+                    raise StorageQuotaError(others, size, account.limit)
+                self._make_room(connection, tenant, account, keep=token)
 
     def abandon(self, tenant: str, route: str, key: str, token: str) -> None:
         """Release a request that was not finished; the next attempt takes over at once, under the same token.
@@ -79,9 +106,24 @@ class IdempotencyKeys:
 
     def purge(self) -> int:
         """Delete keys older than a day, and return their number."""
-        statement = delete(IDEMPOTENCY).where(_COLUMNS.created_at < datetime.now(UTC) - KEPT_FOR)
-        with self._database.writing() as connection:
-            return connection.execute(statement).rowcount
+        return self._quota.purge("idempotency", IDEMPOTENCY, _COLUMNS.created_at < datetime.now(UTC) - KEPT_FOR)
+
+    def delete_all(self, tenant: str) -> int:
+        """Delete all keys of a tenant, and return their number."""
+        return self._quota.purge("idempotency", IDEMPOTENCY, _COLUMNS.tenant == tenant)
+
+    def _make_room(self, connection: Connection, tenant: str, account: Account, *, keep: str = "") -> None:
+        """Delete the oldest keys of a tenant, except the one of `keep`, until the limits hold."""
+        # Rows that another transaction holds are skipped, because it waits for the tenant's row.
+        idle = or_(_COLUMNS.status.is_not(None), ~self._database.is_live(_COLUMNS.lease_until_s, _COLUMNS.lease_s))
+        query = select(_COLUMNS.route, _COLUMNS.key).where(_COLUMNS.tenant == tenant, _COLUMNS.token != keep, idle)
+        oldest = query.order_by(_COLUMNS.created_at).limit(_BATCH_SIZE).with_for_update(skip_locked=True)
+        while _excess(account, self._max_bytes) > 0 and (rows := connection.execute(oldest).all()):
+            for row in rows:
+                freed = deleted_bytes(connection, delete(IDEMPOTENCY).where(*_where(tenant, row.route, row.key)))
+                account = self._quota.settle(connection, tenant, StoredBytes(idempotency=-freed))
+                if _excess(account, self._max_bytes) <= 0:
+                    break
 
     def _repeated(
         self, connection: Connection, own: list[ColumnElement[bool]], body_sha256: str, until_s: Any
@@ -98,6 +140,11 @@ class IdempotencyKeys:
         values = {"lease_until_s": until_s, "lease_s": self._lease_s}
         taken = connection.execute(update(IDEMPOTENCY).where(*own, expired_lease).values(**values))
         return Claimed(row.token) if taken.rowcount == 1 else InProgress()
+
+
+def _excess(account: Account, max_bytes: int) -> int:
+    """Return the bytes by which the keys of a tenant exceed their own limit or that of all it stores."""
+    return max(account.used.idempotency - max_bytes, account.used.total - account.limit)
 
 
 def _where(tenant: str, route: str, key: str) -> list[ColumnElement[bool]]:

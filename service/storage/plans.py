@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, func, select, text, update
+from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, true, update
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M
@@ -21,14 +21,12 @@ from service.storage.plan_cache import PlanCache
 from service.storage.plan_places import place_columns
 from service.storage.records import JSON, ComputedGrid, Cursor, GridKey, Original, PlanRecord, PlanSummary
 from service.storage.statements import newest_first, read_chunks, select_summaries, write_chunks
-from service.storage.stored_grids import insert_grid
-from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
+from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
+from service.storage.stored_grids import grid_bytes, insert_grid
+from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
 from service.storage.venues import remove_from_venues
 from service.stored_plan import PlanDocument, StoredPlan
 from service.telemetry import LOGGER_NAME
-
-# Advisory lock on PostgreSQL that keeps the count of plans exact; differs from the other locks.
-_COUNT_LOCK = 5_210_002
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,13 @@ class _Content:
         packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
         return cls(PlanDocument.from_plan(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
 
+    @property
+    def stored(self) -> StoredBytes:
+        texts = (self.document.document, self.document.warnings, self.original.report)
+        # The texts are ASCII.
+        plan = ROW_BYTES + sum(len(text or "") for text in texts) + len(self.original.content)
+        return StoredBytes(plans=plan, grids=0 if self.grid is None else grid_bytes(self.grid[1]))
+
 
 @dataclass(frozen=True)
 class _StoredPlan:
@@ -57,15 +62,17 @@ class _StoredPlan:
 class Plans:
     """Plans of all tenants; calls treat plans of other tenants as missing."""
 
-    def __init__(self, database: Database, cache: PlanCache) -> None:
+    def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
         """Use a database.
 
         Args:
             database: the database.
             cache: receives every plan that is read or stored at its current revision.
+            quota: counts the stored bytes.
         """
         self._database = database
         self._cache = cache
+        self._quota = quota
 
     def add(
         self,
@@ -76,6 +83,7 @@ class Plans:
         original: Original,
         limit: int,
         grid: ComputedGrid | None = None,
+        later_bytes: int = 0,
     ) -> PlanRecord:
         """Store a plan, its uploaded file, and its grid if it is already computed.
 
@@ -88,24 +96,32 @@ class Plans:
             original: the uploaded file.
             limit: maximum number of the tenant's plans.
             grid: the plan's own grid.
+            later_bytes: expected size of the own grid if it is computed later; there must be room for it.
 
         Raises:
             TooManyFloorPlansError: the tenant has `limit` plans already.
+            StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
         content = _Content.prepare(record, original, grid)
-        with self._database.writing() as connection:
-            if self._database.is_postgresql:
-                connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
+        with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
-                count = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
-                if (connection.scalar(count) or 0) >= limit:
+                if _count(connection, tenant) >= limit:
                     raise TooManyFloorPlansError(limit)
+                self._quota.check(connection, tenant, content.stored.total + later_bytes)
                 values = {"id": plan_id, "tenant": tenant, "created_at": now, **_revision_values(record)}
-                connection.execute(FLOORPLANS.insert(), values)
-                _insert_revision(connection, record, content)
+                statement = self._database.insert(FLOORPLANS).values(values).on_conflict_do_nothing()
+                if connection.scalar(statement.returning(FLOORPLANS.c.id)) is None:
+                    # Another attempt of the same upload was faster.
+                    stored = self._find(connection, _select_current(tenant, plan_id))
+                else:
+                    _insert_revision(connection, record, content)
+                    self._quota.settle(connection, tenant, content.stored)
+                    # Exact now, because settling locks the tenant.
+                    if _count(connection, tenant) > limit:
+                        raise TooManyFloorPlansError(limit)
         if stored is not None:
             record = self._record(stored)
         self._cache.put(record)
@@ -121,6 +137,7 @@ class Plans:
         keep: int,
         expected: str | None = None,
         grid: ComputedGrid | None = None,
+        later_bytes: int = 0,
     ) -> PlanRecord:
         """Store a new revision of a plan, and delete revisions beyond `keep`.
 
@@ -134,15 +151,17 @@ class Plans:
             keep: maximum number of revisions.
             expected: id of the revision that the plan must have; None for any.
             grid: the plan's own grid.
+            later_bytes: as for `add`.
 
         Raises:
             UnknownFloorPlanError: the tenant has no such plan.
             RevisionMismatchError: the plan is not at revision `expected`.
+            StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
         content = _Content.prepare(record, original, grid)
-        with self._database.writing() as connection:
+        with self._database.writing(grows_by=content.stored.total) as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
             if row is None:
@@ -152,11 +171,12 @@ class Plans:
             own = REVISIONS.c.plan_id == plan_id
             number = (connection.scalar(select(func.max(REVISIONS.c.number)).where(own)) or 0) + 1
             record = replace(record, revision=number, created_at=row.created_at)
+            freed = _delete_revisions(connection, own, grids_before=number - 1, before=number - keep + 1)
+            change = content.stored - freed
+            self._quota.check(connection, tenant, change.total + later_bytes)
             _insert_revision(connection, record, content)
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_revision_values(record)))
-            connection.execute(delete(REVISIONS).where(own, REVISIONS.c.number <= number - keep))
-            old = select(REVISIONS.c.id).where(own, REVISIONS.c.number < number - 1)
-            connection.execute(delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
+            self._quota.settle(connection, tenant, change)
         self._cache.put(record)
         return record
 
@@ -233,6 +253,11 @@ class Plans:
             raise _damaged("original", plan_id, row.id)
         return Original(content, row.original_media_type or JSON, row.report)
 
+    def any_stored(self) -> bool:
+        """Tell whether any tenant has a plan."""
+        with self._database.reading() as connection:
+            return connection.scalar(select(FLOORPLANS.c.id).limit(1)) is not None
+
     def list_plans(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[PlanSummary]:
@@ -265,15 +290,7 @@ class Plans:
         Raises:
             RevisionMismatchError: the plan is not at revision `expected`.
         """
-        own = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
-        with self._database.writing() as connection:
-            query = select(FLOORPLANS.c.revision_id).where(*own).with_for_update()
-            revision_id = connection.scalar(query)
-            if revision_id is not None and expected not in (None, revision_id):
-                raise RevisionMismatchError(plan_id, expected, revision_id)
-            if revision_id is not None:
-                remove_from_venues(connection, plan_id)
-            deleted = connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
+        deleted = self._database.freeing(lambda connection: self._delete(connection, tenant, plan_id, expected))
         self._cache.forget(tenant, plan_id)
         return deleted
 
@@ -292,6 +309,23 @@ class Plans:
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
             return set(connection.scalars(query))
+
+    def _delete(self, connection: Connection, tenant: str, plan_id: str, expected: str | None) -> bool:
+        mine = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        revision_id = connection.scalar(select(FLOORPLANS.c.revision_id).where(*mine).with_for_update())
+        if revision_id is None:
+            return False
+        if expected not in (None, revision_id):
+            raise RevisionMismatchError(plan_id, expected, revision_id)
+        own = REVISIONS.c.plan_id == plan_id
+        # Waits for grids that are being stored.
+        connection.execute(select(REVISIONS.c.id).where(own).with_for_update())
+        members = remove_from_venues(connection, plan_id)
+        answers = deleted_bytes(connection, delete(KEPT_ANSWERS).where(KEPT_ANSWERS.c.plan_id == plan_id))
+        freed = replace(_delete_revisions(connection, own), venues=ROW_BYTES * members, answers=answers)
+        connection.execute(delete(FLOORPLANS).where(*mine))
+        self._quota.settle(connection, tenant, StoredBytes() - freed)
+        return True
 
     def _summaries(self, query: Any) -> list[PlanSummary]:
         with self._database.reading() as connection:
@@ -329,6 +363,10 @@ def _document(connection: Connection, revision_id: str) -> PlanDocument:
     columns = REVISIONS.c
     query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == revision_id)
     return PlanDocument(**connection.execute(query).one()._mapping)
+
+
+def _count(connection: Connection, tenant: str) -> int:
+    return connection.scalar(select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)) or 0
 
 
 def _record(
@@ -387,11 +425,23 @@ def _insert_revision(connection: Connection, record: PlanRecord, content: _Conte
         "area_m2": plan.area_m2,
         "camera_height_m": plan.camera_height_m,
         "camera_height_std_m": _height_std_m(plan),
+        "stored_bytes": content.stored.plans,
     }
     connection.execute(REVISIONS.insert(), values)
     write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
     if content.grid is not None:
         insert_grid(connection, *content.grid)
+
+
+def _delete_revisions(
+    connection: Connection, own: ColumnElement[bool], *, grids_before: int | None = None, before: int | None = None
+) -> StoredBytes:
+    """Delete revisions of a plan and grids by their numbers, by default all, and return the freed bytes."""
+    numbers = REVISIONS.c.number
+    old = select(REVISIONS.c.id).where(own, true() if grids_before is None else numbers < grids_before)
+    grids = deleted_bytes(connection, delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
+    dropped = delete(REVISIONS).where(own, true() if before is None else numbers < before)
+    return StoredBytes(plans=deleted_bytes(connection, dropped), grids=grids)
 
 
 def _height_std_m(plan: FloorPlan) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from alembic.migration import MigrationContext
@@ -10,6 +11,7 @@ from alembic.script import ScriptDirectory
 from alembic.script.revision import RevisionError
 from alembic.util import CommandError
 from sqlalchemy import text
+from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
@@ -20,14 +22,19 @@ from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.kept_answers import KeptAnswers
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
+from service.storage.stored_bytes import StorageQuota
 from service.storage.stored_grids import GridLeases, StoredGrids
 from service.storage.tenants import TenantLimits, Tenants
 from service.storage.venues import Venues
 
 # Margin (s) of the lease of an idempotency key over the query timeout.
 _CLAIM_MARGIN_S = 5.0
+# Default limit of a tenant's stored bytes.
+_STORED_BYTES = 10 * 2**30
+# Plans or venues per read when a tenant is purged.
+_PURGED_AT_ONCE = 100
 _MIGRATIONS = Path(__file__).parent / "migrations"
-# Advisory lock on PostgreSQL; differs from the locks in `plans` and `venues`.
+# Advisory lock on PostgreSQL.
 _MIGRATION_LOCK = 5_210_001
 
 
@@ -45,6 +52,7 @@ class Store:
         idempotency_keys: answers by idempotency key.
         keys: API keys.
         answers: kept answers.
+        quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
         tenant_limits: the same limits in memory.
     """
@@ -57,6 +65,8 @@ class Store:
         wait_s: float = 2.0,
         claim_s: float = MIN_LEASE_S,
         plan_cache_bytes: int = 64 * 2**20,
+        stored_bytes: int = _STORED_BYTES,
+        idempotency_bytes: int = 64 * 2**20,
     ) -> None:
         """Connect, and migrate the schema.
 
@@ -66,6 +76,8 @@ class Store:
             wait_s: timeout (s) for a free connection.
             claim_s: lease (s) of an idempotency key while its request runs.
             plan_cache_bytes: approximate memory limit of parsed plans; 0 caches none.
+            stored_bytes: limit of the stored bytes of a tenant without a limit of its own.
+            idempotency_bytes: limit of the bytes of a tenant's idempotency keys and their answers.
 
         Raises:
             ConfigError: the URL is invalid, or the database cannot be opened.
@@ -77,19 +89,46 @@ class Store:
             raise ConfigError(f"cannot open the database (LALALOC_DATABASE_URL): {error}") from error
         self._database = database
         self.plan_cache = PlanCache(plan_cache_bytes)
-        self.plans = Plans(database, self.plan_cache)
-        self.venues = Venues(database)
-        self.grids = StoredGrids(database)
+        self.quota = StorageQuota(database, stored_bytes)
+        self.plans = Plans(database, self.plan_cache, self.quota)
+        self.venues = Venues(database, self.quota)
+        self.grids = StoredGrids(database, self.quota)
         self.leases = GridLeases(database)
-        self.idempotency_keys = IdempotencyKeys(database, claim_s)
+        self.idempotency_keys = IdempotencyKeys(database, self.quota, claim_s, max_bytes=idempotency_bytes)
         self.keys = ApiKeys(database)
-        self.answers = KeptAnswers(database)
+        self.answers = KeptAnswers(database, self.quota)
         self.tenants = Tenants(database)
         self.tenant_limits = TenantLimits(self.tenants)
 
     def answered_since(self, moment_s: float) -> bool:
         """Tell whether the database completed a transaction after a moment (`monotonic`)."""
         return self._database.answered_since(moment_s)
+
+    def purge_tenant(self, tenant: str) -> int:
+        """Delete all that a tenant stored, but not its API keys and limits, and return the number of plans.
+
+        Each plan and venue is deleted in a transaction of its own, so that other tenants do not wait.
+        """
+        count = 0
+        while plans := self.plans.list_plans(tenant, limit=_PURGED_AT_ONCE):
+            count += sum(self.plans.delete(tenant, plan.id) for plan in plans)
+        while venues := self.venues.list_venues(tenant, limit=_PURGED_AT_ONCE):
+            for venue in venues:
+                self.venues.delete(tenant, venue.id)
+        self.idempotency_keys.delete_all(tenant)
+        return count
+
+    def compact(self) -> None:
+        """Write an SQLite file anew without free space; afterwards it returns space after deletions.
+
+        Raises:
+            StoreUnavailableError: another process writes, or the disk has no room for a second file.
+        """
+        self._database.compact()
+
+    def give_back(self) -> None:
+        """Return free space of an SQLite file to the disk."""
+        self._database.give_back()
 
     def close(self) -> None:
         """Close all connections."""
@@ -114,7 +153,17 @@ def open_store(settings: Settings) -> Store:
         # The lease outlasts a query, so that a running query is not started again.
         claim_s=max(MIN_LEASE_S, settings.requests.request_deadline_s + _CLAIM_MARGIN_S),
         plan_cache_bytes=settings.storage.plan_cache_bytes,
+        stored_bytes=settings.storage.max_stored_bytes or _default_stored_bytes(settings),
+        idempotency_bytes=settings.storage.max_idempotency_bytes,
     )
+
+
+def _default_stored_bytes(settings: Settings) -> int:
+    """Return the default limit of a tenant's stored bytes: with SQLite, no tenant can fill the volume alone."""
+    path = make_url(settings.database_url).database
+    if settings.database_url.startswith("sqlite") and path and (folder := Path(path).absolute().parent).is_dir():
+        return min(_STORED_BYTES, shutil.disk_usage(folder).total // 2)
+    return _STORED_BYTES
 
 
 def _migrate(database: Database) -> None:

@@ -29,6 +29,7 @@ from service.storage.statements import (
     select_summaries,
     write_chunks,
 )
+from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
 from service.telemetry import LOGGER_NAME
 
@@ -39,8 +40,9 @@ _BATCH_SIZE = 1000
 class StoredGrids:
     """Stored pose grids; a grid is stored completely or not at all."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, quota: StorageQuota) -> None:
         self._database = database
+        self._quota = quota
 
     def get(self, key: GridKey) -> PoseGrid | None:
         """Return a grid; None if it is not stored, or damaged and to be computed again."""
@@ -78,9 +80,20 @@ class StoredGrids:
 
     def put_prototypes(self, grid_id: int, prototypes: SortedPrototypes) -> None:
         """Store the prototypes of a grid that an earlier version of the service stored without."""
-        statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id)
-        with self._database.writing() as connection:
-            connection.execute(statement.values(prototypes=pack_prototypes(prototypes)))
+        packed = pack_prototypes(prototypes)
+        revisions = LATENT_GRIDS.join(REVISIONS, REVISIONS.c.id == LATENT_GRIDS.c.revision_id)
+        owner = (
+            select(FLOORPLANS.c.tenant)
+            .select_from(revisions.join(FLOORPLANS, FLOORPLANS.c.id == REVISIONS.c.plan_id))
+            .where(LATENT_GRIDS.c.id == grid_id)
+        )
+        statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id, LATENT_GRIDS.c.prototypes.is_(None))
+        values = {"prototypes": packed, "stored_bytes": LATENT_GRIDS.c.stored_bytes + len(packed)}
+        with self._database.writing(grows_by=len(packed)) as connection:
+            tenant = connection.scalar(owner)
+            if tenant is not None and connection.execute(statement.values(values)).rowcount == 1:
+                # Small beside the grid, and needed by queries of venues, so never refused.
+                self._quota.settle(connection, tenant, StoredBytes(grids=len(packed)), refuse=False)
 
     def poses(
         self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None
@@ -119,18 +132,29 @@ class StoredGrids:
 
         Returns:
             False if the revision was deleted; the grid is then not stored.
+
+        Raises:
+            StorageQuotaError: the tenant would store too many bytes.
         """
         packed = pack(grid, prototypes)
-        with self._database.writing() as connection:
+        owner = (
+            select(FLOORPLANS.c.tenant)
+            .join_from(REVISIONS, FLOORPLANS, FLOORPLANS.c.id == REVISIONS.c.plan_id)
+            .where(REVISIONS.c.id == key.revision_id)
+        )
+        with self._database.writing(grows_by=grid_bytes(packed)) as connection:
             # Replicas that store grids of one revision take turns.
-            lock = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id).with_for_update(key_share=True)
-            if connection.scalar(lock) is None:
+            tenant = connection.scalar(owner.with_for_update(key_share=True, of=REVISIONS))
+            if tenant is None:
                 return False
             connection.execute(delete(GRID_LEASES).where(*_where(GRID_LEASES, key)))
-            connection.execute(delete(LATENT_GRIDS).where(*_where(LATENT_GRIDS, key)))
-            _drop_older_models(connection, key)
-            _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
+            freed = deleted_bytes(connection, delete(LATENT_GRIDS).where(*_where(LATENT_GRIDS, key)))
+            freed += _drop_older_models(connection, key)
+            freed += _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
+            change = StoredBytes(grids=grid_bytes(packed) - freed)
+            self._quota.check(connection, tenant, change.total)
             insert_grid(connection, key, packed)
+            self._quota.settle(connection, tenant, change)
         return True
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
@@ -210,6 +234,11 @@ class GridLeases:
             return {(row.revision_id, row.camera_height_mm): row.progress for row in connection.execute(query)}
 
 
+def grid_bytes(packed: PackedGrid) -> int:
+    """Return the stored bytes of a packed grid."""
+    return ROW_BYTES + len(packed.content) + len(packed.prototypes or b"")
+
+
 def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> None:
     """Insert a packed grid within a transaction."""
     values = {
@@ -218,6 +247,7 @@ def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> Non
         "size_bytes": len(packed.content),
         "sha256": packed.sha256,
         "prototypes": packed.prototypes,
+        "stored_bytes": grid_bytes(packed),
     }
     grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
     write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
@@ -236,20 +266,23 @@ def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
     return [table.c[name] == value for name, value in _columns(key).items()]
 
 
-def _drop_older_models(connection: Connection, key: GridKey) -> None:
+def _drop_older_models(connection: Connection, key: GridKey) -> int:
+    """Delete the grids of all other models but the latest, and return the freed bytes."""
     columns = LATENT_GRIDS.c
     own = columns.revision_id == key.revision_id
     same_model = and_(columns.model_sha256 == key.model_sha256, columns.step_m == key.step_m)
     query = select(columns.model_sha256, columns.step_m).where(own, ~same_model).order_by(columns.id.desc()).limit(1)
     latest = connection.execute(query).one_or_none()
-    if latest is not None:
-        latest_model = and_(columns.model_sha256 == latest.model_sha256, columns.step_m == latest.step_m)
-        connection.execute(delete(LATENT_GRIDS).where(own, ~same_model, ~latest_model))
+    if latest is None:
+        return 0
+    latest_model = and_(columns.model_sha256 == latest.model_sha256, columns.step_m == latest.step_m)
+    return deleted_bytes(connection, delete(LATENT_GRIDS).where(own, ~same_model, ~latest_model))
 
 
-def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_mm: int) -> None:
+def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_mm: int) -> int:
+    """Delete the oldest grids on demand beyond `keep`, and return the freed bytes."""
     if key.camera_height_mm == always_keep_mm:
-        return
+        return 0
     columns = LATENT_GRIDS.c
     on_demand = select(columns.id).where(
         columns.revision_id == key.revision_id,
@@ -259,7 +292,7 @@ def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_m
     )
     # Two grids are not among them: the plan's own, and the one about to be stored.
     surplus = connection.scalars(on_demand.order_by(columns.id.desc()).offset(max(keep - 2, 0))).all()
-    connection.execute(delete(LATENT_GRIDS).where(columns.id.in_(surplus)))
+    return deleted_bytes(connection, delete(LATENT_GRIDS).where(columns.id.in_(surplus)))
 
 
 def _unprepared(model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:

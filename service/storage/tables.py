@@ -42,6 +42,11 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.astimezone(UTC) if value.tzinfo else value.replace(tzinfo=UTC)
 
 
+def _stored_bytes() -> Column[int]:
+    """Return the column of a row's stored bytes (`stored_bytes.py`); 0 if an earlier version wrote the row."""
+    return Column("stored_bytes", BigInteger, nullable=False, server_default="0")
+
+
 def _of_revision(*, primary_key: bool = False) -> Column[str]:
     owner = ForeignKey("revisions.id", ondelete="CASCADE")
     return Column("revision_id", String(32), owner, primary_key=primary_key, nullable=False)
@@ -92,6 +97,7 @@ REVISIONS = Table(
     # NULL for an unknown camera height, and in rows of earlier versions of the service.
     Column("camera_height_std_m", Double),
     Column("failure", Text),
+    _stored_bytes(),
     UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
 )
 
@@ -117,6 +123,7 @@ LATENT_GRIDS = Table(
     Column("sha256", String(64)),
     # Input of the choice among a venue's plans; NULL in rows of earlier versions of the service.
     Column("prototypes", LargeBinary),
+    _stored_bytes(),
     UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
 
@@ -186,6 +193,11 @@ TENANTS = Table(
     Column("max_bytes_in_flight", BigInteger),
     # Weight of the tenant's CPU seconds in queues; NULL counts as 1.
     Column("cpu_share", Double),
+    # Counters of stored bytes by kind, see `stored_bytes.py`.
+    *(
+        Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
+        for kind in ("plans", "grids", "venues", "answers", "idempotency")
+    ),
 )
 
 API_KEYS = Table(
@@ -210,6 +222,7 @@ KEPT_ANSWERS = Table(
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("content", Text, nullable=False),
+    _stored_bytes(),
     Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
     Index("kept_answers_by_age", "created_at"),
     Index("kept_answers_by_plan", "plan_id"),
@@ -230,5 +243,7 @@ IDEMPOTENCY = Table(
     Column("status", Integer),
     Column("headers", Text),
     Column("body", LargeBinary),
+    _stored_bytes(),
     Index("idempotency_by_age", "created_at"),
+    Index("idempotency_by_tenant_and_age", "tenant", "created_at"),
 )

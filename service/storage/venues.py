@@ -23,7 +23,6 @@ from sqlalchemy import (
     literal,
     or_,
     select,
-    text,
     update,
 )
 
@@ -40,10 +39,9 @@ from service.storage.records import (
     VenueState,
 )
 from service.storage.statements import is_own_grid, newest_first
+from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
 
-# Advisory lock on PostgreSQL for exact numbers of venues; differs from the other locks.
-_COUNT_LOCK = 5_210_003
 # Ids per statement.
 _BATCH_SIZE = 1000
 # Ids listed in an error message.
@@ -70,8 +68,9 @@ _SEARCH_COLUMNS = (
 class Venues:
     """Venues of all tenants; a venue of another tenant counts as missing."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, quota: StorageQuota) -> None:
         self._database = database
+        self._quota = quota
 
     def add(
         self,
@@ -96,19 +95,23 @@ class Venues:
         Raises:
             TooManyVenuesError: the tenant has `limit` venues already.
             InvalidRequestError: a plan is not the tenant's.
+            StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
-        with self._database.writing() as connection:
-            if self._database.is_postgresql:
-                connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
+        size = ROW_BYTES * (1 + len(members))
+        with self._database.writing(grows_by=size) as connection:
             if (stored := _find(connection, tenant, venue_id)) is None:
-                own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
-                if (connection.scalar(own) or 0) >= limit:
-                    raise TooManyVenuesError(limit)
                 _check_plans(connection, tenant, [member.plan_id for member in members])
                 values = {"id": venue_id, "tenant": tenant, "number": 1, "created_at": now}
-                connection.execute(VENUES.insert(), values | _revision_values(name, anchor, now))
-                _insert(connection, venue_id, members)
+                values |= _revision_values(name, anchor, now)
+                statement = self._database.insert(VENUES).values(values).on_conflict_do_nothing()
+                if connection.scalar(statement.returning(VENUES.c.id)) is not None:
+                    _insert(connection, venue_id, members)
+                    self._quota.settle(connection, tenant, StoredBytes(venues=size))
+                    # Exact, because settling locks the tenant.
+                    own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
+                    if (connection.scalar(own) or 0) > limit:
+                        raise TooManyVenuesError(limit)
                 stored = _find(connection, tenant, venue_id)
         assert stored is not None
         return _record(stored)
@@ -146,12 +149,14 @@ class Venues:
             RevisionMismatchError: the venue has another revision.
             InvalidRequestError: a plan of `members` is not the tenant's, one of `removed` is not in the venue, or the
                 venue has too many plans.
+            StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
-        with self._database.writing() as connection:
+        with self._database.writing(grows_by=ROW_BYTES * len(members)) as connection:
             # Plans are locked before venues, as in the deletion of a plan, to avoid a deadlock.
             _check_plans(connection, tenant, [member.plan_id for member in members])
             row = _locked(connection, tenant, venue_id, expected)
+            before = _count(connection, venue_id)
             if replace_members:
                 connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.venue_id == venue_id))
             _remove(connection, venue_id, removed)
@@ -165,6 +170,7 @@ class Venues:
             values = _revision_values(row.name if name is None else name, kept, now) | {"number": row.number + 1}
             connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
             found = _find(connection, tenant, venue_id)
+            self._quota.settle(connection, tenant, StoredBytes(venues=ROW_BYTES * (count - before)))
         assert found is not None
         return _record(found)
 
@@ -263,24 +269,35 @@ class Venues:
         Raises:
             RevisionMismatchError: the venue has another revision than `expected`.
         """
-        with self._database.writing() as connection:
+
+        def work(connection: Connection) -> bool:
             try:
                 _locked(connection, tenant, venue_id, expected)
             except UnknownVenueError:
                 return False
-            return connection.execute(delete(VENUES).where(VENUES.c.id == venue_id)).rowcount == 1
+            rows = 1 + _count(connection, venue_id)
+            connection.execute(delete(VENUES).where(VENUES.c.id == venue_id))
+            self._quota.settle(connection, tenant, StoredBytes(venues=-ROW_BYTES * rows))
+            return True
+
+        return self._database.freeing(work)
 
 
-def remove_from_venues(connection: Connection, plan_id: str) -> None:
-    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it."""
+def remove_from_venues(connection: Connection, plan_id: str) -> int:
+    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it.
+
+    Returns:
+        The number of deleted rows.
+    """
     own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
     venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
     ids = connection.scalars(venues).all()
-    connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.plan_id == plan_id))
+    rows = connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.plan_id == plan_id)).rowcount
     now = datetime.now(UTC)
     for venue_id in ids:
         values = {"revision_id": uuid.uuid4().hex, "number": VENUES.c.number + 1, "updated_at": now}
         connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
+    return rows
 
 
 def _revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:

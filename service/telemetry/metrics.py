@@ -17,7 +17,8 @@ _GRID_SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1
 class Telemetry:
     """Prometheus metrics of one app, in a registry of their own.
 
-    Labels come from small sets, such as route templates, stages and problem kinds, and never from client input.
+    Labels come from small sets, such as route templates, stages, problem kinds and the tenants that the operator
+    creates, and never from client input.
 
     Attributes:
         registry: the registry.
@@ -57,6 +58,12 @@ class Telemetry:
         # Exported as 0 from the start, so that the first restart shows as an increase.
         for pool in ("lpo", "decode", "import"):
             self.pool_restarts.labels(pool)
+        self.stored_bytes = self._gauge(
+            "lalaloc_stored_bytes", "Stored bytes of a tenant, by kind.", ("tenant", "kind")
+        )
+        self.stored_bytes_limit = self._gauge(
+            "lalaloc_stored_bytes_limit", "Limit of the stored bytes of a tenant.", ("tenant",)
+        )
         self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Pose grids found in memory.")
         self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Pose grids not found in memory.")
         self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Pose grids evicted from memory.")

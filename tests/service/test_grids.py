@@ -406,7 +406,7 @@ def test_sweep_drops_deleted_revisions_from_memory(open_store: OpenStore, make_g
         assert store.plans.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
     elsewhere.plans.add_revision("default", "changed", PLAN, original=Original(b""), keep=5)
-    Sweeper(store, grids, sweep_s=5.0, keep_answers_s=0.0).sweep()
+    Sweeper(store, grids, Telemetry(), sweep_s=5.0, keep_answers_s=0.0).sweep()
     assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
 
@@ -422,7 +422,7 @@ def test_sweep_cancels_revisions_replaced_remotely(
     for _ in range(3):
         record = elsewhere.plans.add_revision("default", "p", HALL, original=Original(b""), keep=5)
         futures.append(grids.compute(record, 1.5))
-    Sweeper(store, grids, sweep_s=5.0, keep_answers_s=0.0).sweep()
+    Sweeper(store, grids, Telemetry(), sweep_s=5.0, keep_answers_s=0.0).sweep()
     encoders.go_on.set()
     assert len(futures.pop().result(60.0).poses) == 1521
     assert [type(future.exception(30.0)) for future in futures] == [PlanNotReadyError] * 3

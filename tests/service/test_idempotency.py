@@ -177,7 +177,9 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
         store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": CONTENT}))
-        claim = IdempotencyKeys(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
+        claim = IdempotencyKeys(store._database, store.quota, lease_s=1.0).begin(
+            "default", "POST /floorplans", "a", digest
+        )
         assert isinstance(claim, Claimed)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}

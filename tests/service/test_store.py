@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import delete, event, func, select, update
+from sqlalchemy import Connection, delete, event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
@@ -61,6 +61,7 @@ from service.storage.tables import (
     METADATA,
     ORIGINAL_CHUNKS,
     REVISIONS,
+    TENANTS,
 )
 from tests.service.conftest import FLAT
 from tests.service.postgres import PostgresServer
@@ -138,6 +139,22 @@ def _rows(store: Store, table: object) -> int:
         return connection.scalar(select(func.count()).select_from(table)) or 0  # pyright: ignore[reportArgumentType]
 
 
+def _filled_tables(store: Store) -> list[str]:
+    """Return the tables with rows, except the counters of tenants."""
+    return [table.name for table in METADATA.sorted_tables if table is not TENANTS and _rows(store, table)]
+
+
+def _fill(store: Store, tenant: str, *, plan_id: str = "a" * 32) -> None:
+    """Store something of every kind."""
+    revision_id = _add(store, plan_id, tenant=tenant)
+    _put(store, _key(revision_id))
+    store.venues.add(tenant, plan_id, "venue", None, [VenueMember(plan_id)], limit=9)
+    store.answers.add(tenant, plan_id, lambda answer_id: answer_id * 20, limit=9)
+    claim = store.idempotency_keys.begin(tenant, "POST /x", "", "body")
+    assert isinstance(claim, Claimed)
+    store.idempotency_keys.finish(tenant, "POST /x", "", claim.token, StoredAnswer(200, {}, b"{}"))
+
+
 # Plans and originals
 
 
@@ -190,7 +207,7 @@ def test_failed_insert_stores_nothing(store: Store, broken: str) -> None:
     with pytest.raises(Exception, match=r"(?i)not.null|buffer"):
         store.plans.add("default", "p", PLAN, original=Original(original), limit=10, grid=grid)  # pyright: ignore[reportArgumentType]
     assert store.plans.get("default", "p") is None
-    assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
+    assert _filled_tables(store) == []
 
 
 def test_plan_limit_is_per_tenant(store: Store) -> None:
@@ -322,7 +339,7 @@ def test_deleted_plan_leaves_no_rows(store: Store) -> None:
     assert not store.plans.delete("default", "p")
     assert store.plans.get_revision("default", "p", revision_id) is None
     assert store.grids.get(_key(revision_id)) is None
-    assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
+    assert _filled_tables(store) == []
 
 
 def test_listing_is_newest_first_and_paged(store: Store) -> None:
@@ -667,7 +684,7 @@ def test_abandoned_request_can_be_claimed_again(store: Store) -> None:
 
 def test_expired_claim_is_taken_over_with_its_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
-    dead = IdempotencyKeys(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
+    dead = IdempotencyKeys(stores[0]._database, stores[0].quota, lease_s=0.2).begin("t", "r", "k", "body")
     assert isinstance(dead, Claimed)
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
@@ -769,7 +786,34 @@ CREATE TABLE {grids} (
 # Columns that the migration for venues adds.
 _OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
 _OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
+_OF_BYTES = tuple((name, "stored_bytes") for name in ("revisions", "latent_grids", "kept_answers", "idempotency"))
 _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude"))
+
+
+def _undo_tenants(connection: Connection) -> None:
+    """Undo the migrations 0007 and 0008."""
+    connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
+    connection.exec_driver_sql("DROP TABLE tenants")
+    for table, column in _OF_BYTES:
+        connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
+
+
+def test_migration_counts_stored_bytes(store: Store, url: str) -> None:
+    _fill(store, "one")
+    _fill(store, "two", plan_id="b" * 32)
+    counted = store.quota.accounts()
+    with store._database.writing() as connection:
+        _undo_tenants(connection)
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0006'")
+    store.close()
+    moved = Store(url)
+    assert moved.quota.accounts() == counted
+    assert all(vars(account.used).values() for account in counted.values())
+    for tenant in ("one", "two"):
+        for plan in moved.plans.list_plans(tenant, limit=10):
+            moved.plans.delete(tenant, plan.id)
+    assert {account.used.plans + account.used.grids for account in moved.quota.accounts().values()} == {0}
+    moved.close()
 
 
 def test_migration_fills_in_places(store: Store, url: str) -> None:
@@ -779,11 +823,11 @@ def test_migration_fills_in_places(store: Store, url: str) -> None:
     columns = select(*(getattr(FLOORPLANS.c, name) for _, name in _OF_PLACES)).order_by(FLOORPLANS.c.id)
     with store._database.writing() as connection:
         written = connection.execute(columns).all()
+        _undo_tenants(connection)
         connection.exec_driver_sql("DROP INDEX floorplans_by_place")
         for table, column in _OF_PLACES:
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         connection.exec_driver_sql("UPDATE revisions SET document = 'damaged' WHERE plan_id = 'r'")
-        connection.exec_driver_sql("DROP TABLE tenants")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0005'")
     store.close()
     moved = Store(url)
@@ -801,6 +845,7 @@ def test_migration_drops_grids_without_digest(store: Store, url: str) -> None:
     _put(store, _key(revision_id))
     store.idempotency_keys.begin("t", "r", "k", "body")
     with store._database.writing() as connection:
+        _undo_tenants(connection)
         connection.exec_driver_sql("DROP INDEX floorplans_by_place")
         for table, column in (
             ("latent_grids", "sha256"),
@@ -814,7 +859,7 @@ def test_migration_drops_grids_without_digest(store: Store, url: str) -> None:
             *_OF_PLACES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers", "tenants"):
+        for table in ("venue_plans", "venues", "kept_answers"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
     store.close()
@@ -835,10 +880,11 @@ def test_migration_adds_venues(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
     with store._database.writing() as connection:
+        _undo_tenants(connection)
         connection.exec_driver_sql("DROP INDEX floorplans_by_place")
         for table, column in (*_OF_VENUES, *_OF_FILES, *_OF_PLACES):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers", "tenants"):
+        for table in ("venue_plans", "venues", "kept_answers"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0002'")
     store.close()

@@ -1,25 +1,78 @@
-"""Tenants: the operator's limits."""
+"""Tenants: the operator's limits, stored bytes and their quota, and purging, on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
+from sqlalchemy import func, select
 
+from lalaloc_core.floorplan import FloorPlan
 from service.cli import main
-from service.storage.records import OperatorLimits
+from service.errors import StorageQuotaError
+from service.storage.records import (
+    Claimed,
+    ComputedGrid,
+    GridKey,
+    OperatorLimits,
+    Original,
+    StoredAnswer,
+    VenueMember,
+)
 from service.storage.store import Store
-from tests.service.conftest import DatabaseOf
+from service.storage.tables import IDEMPOTENCY, METADATA, TENANTS
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.test_store import _grid
+
+PLAN = FloorPlan.from_dict(FLAT)
+MIB = 2**20
 
 
-@pytest.fixture
-def url(tmp_path: Path, database_of: DatabaseOf, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the URL of the database that the settings in the environment name."""
-    address = database_of(tmp_path)
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the URL of an empty database of either kind, which the settings in the environment name."""
+    address = f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
+    if request.param == "postgresql":
+        address = request.getfixturevalue("postgres").new_database()
     monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
     monkeypatch.setenv("LALALOC_DATABASE_URL", address)
     return address
+
+
+@pytest.fixture
+def store(url: str) -> Iterator[Store]:
+    opened = Store(url, stored_bytes=10 * MIB, idempotency_bytes=MIB)
+    yield opened
+    opened.close()
+
+
+def _add(store: Store, tenant: str, plan_id: str, size: int = MIB, **options: object) -> str:
+    """Store a plan with a file of some size, and return the id of its revision."""
+    original = Original(bytes(size))
+    return store.plans.add(tenant, plan_id, PLAN, original=original, limit=100, **options).revision_id  # pyright: ignore[reportArgumentType]
+
+
+def _keep_answer(store: Store, tenant: str, key: str, size: int) -> Claimed:
+    claim = store.idempotency_keys.begin(tenant, "POST /x", key, "body")
+    assert isinstance(claim, Claimed)
+    store.idempotency_keys.finish(tenant, "POST /x", key, claim.token, StoredAnswer(200, {}, bytes(size)))
+    return claim
+
+
+def _recounted(store: Store, tenant: str) -> None:
+    """Check that the counters are the sums of the rows."""
+    counted = store.quota.account(tenant)
+    store.quota.recount()
+    assert store.quota.account(tenant) == counted
+
+
+# Limits of the operator
 
 
 def test_limits_are_set_and_reset(url: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,30 +85,208 @@ def test_limits_are_set_and_reset(url: str, capsys: pytest.CaptureFixture[str]) 
     ]
     assert main(["tenants", "list", "--json"]) == 0
     [listed] = json.loads(capsys.readouterr().out)
-    assert listed == {"tenant": "acme", "stored_bytes": 1000, "bytes_in_flight": 2000, "cpu_share": None}
+    limits = {"stored_bytes": 1000, "bytes_in_flight": 2000, "cpu_share": None}
+    assert listed == {"tenant": "acme", "used_bytes": 0, **limits}
     assert main(["tenants", "list"]) == 0
-    assert capsys.readouterr().out.splitlines()[1].split() == ["acme", "1000", "2000", "default"]
+    assert capsys.readouterr().out.splitlines()[1].split() == ["acme", "0", "1000", "2000", "default"]
 
 
 @pytest.mark.parametrize(
     "options",
     [["--stored-bytes", "-1"], ["--stored-bytes", str(2**63)], ["--cpu-share", "0"], ["--cpu-share", "nan"]],
 )
-def test_invalid_limit_is_a_usage_error(url: str, options: list[str]) -> None:
+def test_invalid_limit_is_a_usage_error(options: list[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         main(["tenants", "limit", "acme", *options])
     assert exit_info.value.code == 2
 
 
-def test_limits_in_memory_follow_the_database(url: str) -> None:
-    store, operator = Store(url), Store(url)
+def test_limits_in_memory_follow_the_database(store: Store) -> None:
     assert store.tenant_limits.of("acme") == OperatorLimits()
-    operator.tenants.change_limits("acme", stored_bytes=2**40)
+    store.tenants.change_limits("acme", stored_bytes=2**40)
     store.tenant_limits.refresh()
     assert store.tenant_limits.of("acme") == OperatorLimits(stored_bytes=2**40)
     assert store.tenant_limits.of("other") == OperatorLimits()
-    operator.tenants.change_limits("acme", stored_bytes=None)
+    store.tenants.change_limits("acme", stored_bytes=None)
     store.tenant_limits.refresh()
     assert store.tenant_limits.of("acme") == OperatorLimits()
-    for opened in (store, operator):
-        opened.close()
+
+
+# Stored bytes
+
+
+def test_stored_bytes_follow_every_change(store: Store) -> None:
+    revision_id = _add(store, "a", "p" * 32)
+    plans = store.quota.account("a").used.plans
+    assert MIB < plans < 1.01 * MIB
+    _add(store, "a", "q" * 32, 2 * MIB, grid=ComputedGrid(model_sha256="m1", grid=_grid()))
+    key = GridKey(revision_id=revision_id, model_sha256="m1", step_m=0.5, camera_height_mm=1500)
+    for camera_height_mm in (1500, 1500, 1600, 1620, 1640):
+        height_key = GridKey(**(vars(key) | {"camera_height_mm": camera_height_mm}))
+        assert store.grids.put(height_key, _grid(count=1000), keep=2, always_keep_mm=1500)
+    _recounted(store, "a")
+    for _ in range(4):
+        store.plans.add_revision("a", "p" * 32, PLAN, original=Original(bytes(MIB)), keep=2)
+        _recounted(store, "a")
+    assert store.quota.account("a").used.plans == pytest.approx(4 * MIB, rel=0.01)
+    store.venues.add("a", "v", "venue", None, [VenueMember("p" * 32), VenueMember("q" * 32)], limit=9)
+    store.venues.change("a", "v", removed=["q" * 32], max_plans=9)
+    _recounted(store, "a")
+    kept = [store.answers.add("a", "p" * 32, lambda answer_id: answer_id * 100, limit=2) for _ in range(4)]
+    _keep_answer(store, "a", "k", 1000)
+    _recounted(store, "a")
+    used = store.quota.account("a").used
+    assert min(vars(used).values()) > 0
+    assert store.answers.delete("a", kept[-1] or "")
+    assert store.plans.delete("a", "p" * 32)
+    _recounted(store, "a")
+    assert store.plans.delete("a", "q" * 32)
+    assert store.venues.delete("a", "v")
+    store.idempotency_keys.delete_all("a")
+    assert store.quota.account("a").used.total == 0
+    _recounted(store, "a")
+
+
+def test_tenant_cannot_store_more_than_its_quota(store: Store) -> None:
+    for number in range(9):
+        _add(store, "a", f"p{number}")
+    with pytest.raises(StorageQuotaError, match=r"needs .* more; the limit is 10485760 .*LALALOC_MAX_STORED_BYTES"):
+        _add(store, "a", "q")
+    with pytest.raises(StorageQuotaError):
+        store.plans.add_revision("a", "p0", PLAN, original=Original(bytes(MIB)), keep=2)
+    store.tenants.change_limits("a", stored_bytes=store.quota.account("a").used.total)
+    with pytest.raises(StorageQuotaError, match="lalaloc-service tenants limit"):
+        store.venues.add("a", "v", "venue", None, [], limit=9)
+    with pytest.raises(StorageQuotaError):
+        store.answers.add("a", "p0", lambda answer_id: answer_id, limit=9)
+    store.tenants.change_limits("a", stored_bytes=None)
+    assert store.plans.get("a", "q") is None
+    _recounted(store, "a")
+    _add(store, "b", "q")
+    assert store.plans.delete("a", "p0")
+    _add(store, "a", "p0")
+
+
+def test_room_for_the_grid_is_needed_at_the_upload(store: Store) -> None:
+    with pytest.raises(StorageQuotaError):
+        _add(store, "a", "p", later_bytes=10 * MIB)
+    revision_id = _add(store, "a", "p", later_bytes=8 * MIB)
+    store.tenants.change_limits("a", stored_bytes=2 * MIB)
+    key = GridKey(revision_id=revision_id, model_sha256="m1", step_m=0.5, camera_height_mm=1500)
+    with pytest.raises(StorageQuotaError, match="lalaloc-service tenants limit"):
+        store.grids.put(key, _grid(count=2000), keep=8, always_keep_mm=1500)
+    assert store.grids.get(key) is None
+    _recounted(store, "a")
+
+
+def test_concurrent_uploads_do_not_exceed_the_quota(store: Store, url: str) -> None:
+    stores = [store, Store(url, stored_bytes=10 * MIB)]
+
+    def add(number: int) -> bool:
+        try:
+            _add(stores[number % 2], "a", f"p{number}", 2 * MIB)
+        except StorageQuotaError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as threads:
+        assert sum(threads.map(add, range(16))) == 4
+    assert store.quota.account("a").used.total <= 10 * MIB
+    _recounted(store, "a")
+    stores[1].close()
+
+
+def test_oldest_idempotent_answers_are_deleted_first(store: Store) -> None:
+    first = _keep_answer(store, "a", "0", 10_000)
+    for number in range(1, 150):
+        _keep_answer(store, "a", str(number), 10_000)
+        assert store.quota.account("a").used.idempotency <= MIB
+    repeated = store.idempotency_keys.begin("a", "POST /x", "149", "body")
+    assert repeated == StoredAnswer(200, {}, bytes(10_000))
+    again = store.idempotency_keys.begin("a", "POST /x", "0", "body")
+    assert isinstance(again, Claimed)
+    assert again != first
+    _recounted(store, "a")
+
+
+def test_idempotent_answer_beyond_the_quota_is_not_kept(store: Store) -> None:
+    _add(store, "a", "p", 10 * MIB - 10_000)
+    claim = store.idempotency_keys.begin("a", "POST /x", "k", "body")
+    assert isinstance(claim, Claimed)
+    with pytest.raises(StorageQuotaError):
+        store.idempotency_keys.finish("a", "POST /x", "k", claim.token, StoredAnswer(200, {}, bytes(20_000)))
+    store.idempotency_keys.abandon("a", "POST /x", "k", claim.token)
+    # The next attempt works under the same token, so nothing is stored twice.
+    assert store.idempotency_keys.begin("a", "POST /x", "k", "body") == claim
+    for number in range(100):
+        unfinished = store.idempotency_keys.begin("a", "POST /x", f"k{number}", "body")
+        assert isinstance(unfinished, Claimed)
+        store.idempotency_keys.abandon("a", "POST /x", f"k{number}", unfinished.token)
+    with store._database.reading() as connection:
+        assert (connection.scalar(select(func.count()).select_from(IDEMPOTENCY)) or 0) < 30
+    _recounted(store, "a")
+
+
+def test_purge_deletes_all_of_one_tenant(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    for tenant in ("a", "b"):
+        _add(store, tenant, f"p{tenant}", grid=ComputedGrid(model_sha256="m1", grid=_grid()))
+        store.venues.add(tenant, f"v{tenant}", "venue", None, [VenueMember(f"p{tenant}")], limit=9)
+        store.answers.add(tenant, f"p{tenant}", lambda answer_id: answer_id, limit=2)
+        _keep_answer(store, tenant, "k", 100)
+    kept = store.quota.account("b")
+    assert main(["tenants", "purge", "a", "--yes"]) == 0
+    assert "deleted 1 floor plans of tenant 'a'" in capsys.readouterr().out
+    assert store.quota.account("a").used.total == 0
+    assert store.quota.account("b") == kept
+    assert main(["tenants", "purge", "b", "--yes"]) == 0
+    with store._database.reading() as connection:
+        left = {
+            table.name: connection.scalar(select(func.count()).select_from(table)) for table in METADATA.sorted_tables
+        }
+    assert {name for name, count in left.items() if count} == {TENANTS.name}
+
+
+def test_purge_needs_a_confirmation() -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(["tenants", "purge", "a"])
+    assert exit_info.value.code == 2
+
+
+# The service
+
+
+def _usage(client: httpx.Client) -> dict[str, Any]:
+    return client.get("/usage").json()["stored_bytes"]
+
+
+def test_full_tenant_is_refused_and_can_delete(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    padded = json.dumps(FLAT).encode() + b" " * MIB
+    headers = {"content-type": "application/json"}
+    with start_app(tmp_path, max_stored_bytes=4 * MIB, keep_answers_s=60.0) as client:
+        plans = []
+        while (answer := client.post("/floorplans", content=padded, headers=headers)).status_code == 201:
+            plans.append(answer.json()["id"])
+        assert 2 <= len(plans) <= 3
+        problem = assert_problem(answer, 507, "storage-quota")
+        used = _usage(client)
+        assert used["limit"] == 4 * MIB
+        assert f"{used['used']} bytes are stored" in problem["detail"]
+        assert "LALALOC_MAX_STORED_BYTES" in problem["detail"]
+        assert sum(used["by_kind"].values()) == used["used"]
+        put = client.put(f"/floorplans/{plans[0]}", content=padded, headers=headers)
+        assert_problem(put, 507, "storage-quota")
+        assert localise(client, plans[0], panorama).status_code == 200
+        for plan_id in plans:
+            assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+        left = _usage(client)
+        assert left["used"] == left["by_kind"]["idempotency"] == 0
+        upload(client)
+
+
+@pytest.mark.one_replica
+def test_stored_bytes_are_metrics(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, sweep_s=0.1) as client:
+        upload(client)
+        expected = f'lalaloc_stored_bytes{{kind="plans",tenant="default"}} {float(_usage(client)["by_kind"]["plans"])}'
+        wait_for(lambda: expected in client.get("/metrics").text)
+        assert re.search(r'lalaloc_stored_bytes_limit\{tenant="default"\} \d', client.get("/metrics").text)
