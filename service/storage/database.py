@@ -149,16 +149,16 @@ class Database:
         Raises:
             StoreUnavailableError, StoreBusyError: see `reading`.
         """
-        disk = self._disk
-        if disk is None:
+        if (disk := self._disk) is None:
             return
-        while True:
-            with self.reading() as connection:
-                if not disk.has_surplus(connection):
-                    break
-            self.freeing(disk.return_pages)
-        with closing(self._engine.raw_connection()) as raw:
-            disk.copy_log(raw.cursor())
+        with self._driver_cursor() as cursor:
+            while disk.has_surplus(cursor):
+                try:
+                    disk.return_pages(cursor)
+                except sqlite3.OperationalError:
+                    if not disk.release():
+                        raise
+            disk.copy_log(cursor)
         disk.restore()
 
     def compact(self) -> None:
@@ -170,12 +170,8 @@ class Database:
         """
         if self.is_postgresql:
             return
-        with closing(self._engine.raw_connection()) as raw:
-            cursor = raw.cursor()
-            try:
-                cursor.execute("VACUUM")
-            except sqlite3.OperationalError as error:
-                raise _unavailable(error) from error
+        with self._driver_cursor() as cursor:
+            cursor.execute("VACUUM")
 
     def now_s(self) -> ColumnElement[float]:
         """Return the seconds since 1970 by the clock that all replicas share: PostgreSQL's, or this machine's."""
@@ -200,6 +196,16 @@ class Database:
     def insert(self, table: Any) -> Any:
         """Return an INSERT with `ON CONFLICT`, which both databases write alike."""
         return postgresql.insert(table) if self.is_postgresql else sqlite.insert(table)
+
+    @contextmanager
+    def _driver_cursor(self) -> Iterator[Any]:
+        """Yield a cursor of the SQLite driver, for statements outside of transactions."""
+        self._check_file()
+        with closing(self._engine.raw_connection()) as raw:
+            try:
+                yield raw.cursor()
+            except sqlite3.OperationalError as error:
+                raise _unavailable(error) from error
 
     def _note_file(self, _connection: Any, _record: Any) -> None:
         self._file = self._file or _identity(self._path)

@@ -66,8 +66,9 @@ class DiskReserve:
         Raises:
             StoreFullError: it has not, even after the reserve is restored.
         """
+        free_pages = connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
         page_bytes = connection.exec_driver_sql("PRAGMA page_size").scalar_one()
-        needed = max(growth - _size(self._log), 0) + max(growth - _free_pages(connection) * page_bytes, 0)
+        needed = max(growth - _size(self._log), 0) + max(growth - free_pages * page_bytes, 0)
         if not self.restore() or self._free_bytes() < needed:
             raise StoreFullError()
 
@@ -94,27 +95,23 @@ class DiskReserve:
             return False
         return True
 
-    def has_surplus(self, connection: Connection) -> bool:
+    def has_surplus(self, cursor: Any) -> bool:
         """Tell whether the database has free pages to return; files of earlier versions keep theirs."""
-        mode = connection.exec_driver_sql("PRAGMA auto_vacuum").scalar_one()
-        return mode == _INCREMENTAL and _free_pages(connection) > _KEPT_PAGES
+        mode, free = (cursor.execute(f"PRAGMA {name}").fetchone()[0] for name in ("auto_vacuum", "freelist_count"))
+        return mode == _INCREMENTAL and free > _KEPT_PAGES
 
-    def return_pages(self, connection: Connection) -> None:
+    def return_pages(self, cursor: Any) -> None:
         """Return some free pages; the file shrinks when the log is next copied to it."""
-        # Each row of the answer is a page.
-        connection.exec_driver_sql(f"PRAGMA incremental_vacuum({_STEP_PAGES})").all()
+        # As a script, because `execute` would end after the first page.
+        cursor.executescript(f"PRAGMA incremental_vacuum({_STEP_PAGES})")
 
     def copy_log(self, cursor: Any) -> None:
-        """Copy a long log to the database, as far as readers and writers allow without waiting for them."""
-        if _size(self._log) > LOG_BYTES:
+        """Copy the log to the database, as far as readers and writers allow without waiting for them."""
+        if _size(self._log) > 0:
             cursor.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
     def _free_bytes(self) -> int:
         return shutil.disk_usage(self._folder).free
-
-
-def _free_pages(connection: Connection) -> int:
-    return connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
 
 
 def _size(file: Path) -> int:

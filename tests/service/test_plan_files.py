@@ -296,7 +296,7 @@ class TestHostileFiles:
 
         response = strict.post("/floorplans", content=endless(), headers={"content-type": "image/vnd.dxf"})
         problem = assert_problem(response, 413, "upload-too-large")
-        assert "the limit is 3000000 bytes (max_plan_bytes)" in problem["detail"]
+        assert "the limit is 3000000 bytes (LALALOC_MAX_PLAN_BYTES)" in problem["detail"]
         assert store_plan(strict, plan_file("svg"))["rooms"]
 
 

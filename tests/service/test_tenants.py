@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +122,8 @@ def test_stored_bytes_follow_every_change(store: Store) -> None:
     assert MIB < plans < 1.01 * MIB
     _add(store, "a", "q" * 32, 2 * MIB, grid=ComputedGrid(model_sha256="m1", grid=_grid()))
     key = GridKey(revision_id=revision_id, model_sha256="m1", step_m=0.5, camera_height_mm=1500)
-    for camera_height_mm in (1500, 1500, 1600, 1620, 1640):
-        height_key = GridKey(**(vars(key) | {"camera_height_mm": camera_height_mm}))
+    for height_mm in (1500, 1500, 1600, 1620, 1640):
+        height_key = replace(key, camera_height_mm=height_mm)
         assert store.grids.put(height_key, _grid(count=1000), keep=2, always_keep_mm=1500)
     _recounted(store, "a")
     for _ in range(4):

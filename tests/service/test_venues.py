@@ -206,7 +206,8 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_venues=1, max_venue_plans=2, max_venue_bytes=500) as client:
         plans = [upload(client) for _ in range(3)]
         full = [member(plan) for plan in plans]
-        assert "max_venue_plans" in client.post("/venues", json={"plans": full}).json()["detail"].lower()
+        detail = client.post("/venues", json={"plans": full}).json()["detail"]
+        assert "has 3 floor plans; the limit is 2 (LALALOC_MAX_VENUE_PLANS)" in detail
         venue = make(client, *full[:2])
         grown = client.patch(f"/venues/{venue['id']}", json={"plans": full[2:]})
         assert "would have 3 plans; the limit is 2" in assert_problem(grown, 422, "invalid-request")["detail"]
@@ -214,7 +215,7 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
         assert moved.json()["plans"] == 2
         assert "LALALOC_MAX_VENUES" in assert_problem(client.post("/venues", json={}), 507, "too-many-venues")["detail"]
         long = client.put(f"/venues/{venue['id']}", json={"name": "x" * 600})
-        assert "(max_venue_bytes)" in assert_problem(long, 413, "upload-too-large")["detail"]
+        assert "(LALALOC_MAX_VENUE_BYTES)" in assert_problem(long, 413, "upload-too-large")["detail"]
 
 
 def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
