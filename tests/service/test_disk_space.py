@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import shutil
 import sqlite3
 from pathlib import Path
@@ -19,6 +20,7 @@ from service.errors import StoreFullError
 from service.storage import database, disk_reserve
 from service.storage.records import Original
 from service.storage.store import Store
+from service.telemetry import LOGGER_NAME
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -178,15 +180,20 @@ def test_lost_file_beside_its_log_prevents_the_start(tmp_path: Path, empty: bool
     assert (tmp_path / "copy-wal").stat().st_size > 0
 
 
-def test_start_without_plans_is_a_warning(
-    start_app: StartApp, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with start_app(tmp_path, log_level="warning") as client:
-        upload(client)
-    assert caplog.messages.count("the database has no floor plans") == 1
-    with start_app(tmp_path, log_level="warning"):
-        pass
-    assert caplog.messages.count("the database has no floor plans") == 1
+def test_start_without_plans_is_a_warning(start_app: StartApp, tmp_path: Path) -> None:
+    warnings: list[str] = []
+    handler, logger = logging.Handler(logging.WARNING), logging.getLogger(LOGGER_NAME)
+    handler.emit = lambda record: warnings.append(record.getMessage())
+    logger.addHandler(handler)
+    try:
+        with start_app(tmp_path, log_level="warning") as client:
+            upload(client)
+        assert warnings == ["the database has no floor plans"]
+        with start_app(tmp_path, log_level="warning"):
+            pass
+        assert len(warnings) == 1
+    finally:
+        logger.removeHandler(handler)
 
 
 def test_full_database_refuses_uploads_and_allows_deletions(
