@@ -25,7 +25,9 @@ def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
     train.add_argument(
-        "stage", choices=("layout", "image", "end-to-end"), help="stage to train; end-to-end trains both at once"
+        "stage",
+        choices=("layout", "image", "view", "end-to-end"),
+        help="stage to train: the encoder of layouts, of spheres, of views (preset trunk), or the first two at once",
     )
     train.add_argument(
         "--preset",
@@ -111,7 +113,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
+    from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout, train_views
 
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -121,10 +123,13 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--render is for generated homes, not for --data")
     if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
         raise InvalidInputError("--from starts a new run of one stage; it excludes --resume and end-to-end")
-    image_only = {"--layout-from": "layout_from", "--photographs": "photographs", "--teacher": "teacher"}
-    for option, name in image_only.items():
-        if arguments.stage != "image" and getattr(arguments, name) is not None:
-            raise InvalidInputError(f"{option} is for the stage 'image', not for '{arguments.stage}'")
+    for option, name, stages in (
+        ("--layout-from", "layout_from", ("image",)),
+        ("--photographs", "photographs", ("image", "view")),
+        ("--teacher", "teacher", ("image", "view")),
+    ):
+        if arguments.stage not in stages and getattr(arguments, name) is not None:
+            raise InvalidInputError(f"{option} is for the stage {' or '.join(stages)}, not for '{arguments.stage}'")
     config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
     # End-to-end training takes its schedule from the image stage.
     part = "layout" if arguments.stage == "layout" else "image"
@@ -155,9 +160,12 @@ def _train(arguments: argparse.Namespace) -> None:
         photographs=arguments.photographs,
         segmenter=arguments.teacher,
     )
-    train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
-        arguments.stage
-    ]
+    train: Callable[..., Any] = {
+        "layout": train_layout,
+        "image": train_image,
+        "view": train_views,
+        "end-to-end": train_end_to_end,
+    }[arguments.stage]
     optional = {name: getattr(arguments, name) for name in ("init_from", "layout_from")}
     given = {name: value for name, value in optional.items() if value is not None}
     train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **given)

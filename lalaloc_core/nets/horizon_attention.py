@@ -8,22 +8,24 @@ from torch import Tensor, nn
 
 
 class HorizonAttention(nn.Module):
-    """Attention over the sectors with a learnt bias by circular offset, and a feed-forward layer.
+    """Attention over the sectors with a learnt bias by offset, and a feed-forward layer.
 
-    The bias depends on offsets, not on positions, so rolling the panorama rolls the ring.
+    The bias depends on offsets, not on positions, so rolling the panorama rolls the ring. The offsets of a full circle
+    are circular; those of a part of it are not.
     """
 
-    def __init__(self, width: int, heads: int, sectors: int) -> None:
+    def __init__(self, width: int, heads: int, sectors: int, *, circular: bool = True) -> None:
         super().__init__()
         self.heads = heads
         self.norm1 = nn.LayerNorm(width)
         self.qkv = nn.Linear(width, 3 * width)
-        self.bias = nn.Parameter(torch.zeros(heads, sectors))
+        self.bias = nn.Parameter(torch.zeros(heads, sectors if circular else 2 * sectors - 1))
         self.out = nn.Linear(width, width)
         self.norm2 = nn.LayerNorm(width)
         self.feed = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
         sector = torch.arange(sectors)
-        self.register_buffer("offset", (sector[None, :] - sector[:, None]) % sectors, persistent=False)
+        offset = sector[None, :] - sector[:, None]
+        self.register_buffer("offset", offset % sectors if circular else offset + sectors - 1, persistent=False)
         self.offset: Tensor
 
     def forward(self, x: Float[Tensor, "b s c"]) -> Float[Tensor, "b s c"]:

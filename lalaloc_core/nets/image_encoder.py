@@ -60,32 +60,52 @@ class TrunkEncoderConfig:
             raise ConfigError(f"trunk.squeezed has {len(self.squeezed)} values; it must have {len(TAP_STRIDES)}")
 
 
-class TrunkImageEncoder(nn.Module):
-    """Image encoder: panorama and camera height to ring, wall profile, openings, ceiling height and room type."""
+class HorizonEncoder(nn.Module):
+    """Base of the image encoders on a pretrained trunk: pixels to features of the sectors around the horizon.
 
-    def __init__(self, config: TrunkEncoderConfig, ring: RingConfig) -> None:
+    Args:
+        config: sizes.
+        sectors: sectors that the picture covers.
+        columns_per_sector: azimuth columns of a sector.
+        profile_outputs: values that are predicted of the wall at each azimuth column.
+        extra_inputs: further features of each sector, given to `sector_features`.
+        circular: the picture shows the full circle.
+    """
+
+    def __init__(
+        self,
+        config: TrunkEncoderConfig,
+        sectors: int,
+        columns_per_sector: int,
+        *,
+        profile_outputs: int,
+        extra_inputs: int = 0,
+        circular: bool,
+    ) -> None:
         super().__init__()
         self.config = config
-        self.trunk = Trunk(config.trunk)
-        self.columns_per_sector = ring.profile_columns // ring.sectors
+        self.trunk = Trunk(config.trunk, circular=circular)
+        self.columns_per_sector = columns_per_sector
         width = config.mixer_width
         maps = list(zip(TAP_STRIDES, config.trunk.tap_channels, config.squeezed, strict=True))
         self.squeezes = nn.ModuleList(
             nn.Linear(channels * (config.image_height // stride), squeezed) for stride, channels, squeezed in maps
         )
         for number, stride in enumerate(TAP_STRIDES):
-            weights = _interpolation(config.image_width, stride, ring.sectors)
+            weights = _interpolation(config.image_width, stride, sectors, circular)
             self.register_buffer(f"interpolation{number}", weights, persistent=False)
-        self.join = nn.Linear(sum(config.squeezed), width)
+        self.join = nn.Linear(sum(config.squeezed) + extra_inputs, width)
         self.mixer = nn.Sequential(
-            *(HorizonAttention(width, config.mixer_heads, ring.sectors) for _ in range(config.mixer_blocks))
+            *(
+                HorizonAttention(width, config.mixer_heads, sectors, circular=circular)
+                for _ in range(config.mixer_blocks)
+            )
         )
         self.norm = nn.LayerNorm(width)
-        self.to_profile = nn.Linear(width, 2 * self.columns_per_sector)
-        self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * self.columns_per_sector)
+        self.to_profile = nn.Linear(width, profile_outputs * columns_per_sector)
+        self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * columns_per_sector)
         self.to_ceiling = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, 2))
         self.to_room_type = nn.Sequential(nn.Linear(2 * width, width), nn.GELU(), nn.Linear(width, len(ROOM_TYPES)))
-        self.to_ring = nn.Sequential(nn.Linear(width + 1, width), nn.GELU(), nn.Linear(width, ring.channels))
         # Class shares of the training data: the prior by which predicted probabilities are divided.
         for name, classes in (("opening", OPENING_CLASSES), ("room_type", ROOM_TYPES)):
             self.register_buffer(f"{name}_share", torch.full((len(classes),), 1.0 / len(classes)))
@@ -98,32 +118,6 @@ class TrunkImageEncoder(nn.Module):
         self.mean: Tensor
         self.std: Tensor
 
-    def forward(
-        self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
-    ) -> ImageFeatures:
-        """Encode panoramas.
-
-        Pixels are 0 to 255 of any type, (b, h, w, 3); `styles` is for training only.
-        """
-        mixed = self._mixed(image, styles)
-        log_height = torch.log(camera_height_m)
-        height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
-        profile = self.to_profile(mixed).unflatten(2, (self.columns_per_sector, 2)).flatten(1, 2)
-        openings = self.to_openings(mixed).unflatten(2, (self.columns_per_sector, len(OPENING_CLASSES))).flatten(1, 2)
-        ceiling = self.to_ceiling(mixed).mean(dim=1)
-        overall = torch.cat([mixed.mean(dim=1), mixed.amax(dim=1)], dim=1)
-        return ImageFeatures(
-            ring=self.to_ring(torch.cat([mixed, height_input], dim=2)).transpose(1, 2),
-            log_profile=profile[..., 0] + log_height[:, None],
-            log_scale=profile[..., 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
-            structure=StructureFeatures(
-                opening_logits=openings,
-                log_ceiling=ceiling[:, 0] + log_height,
-                log_ceiling_scale=ceiling[:, 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
-                room_type_logits=self.to_room_type(overall),
-            ),
-        )
-
     @torch.no_grad()
     def update_class_shares(self, opening_kind: Int[Tensor, "b w"], room_type: Int[Tensor, "b"]) -> None:
         """Update the class shares with the labels of a batch; codes below 0 are unknown."""
@@ -134,28 +128,92 @@ class TrunkImageEncoder(nn.Module):
             if len(known):
                 share.lerp_(torch.bincount(known.long(), minlength=len(share)).to(share) / len(known), rate)
 
-    def _mixed(self, image: Tensor, styles: StyleMixing | None) -> Float[Tensor, "b s c"]:
-        """Return the sectors' features, which do not depend on the camera height."""
-        pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+    def sector_features(
+        self,
+        pixels: Float[Tensor, "b 3 h w"],
+        styles: StyleMixing | None = None,
+        extra: Float[Tensor, "b s e"] | None = None,
+    ) -> Float[Tensor, "b s c"]:
+        """Return the sectors' features of normalised pixels; they do not depend on the camera height."""
         squeezed = []
         for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels, styles), self.squeezes, strict=True)):
             columns = squeeze(tap.flatten(1, 2).transpose(1, 2)).to(self.mean.dtype)
             squeezed.append(self.get_buffer(f"interpolation{number}") @ columns)
+        if extra is not None:
+            squeezed.append(extra)
         return self.norm(self.mixer(self.join(torch.cat(squeezed, dim=2))))
 
+    def profile_values(self, mixed: Float[Tensor, "b s c"]) -> Float[Tensor, "b w p"]:
+        """Return the predicted values of the wall at each azimuth column."""
+        values = self.to_profile(mixed)
+        return values.unflatten(2, (self.columns_per_sector, -1)).flatten(1, 2)
 
-def _interpolation(width: int, stride: int, sectors: int) -> Float[Tensor, "s v"]:
-    """Return weights of linear interpolation from a map's columns to the sectors' centres, around the horizon.
+    def structure(self, mixed: Float[Tensor, "b s c"], log_height: Float[Tensor, "b"]) -> StructureFeatures:
+        """Return openings, ceiling height and room type; `log_height` is the log of the camera height (m)."""
+        openings = self.to_openings(mixed).unflatten(2, (self.columns_per_sector, len(OPENING_CLASSES))).flatten(1, 2)
+        ceiling = self.to_ceiling(mixed).mean(dim=1)
+        overall = torch.cat([mixed.mean(dim=1), mixed.amax(dim=1)], dim=1)
+        return StructureFeatures(
+            opening_logits=openings,
+            log_ceiling=ceiling[:, 0] + log_height,
+            log_ceiling_scale=clamped_scale(ceiling[:, 1]),
+            room_type_logits=self.to_room_type(overall),
+        )
+
+    def normalised(self, image: Tensor) -> Float[Tensor, "b 3 h w"]:
+        """Return (b, h, w, 3) pixels of 0 to 255 as the trunk's input."""
+        return (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+
+
+class TrunkImageEncoder(HorizonEncoder):
+    """Image encoder: panorama and camera height to ring, wall profile, openings, ceiling height and room type."""
+
+    def __init__(self, config: TrunkEncoderConfig, ring: RingConfig) -> None:
+        super().__init__(config, ring.sectors, ring.profile_columns // ring.sectors, profile_outputs=2, circular=True)
+        width = config.mixer_width
+        self.to_ring = nn.Sequential(nn.Linear(width + 1, width), nn.GELU(), nn.Linear(width, ring.channels))
+
+    def forward(
+        self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
+    ) -> ImageFeatures:
+        """Encode panoramas.
+
+        Pixels are 0 to 255 of any type, (b, h, w, 3); `styles` is for training only.
+        """
+        mixed = self.sector_features(self.normalised(image), styles)
+        log_height = torch.log(camera_height_m)
+        height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
+        profile = self.profile_values(mixed)
+        return ImageFeatures(
+            ring=self.to_ring(torch.cat([mixed, height_input], dim=2)).transpose(1, 2),
+            log_profile=profile[..., 0] + log_height[:, None],
+            log_scale=clamped_scale(profile[..., 1]),
+            structure=self.structure(mixed, log_height),
+        )
+
+
+def clamped_scale(log_scale: Tensor) -> Tensor:
+    """Limit the log of a predicted scale."""
+    return log_scale.clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE)
+
+
+def _interpolation(width: int, stride: int, sectors: int, circular: bool) -> Float[Tensor, "s v"]:
+    """Return weights of linear interpolation from a map's columns to the sectors' centres.
 
     Column i of a map is centred on pixel `stride (i + 1) - 1`: "same" padding of an even picture is uneven, so each
-    halving shifts by half a pixel to the right.
+    halving shifts by half a pixel to the right. Beyond the borders of a part of the circle, its outermost column is
+    used.
     """
     columns = width // stride
     weights = torch.zeros(sectors, columns)
+
+    def place(column: int) -> int:
+        return column % columns if circular else min(max(column, 0), columns - 1)
+
     for sector in range(sectors):
         pixel = (sector + 0.5) * width / sectors - 0.5
         column = (pixel + 1.0) / stride - 1.0
         left = math.floor(column)
-        weights[sector, left % columns] += 1.0 - (column - left)
-        weights[sector, (left + 1) % columns] += column - left
+        weights[sector, place(left)] += 1.0 - (column - left)
+        weights[sector, place(left + 1)] += column - left
     return weights

@@ -113,11 +113,13 @@ def _around(conv: nn.Conv2d) -> tuple[int, int]:
     return total // 2, total - total // 2
 
 
-def _pad_around(x: Tensor, conv: nn.Conv2d) -> Tensor:
-    """Pad a map in azimuth for a convolution."""
+def _pad_azimuth(x: Tensor, conv: nn.Conv2d, circular: bool) -> Tensor:
+    """Pad a map in azimuth for a convolution, with zeros if the map is only a part of the circle."""
     before, after = _around(conv)
     if not before + after:
         return x
+    if not circular:
+        return functional.pad(x, (before, after))
     return _PadAround.apply(x, before, after) if x.requires_grad else _padded_around(x, before, after)
 
 
@@ -138,8 +140,9 @@ def _conv(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int =
 class _Block(nn.Module):
     """Inverted bottleneck: expand, depthwise, project."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int, *, circular: bool) -> None:
         super().__init__()
+        self._circular = circular
         width = inputs * expansion
         self.expands = expansion != 1
         if self.expands:
@@ -153,7 +156,7 @@ class _Block(nn.Module):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
         # Padding before the point-wise expansion is cheaper: the map has a sixth of the channels.
-        inner = _pad_around(x, self._depthwise_conv)
+        inner = _pad_azimuth(x, self._depthwise_conv, self._circular)
         if self.expands:
             inner = functional.relu6(_convolve(inner, self._expand_conv, self._bn0))
         inner = functional.relu6(_convolve(inner, self._depthwise_conv, self._bn1))
@@ -182,11 +185,17 @@ class StyleMixing:
 
 
 class Trunk(nn.Module):
-    """Trunk: normalised pictures to the last feature maps of strides 4, 8, 16 and 32."""
+    """Trunk: normalised pictures to the last feature maps of strides 4, 8, 16 and 32.
 
-    def __init__(self, config: TrunkConfig) -> None:
+    Args:
+        config: sizes.
+        circular: the pictures show the full circle, so that their left and right borders meet.
+    """
+
+    def __init__(self, config: TrunkConfig, *, circular: bool = True) -> None:
         super().__init__()
         self.config = config
+        self._circular = circular
         self._conv_stem = _conv(3, config.stem, 3, 2)
         self._bn0 = _FrozenNorm(config.stem)
         blocks, inputs, self._ends = [], config.stem, []
@@ -194,7 +203,8 @@ class Trunk(nn.Module):
             config.widths, config.repeats, _KERNELS, _STRIDES, _EXPANSIONS, strict=True
         ):
             for number in range(count):
-                blocks.append(_Block(inputs, outputs, kernel, stride if number == 0 else 1, expansion))
+                first_stride = stride if number == 0 else 1
+                blocks.append(_Block(inputs, outputs, kernel, first_stride, expansion, circular=circular))
                 inputs = outputs
             self._ends.append(len(blocks))
         self._blocks = nn.ModuleList(blocks)
@@ -213,7 +223,9 @@ class Trunk(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 3 h w"], styles: StyleMixing | None = None) -> list[Tensor]:
         """Return maps (b, c, h / stride, w / stride) for the strides of `TAP_STRIDES`."""
-        x = functional.relu6(_convolve(_pad_around(image, self._conv_stem), self._conv_stem, self._bn0))
+        x = functional.relu6(
+            _convolve(_pad_azimuth(image, self._conv_stem, self._circular), self._conv_stem, self._bn0)
+        )
         taps, tapped = [], {self._ends[stage] for stage in _TAPPED}
         styled = {self._ends[stage] for stage in _STYLED} if styles is not None else set()
         for number, block in enumerate(self._blocks, start=1):

@@ -78,13 +78,14 @@ class PanoramaBatches(Stream):
     error, and `ceiling_height_m` (b). Batches with neighbours hold `neighbour_profile_m` (b, n, columns) and
     `neighbour_ceiling_height_m` (b, n), rotated and mirrored like their panorama. With architecture `trunk` there are
     `opening_kind` (b, columns) and `room_type` (b): codes of `conventions`, or `UNKNOWN`. Sources with deferred
-    rendering yield `DeferredBatch` instead.
+    rendering yield `DeferredBatch` instead. Views, a part of the horizon, are mirrored only.
     """
 
     config: TrainConfig
     source: Source
     neighbours: bool = False
     first: int = 0
+    views: bool = False
 
     def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
         stage, (_, workers) = self.config.image, worker_share()
@@ -119,9 +120,13 @@ class PanoramaBatches(Stream):
         """Draw the samples of a visit, their rotations and the rest of their rows; a row without neighbours is None."""
         rng = self.source.rng(visit)
         drawn = []
-        for new in self.source.samples(visit, *self.config.image_size):
+        sizes = self.config.view if self.views else self.config.image_sizes
+        for new in self.source.samples(visit, sizes.image_height, sizes.image_width):
             for sample in replay.add_and_sample(new, rng):
-                turn = sample_rotation(self.config.turns, sample.heading, self.config.image_size[1], rng)
+                if self.views:
+                    turn = Rotation(shift=0, heading=sample.heading, mirrored=bool(rng.random() < 0.5))
+                else:
+                    turn = sample_rotation(self.config.turns, sample.heading, sizes.image_width, rng)
                 drawn.append((sample, turn, self._row(sample, turn, rng)))
         return drawn
 

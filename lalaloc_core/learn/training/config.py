@@ -12,6 +12,7 @@ from lalaloc_core.nets.decoder import DECODED_WIDTH
 from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.paper_encoders import PaperConfig
+from lalaloc_core.nets.view_encoder import ViewEncoderConfig
 from lalaloc_core.render.sampling import TripletSampling
 
 Architecture = Literal["ring", "trunk", "paper"]
@@ -163,6 +164,7 @@ class TrainConfig:
         turns: headings of training layouts and panoramas: "any" and "quarters" (multiples of 90°) with random
             mirroring, or "none", heading 0 only, which suffices for queries with known heading.
         ring, trunk, paper: sizes of the networks; an architecture ignores the sizes of others.
+        view: sizes of the encoder of views, which architecture `trunk` can have besides.
     """
 
     name: str
@@ -172,6 +174,7 @@ class TrainConfig:
     ring: RingConfig = field(default_factory=RingConfig)
     trunk: TrunkEncoderConfig = field(default_factory=TrunkEncoderConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
+    view: ViewEncoderConfig = field(default_factory=ViewEncoderConfig)
     layout: LayoutStageConfig = field(default_factory=LayoutStageConfig)
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
 

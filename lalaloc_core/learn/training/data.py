@@ -54,8 +54,10 @@ class TrainingData:
             return GeneratedSource(config, self.textures, self.deferred)
         return SceneSource(config, self.dataset, self.skip_bad)
 
-    def load_photographs(self, config: TrainConfig) -> Photographs | None:
+    def load_photographs(self, config: TrainConfig, size: tuple[int, int] | None = None) -> Photographs | None:
         """Load the photographs with the segmenter's predictions; None if there are no photographs.
+
+        `size` is their (height, width) in pixels (default: the image encoder's).
 
         Raises:
             ConfigError: photographs without a segmenter or the reverse, an architecture without openings, or a
@@ -70,7 +72,7 @@ class TrainingData:
             raise ConfigError(
                 f"architecture '{config.architecture}' predicts no openings; --photographs needs architecture 'trunk'"
             )
-        return load_photographs(self.photographs, self.segmenter, *config.image_size)
+        return load_photographs(self.photographs, self.segmenter, *(size or config.image_size))
 
     def validation(self, config: TrainConfig) -> list[Scene]:
         """Load the validation scenes; empty if the data set has none.

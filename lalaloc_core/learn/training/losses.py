@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -66,6 +66,24 @@ def laplace(
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
+def laplace_mixture(
+    log_profile: Float[Tensor, "b w m"],
+    log_scale: Float[Tensor, "b w m"],
+    log_share: Float[Tensor, "b w m"],
+    target: Float[Tensor, "b w"],
+    known: Bool[Tensor, "b w"],
+) -> Tensor:
+    """Return the negative log likelihood of true log distances under mixtures of Laplace distributions, where known."""
+    error = (log_profile - target[..., None]).abs()
+    loss = -torch.logsumexp(log_share - error * torch.exp(-log_scale) - log_scale, dim=2)
+    return (loss * known).sum() / known.sum().clamp_min(1)
+
+
+def is_passage(opening_logits: Float[Tensor, "b w c"]) -> Bool[Tensor, "b w"]:
+    """Return the azimuths where a network predicts a passage."""
+    return torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")] >= 0.5
+
+
 def teacher_walls(
     log_profile: Float[Tensor, "b w"],
     log_scale: Float[Tensor, "b w"],
@@ -77,8 +95,7 @@ def teacher_walls(
     Azimuths where the student predicts a passage are left out: the teacher sees the wall of the next room, but a room
     ends in the plane of its own wall.
     """
-    passage = torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")]
-    known = torch.isfinite(log_distance) & (passage < 0.5)
+    known = torch.isfinite(log_distance) & ~is_passage(opening_logits)
     error = (log_profile - log_distance.nan_to_num()).abs()
     loss = error * torch.exp(-log_scale) + log_scale
     return (loss * known).sum() / known.sum().clamp_min(1)

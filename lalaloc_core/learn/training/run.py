@@ -16,8 +16,11 @@ from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.layout_stage import LayoutStage
 from lalaloc_core.learn.training.loop import run_stage
+from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage
 from lalaloc_core.learn.training.validate import LayoutValidation
+from lalaloc_core.learn.training.view_stage import PHOTOGRAPH_SIZE, ViewStage, view_window
+from lalaloc_core.learn.training.view_validation import ViewValidation
 from lalaloc_core.learn.training.warm_start import (
     check_same_networks,
     find_checkpoint,
@@ -101,6 +104,40 @@ def train_image(
     begun_from = None if init_from is None else _warm_start(stage, init_from)
     scenes = data.validation(config)
     validate = data.image_validation(config, scenes, layout_encoder, device, folder) if scenes else None
+    return run_stage(
+        stage, folder, device=device, workers=workers, resume=resume, validate=validate, begun_from=begun_from
+    )
+
+
+def train_views(
+    config: TrainConfig,
+    folder: Path,
+    *,
+    device: torch.device,
+    data: TrainingData = ONLINE,
+    workers: int = 1,
+    resume: bool = False,
+    init_from: Path | None = None,
+) -> Checkpoint:
+    """Train the encoder of views in `folder`.
+
+    `init_from` is a bundle or run folder whose image encoder provides the first weights; it excludes `resume`.
+
+    Raises:
+        CheckpointError: initial weights or the checkpoint are missing, or have other networks.
+        DatasetError: a photograph cannot be read.
+    """
+    torch.manual_seed(config.seed + 2)
+    source = GeneratedSource(config, data.textures, data.deferred, view_window(config))
+    stage = ViewStage(config, source, data.load_photographs(config, PHOTOGRAPH_SIZE))
+    begun_from = None
+    if init_from is not None:
+        start = load_warm_start(init_from, "image", config)
+        sphere = TrunkImageEncoder(config.trunk, config.ring)
+        start.load_into({"image_encoder": sphere})
+        stage.encoder.start_from(sphere)
+        begun_from = start.origin
+    validate = ViewValidation(config, data.validation_scenes, data.textures, device)
     return run_stage(
         stage, folder, device=device, workers=workers, resume=resume, validate=validate, begun_from=begun_from
     )

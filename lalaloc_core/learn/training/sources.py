@@ -22,7 +22,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, sample_shots
@@ -121,12 +121,13 @@ class GeneratedSource:
     """Source of generated homes: a new one for every visit, with anchors and cameras anywhere on the floor.
 
     With `textures` None all materials are procedural. `deferred` panoramas are scenes, to be rendered by `renderer` in
-    another process.
+    another process. `window` is the part of the sphere that samples show, None for all of it.
     """
 
     config: TrainConfig
     textures: Path | None = None
     deferred: bool = False
+    window: Window | None = None
     _renderers: RendererCache | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
 
@@ -186,7 +187,8 @@ class GeneratedSource:
             first = visit * stage.shots_per_home
             images = [DeferredScene(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
         else:
-            images = list(self._renderers.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
+            renderer = self._renderers.renderer(height, width, stage.supersample, self.window)
+            images = list(renderer.render_scenes(scenes).numpy())
         return [
             PanoramaSample(
                 plan=home.plan,
@@ -199,9 +201,9 @@ class GeneratedSource:
             for shot, image in zip(shots, images, strict=True)
         ]
 
-    def renderer(self, device: torch.device) -> PanoramaRenderer:
+    def renderer(self, device: torch.device, height: int, width: int) -> PanoramaRenderer:
         """Create the renderer of deferred panoramas; its pixels are those of `samples`."""
-        return self._renderers_on(device).renderer(*self.config.image_size, self.config.image.supersample)
+        return self._renderers_on(device).renderer(height, width, self.config.image.supersample, self.window)
 
     def _renderers_on(self, device: torch.device | str) -> RendererCache:
         return RendererCache(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)

@@ -78,16 +78,26 @@ def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
 
 
 def panorama_batches(
-    config: TrainConfig, source: Source, *, neighbours: bool, first_step: int, workers: int, device: torch.device
+    config: TrainConfig,
+    source: Source,
+    *,
+    first_step: int,
+    workers: int,
+    device: torch.device,
+    neighbours: bool = False,
+    views: bool = False,
 ) -> Iterator[Batch]:
     """Yield panorama batches from a step on, with homes or parts of the epoch that earlier steps have not used.
 
-    Rows hold the layouts of neighbouring poses if `neighbours` is set; `device` renders deferred panoramas.
+    Rows hold the layouts of neighbouring poses if `neighbours` is set; `views` are parts of the horizon; `device`
+    renders deferred panoramas.
     """
     first_visit = first_step * (config.image.batch // config.image.shots_per_home + 1)
-    batches = load_batches(PanoramaBatches(config, source, neighbours, first_visit), workers)
+    batches = load_batches(PanoramaBatches(config, source, neighbours, first_visit, views), workers)
     if isinstance(source, GeneratedSource) and source.deferred:
-        return DeferredRenderer(source.renderer(device)).render_batches(batches)
+        sizes = config.view if views else config.image_sizes
+        renderer = source.renderer(device, sizes.image_height, sizes.image_width)
+        return DeferredRenderer(renderer).render_batches(batches)
     return batches
 
 

@@ -17,7 +17,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
@@ -116,14 +116,16 @@ class RendererCache:
     def __init__(self, materials: MaterialLibrary, device: torch.device | str = "cpu") -> None:
         self.materials = materials
         self._device = device
-        self._renderers: dict[tuple[int, int, tuple[int, int]], PanoramaRenderer] = {}
+        self._renderers: dict[tuple[int, int, tuple[int, int], Window | None], PanoramaRenderer] = {}
 
-    def renderer(self, height: int, width: int, supersample: tuple[int, int] = (1, 1)) -> PanoramaRenderer:
+    def renderer(
+        self, height: int, width: int, supersample: tuple[int, int] = (1, 1), window: Window | None = None
+    ) -> PanoramaRenderer:
         """Return the renderer of a picture size with `supersample` rays per pixel along (rows, columns)."""
-        key = height, width, supersample
+        key = height, width, supersample, window
         if key not in self._renderers:
             self._renderers[key] = PanoramaRenderer(
-                self.materials, height=height, width=width, device=self._device, supersample=supersample
+                self.materials, height=height, width=width, device=self._device, supersample=supersample, window=window
             )
         return self._renderers[key]
 

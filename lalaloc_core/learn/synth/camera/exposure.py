@@ -97,6 +97,14 @@ def sample_staged_exposure(rng: np.random.Generator) -> Exposure:
     return exposure
 
 
+def without_stitching(exposure: Exposure) -> Exposure:
+    """Return settings (torch) without what stitched spheres have: seams, rims of two lenses, tilt, covered poles."""
+    changed = Exposure(exposure.rows.clone())
+    for name in ("nadir", "zenith", "roll", "pitch", "seam_step", "seam_shift", "vignette"):
+        setattr(changed, name, 0.0)
+    return changed
+
+
 def _sample_lenses(exposure: Exposure, rng: np.random.Generator) -> None:
     exposure.seam = rng.uniform(-math.pi, math.pi)
     if rng.random() < 0.5:

@@ -13,9 +13,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from lalaloc_core.conventions import column_azimuths, row_elevations
+from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.synth.camera.develop import develop
+from lalaloc_core.learn.synth.camera.exposure import without_stitching
 from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.records import Row
@@ -40,11 +41,23 @@ _PADDING = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Part of the sphere around a shot's heading: the azimuths it spans and its upper border, radians.
+
+    Pixels are as high as they are wide.
+    """
+
+    width: float
+    top: float
+
+
 class PanoramaRenderer:
     """Renders shots as equirectangular panoramas of one size on one device.
 
     `supersample` is the number of rays per pixel along a column and along a row, or one number for both. Photographs
-    average over their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
+    average over their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too. `window` is the part
+    of the sphere to render, None for all of it; it shows no traces of stitching, and nothing that covers the poles.
 
     Raises:
         InvalidInputError: `height` is odd, or a count of rays is less than one.
@@ -58,8 +71,9 @@ class PanoramaRenderer:
         width: int = 256,
         device: str | torch.device = "cpu",
         supersample: int | tuple[int, int] = 1,
+        window: Window | None = None,
     ) -> None:
-        if height % 2:
+        if window is None and height % 2:
             raise InvalidInputError(f"a panorama of {height} rows has a row on the horizon; the height must be even")
         self._materials = materials
         self._device = torch.device(device)
@@ -72,8 +86,13 @@ class PanoramaRenderer:
         rows, columns = height * rays[0], width * rays[1]
         pixels = _BATCH_PIXELS.get(self._device.type, _BATCH_PIXELS_ELSEWHERE)
         self._batch_size = max(1, pixels // (rows * columns))
-        self._slope = self._tensor(np.tan(row_elevations(rows)))
-        self._azimuth = self._tensor(column_azimuths(columns))
+        self._window = window
+        elevations, azimuths = row_elevations(rows), column_azimuths(columns)
+        if window is not None:
+            elevations = window.top - (np.arange(rows) + 0.5) * (window.width / width / rays[0])
+            azimuths = azimuths * (window.width / TWO_PI)
+        self._slope = self._tensor(np.tan(elevations))
+        self._azimuth = self._tensor(azimuths)
         # Pictures use differently rolled parts of one noise field, because new noise would cost more than the rays.
         self._noise = self._tensor(np.random.default_rng(0).normal(size=(height + 64, width + 64, 3)))
 
@@ -125,7 +144,8 @@ class PanoramaRenderer:
         radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
         if self._rays_per_pixel != (1, 1):
             radiance = _shrink(radiance, self._rays_per_pixel)
-        return develop(radiance, batch.exposure, self._noise)
+        exposure = batch.exposure if self._window is None else without_stitching(batch.exposure)
+        return develop(radiance, exposure, self._noise)
 
     def _range_m(self, hits: Hits) -> Float[Tensor, "b h w"]:
         return hits.distance_m.transpose(1, 2) * torch.sqrt(1.0 + self._slope.square())[None, :, None]

@@ -1,0 +1,166 @@
+"""Training of the encoder of views: photographs that show a part of the horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lalaloc_core.learn.synth.augmentation.framing import framed
+from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
+from lalaloc_core.learn.synth.rendering.panorama import Window
+from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.batch_streams import UNKNOWN
+from lalaloc_core.learn.training.batches import Batch
+from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.photographs import Photographs
+from lalaloc_core.learn.training.sources import Source
+from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches
+from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
+
+# Smallest share of an azimuth column that must be seen to count.
+MIN_SEEN = 0.25
+# Size of the spheres from which views of photographs are cut, about as fine as the views.
+PHOTOGRAPH_SIZE = (384, 768)
+
+
+def view_window(config: TrainConfig) -> Window:
+    """Return the part of the sphere that views show."""
+    return Window(config.view.width_rad(config.ring), float(np.radians(config.view.top_deg)))
+
+
+class ViewStage(TrainingStage):
+    """Train the encoder of views on renderings and on parts of photographs, each seen through a random camera."""
+
+    name = "view"
+
+    def __init__(self, config: TrainConfig, source: Source, photographs: Photographs | None = None) -> None:
+        self.config = config
+        self.source = source
+        self.photographs = photographs
+        self.encoder = ViewEncoder(config.view, config.ring)
+        self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
+        self._azimuths, self._elevations = (
+            torch.from_numpy(angles).float()
+            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
+        )
+        self._generator = torch.Generator()
+
+    @property
+    def settings(self) -> ImageStageConfig:
+        """Settings of this stage."""
+        return self.config.image
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Description of the training data."""
+        if self.photographs is None:
+            return self.source.data
+        return {**self.source.data, "photographs": len(self.photographs.images)}
+
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
+        """Yield batches of level pictures of the patch's size."""
+        device = next(self.encoder.parameters()).device
+        seed = int(np.random.default_rng([10, self.config.seed, first_step]).integers(1 << 62))
+        self._generator = torch.Generator(device).manual_seed(seed)
+        return panorama_batches(
+            self.config, self.source, first_step=first_step, workers=workers, device=device, views=True
+        )
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the weighted losses of a batch by name; azimuths that are not seen do not count."""
+        settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
+        count = settings.photographs_per_batch if self.photographs is not None else 0
+        photographs = None
+        if self.photographs is not None:
+            photographs = self.photographs.draw(count, self.config.profile_columns, torch.default_generator)
+            cut = self._cut(photographs.images).to(image.device)
+            image, height = torch.cat([image, cut]), torch.cat([height, height.new_ones(count)])
+        features = self.encoder(self._shown(image), height)
+        seen = features.seen >= MIN_SEEN
+        rendered = slice(0, len(image) - count)
+        terms = self._rendered_losses(features, seen, rendered, batch)
+        if photographs is not None:
+            terms["photographs"] = self._photograph_losses(features, seen, slice(len(image) - count, None), photographs)
+        return terms
+
+    def _rendered_losses(
+        self, features: ViewFeatures, seen: Bool[Tensor, "b w"], rows: slice, batch: Batch
+    ) -> dict[str, Tensor]:
+        settings, structure = self.settings, features.structure
+        part = middle(self.config)
+        kind = torch.where(seen[rows], batch["opening_kind"][:, part], UNKNOWN)
+        self.encoder.update_class_shares(kind, batch["room_type"])
+        walls = losses.laplace_mixture(
+            features.log_profile[rows],
+            features.log_scale[rows],
+            features.log_share[rows],
+            batch["profile_m"][:, part].log(),
+            seen[rows],
+        )
+        above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
+        ceiling = losses.ceiling(structure.log_ceiling[rows], structure.log_ceiling_scale[rows], above_m)
+        openings = losses.opening(
+            structure.opening_logits[rows], kind, self.encoder.opening_share, settings.opening_balance
+        )
+        room_type = losses.room_type(structure.room_type_logits[rows], batch["room_type"])
+        return {
+            "profile": settings.profile_weight * walls,
+            "opening": settings.opening_weight * openings,
+            "ceiling": settings.ceiling_weight * ceiling,
+            "room_type": settings.room_type_weight * room_type,
+        }
+
+    def _photograph_losses(
+        self, features: ViewFeatures, seen: Bool[Tensor, "b w"], rows: slice, photographs: Photographs
+    ) -> Tensor:
+        settings, part, device = self.settings, middle(self.config), seen.device
+        openings, log_distance = (
+            target[:, part].to(device) for target in (photographs.openings, photographs.log_distance)
+        )
+        logits = features.structure.opening_logits[rows]
+        known = seen[rows] & torch.isfinite(log_distance) & ~losses.is_passage(logits)
+        walls = losses.laplace_mixture(
+            features.log_profile[rows],
+            features.log_scale[rows],
+            features.log_share[rows],
+            log_distance.nan_to_num(),
+            known,
+        )
+        agreement = losses.teacher_openings(logits[seen[rows]][None], openings[seen[rows]][None])
+        return settings.photograph_weight * agreement + settings.photograph_profile_weight * walls
+
+    def _cut(self, images: UInt8[Tensor, "n h w 3"]) -> UInt8[Tensor, "n h2 w2 3"]:
+        """Cut patches from the middle of spheres."""
+        rows, columns = images.shape[1:3]
+        pixel = np.pi / rows
+        top = round((np.pi / 2.0 - np.radians(self.config.view.top_deg)) / pixel)
+        width = round(self.config.view.width_rad(self.config.ring) / pixel)
+        height = round(width * self.config.view.image_height / self.config.view.image_width)
+        left = (columns - width) // 2
+        patch = images[:, top : top + height, left : left + width].permute(0, 3, 1, 2).float()
+        size = (self.config.view.image_height, self.config.view.image_width)
+        return functional.interpolate(patch, size, mode="bilinear").permute(0, 2, 3, 1).round().to(torch.uint8)
+
+    def _shown(self, image: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b h w 4"]:
+        """Apply photometric augmentation, and show the pictures through random cameras."""
+        settings, generator = self.settings, self._generator
+        # Single precision, because bfloat16 cannot represent 256 grey levels.
+        with torch.autocast(image.device.type, enabled=False):
+            pixels = jittered(image, settings.photometric, generator)
+            if settings.optics:
+                pixels = optics(pixels, settings.optics, generator)
+            azimuths, elevations = (angles.to(image.device) for angles in (self._azimuths, self._elevations))
+            return framed(pixels, azimuths, elevations, generator)
+
+
+def middle(config: TrainConfig) -> slice:
+    """Return the azimuth columns of a view among those of the full circle."""
+    columns = config.view.sectors * config.profile_columns // config.ring.sectors
+    first = (config.profile_columns - columns) // 2
+    return slice(first, first + columns)

@@ -1,0 +1,162 @@
+"""Image encoder of views: photographs that show a part of the horizon.
+
+A view is a patch of a level equirectangular picture around the photograph, of fixed size and position relative to the
+horizon, with an opacity that says which of its pixels the photograph shows. The wall at each azimuth is predicted as a
+mixture of two Laplace distributions of its log distance, because an edge of the floor is often hidden, and a passage
+shows two walls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.nets.image_encoder import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder, clamped_scale
+from lalaloc_core.nets.image_features import StructureFeatures
+from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.trunk import TAP_STRIDES, StyleMixing
+
+MODES = 2
+# Values predicted of each mode: log distance, log scale, logit of its share.
+_VALUES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewEncoderConfig(TrunkEncoderConfig):
+    """Sizes of the encoder of views; `image_height` and `image_width` are those of the patch.
+
+    Attributes:
+        sectors: sectors that the patch covers, each as wide as the ring's.
+        top_deg: elevation of the patch's upper border; pixels are as high as they are wide.
+    """
+
+    image_height: int = 192
+    image_width: int = 256
+    sectors: int = 20
+    top_deg: float = 39.375
+
+    def width_rad(self, ring: RingConfig) -> float:
+        """Return the azimuths (radians) that the patch spans."""
+        return TWO_PI * self.sectors / ring.sectors
+
+    def column_azimuths(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "columns"]:
+        """Return the azimuth (radians, relative to the patch's centre) of column centres, `rays` per pixel."""
+        columns = self.image_width * rays
+        return ((np.arange(columns) + 0.5) / columns - 0.5) * self.width_rad(ring)
+
+    def row_elevations(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "rows"]:
+        """Return the elevation (radians) of row centres, `rays` per pixel."""
+        rows = self.image_height * rays
+        pixel = self.width_rad(ring) / self.image_width
+        return np.radians(self.top_deg) - (np.arange(rows) + 0.5) * pixel / rays
+
+
+@dataclass(frozen=True)
+class ViewFeatures:
+    """Predictions of the encoder for a batch of views.
+
+    Attributes:
+        log_profile: (b, w, m) centres of the modes: log distances of the wall (m).
+        log_scale: (b, w, m) logs of the scales of the modes.
+        log_share: (b, w, m) logs of the shares of the modes, which sum to 1.
+        seen: (b, w) share of each azimuth column that the photograph shows.
+        structure: openings, ceiling height and room type.
+    """
+
+    log_profile: Tensor
+    log_scale: Tensor
+    log_share: Tensor
+    seen: Tensor
+    structure: StructureFeatures
+
+
+class ViewEncoder(HorizonEncoder):
+    """Image encoder of views: patch and camera height to walls, openings, ceiling height and room type."""
+
+    def __init__(self, config: ViewEncoderConfig, ring: RingConfig) -> None:
+        if not 0 < config.sectors <= ring.sectors:
+            raise ConfigError(
+                f"view.sectors is {config.sectors}; it must lie between 1 and ring.sectors, {ring.sectors}"
+            )
+        super().__init__(
+            config,
+            config.sectors,
+            ring.profile_columns // ring.sectors,
+            profile_outputs=_VALUES * MODES,
+            extra_inputs=1,
+            circular=False,
+        )
+        columns = config.sectors * self.columns_per_sector
+        self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
+        self.pooling: Tensor
+        self.row_elevations = config.row_elevations(ring)
+        # The modes begin apart, or both would learn the same.
+        self._apart = torch.tensor([0.7, 0.0, -2.0])
+        with torch.no_grad():
+            self.to_profile.bias.view(-1, MODES, _VALUES)[:, 1] += self._apart
+
+    @torch.no_grad()
+    def start_from(self, sphere: TrunkImageEncoder) -> None:
+        """Take over the weights of an encoder of spheres; both modes begin as its only one.
+
+        Layers that flatten feature maps over height are resampled from the sphere's rows to the patch's.
+        """
+        own, theirs = self.state_dict(), sphere.state_dict()
+        for name, value in theirs.items():
+            if name in own and own[name].shape == value.shape:
+                own[name].copy_(value)
+        own["join.weight"][:, : sphere.join.in_features].copy_(theirs["join.weight"])
+        own["join.weight"][:, sphere.join.in_features :].zero_()
+        elevations = torch.from_numpy(self.row_elevations).float()
+        for number, stride in enumerate(TAP_STRIDES):
+            weight = theirs[f"squeezes.{number}.weight"]
+            rows, own_rows = sphere.config.image_height // stride, self.config.image_height // stride
+            by_row = weight.unflatten(1, (-1, rows))
+            place = (0.5 - elevations.view(own_rows, stride).mean(dim=1) / torch.pi) * rows - 0.5
+            left = place.floor().clamp(0, rows - 2)
+            share = (place - left).clamp(0.0, 1.0)
+            resampled = torch.lerp(by_row[..., left.long()], by_row[..., left.long() + 1], share)
+            # A row of the sphere is seen by several rows of the patch.
+            per_row = abs(float(elevations[0] - elevations[stride])) * rows / torch.pi
+            own[f"squeezes.{number}.weight"].copy_((resampled * per_row).flatten(1))
+        for name in ("weight", "bias"):
+            values = own[f"to_profile.{name}"].unflatten(0, (self.columns_per_sector, MODES, _VALUES))
+            values[:, :, :2] = theirs[f"to_profile.{name}"].unflatten(0, (self.columns_per_sector, 1, 2))
+        own["to_profile.bias"].unflatten(0, (self.columns_per_sector, MODES, _VALUES))[:, 1] += self._apart
+
+    def forward(
+        self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
+    ) -> ViewFeatures:
+        """Encode views.
+
+        Patches (b, h, w, 4) are RGB and opacity, 0 to 255 of any type; transparent pixels are unknown. `styles` is for
+        training only.
+        """
+        opacity = image[..., 3].to(self.mean.dtype) / 255.0
+        pixels = self.normalised(image[..., :3]) * opacity[:, None]
+        seen = opacity.mean(dim=1) @ self.pooling
+        by_sector = seen.unflatten(1, (-1, self.columns_per_sector)).mean(dim=2)
+        mixed = self.sector_features(pixels, styles, by_sector[..., None])
+        log_height = torch.log(camera_height_m)
+        modes = self.profile_values(mixed).unflatten(2, (MODES, _VALUES))
+        return ViewFeatures(
+            log_profile=modes[..., 0] + log_height[:, None, None],
+            log_scale=clamped_scale(modes[..., 1]),
+            log_share=torch.log_softmax(modes[..., 2], dim=2),
+            seen=seen,
+            structure=self.structure(mixed, log_height),
+        )
+
+
+def _pooling(width: int, columns: int) -> Float[Tensor, "w c"]:
+    """Return weights that average pixels over azimuth columns, whose borders may cut pixels."""
+    edge = torch.arange(columns + 1) * (width / columns)
+    pixel = torch.arange(width)[:, None]
+    overlap = torch.minimum(pixel + 1, edge[None, 1:]) - torch.maximum(pixel, edge[None, :-1])
+    return overlap.clamp(min=0.0) * (columns / width)
