@@ -167,18 +167,22 @@ def _at_best_offset(
 
 def _table(binned: BinnedLayouts, matching_cost: MatchingCost) -> Float[np.ndarray, "r c"]:
     """Return the cost of each row under every δ and hypothesis, δ by δ."""
-    centre, precision, loss = matching_cost.predicted(binned.columns)
+    modes, loss = matching_cost.predicted_modes(binned.columns), matching_cost.opening_costs(binned.columns)
     azimuths, bins = len(binned.columns), len(binned.bins)
     offsets = matching_cost.offsets.astype(np.float32)
     shape = (len(offsets), matching_cost.hypotheses)
-    # Hypotheses are one prediction, turned, so there are few different pairs of a centre and a precision.
-    pairs, which = np.unique((centre + 1j * precision).ravel(), return_inverse=True)
-    apart = binned.bins[:, None, None] - offsets[:, None] - pairs.real.astype(np.float32)
-    wall_costs = np.log1p(np.square(apart * pairs.imag.astype(np.float32))) / azimuths
+    # Hypotheses are one prediction, turned, so there are few different ones at an azimuth.
+    different, which = np.unique(modes.reshape(-1, modes.shape[2]), axis=0, return_inverse=True)
+    apart = binned.bins[:, None, None] - offsets[:, None]
+    likelihood = sum(
+        odds / (1.0 + np.square((apart - centre) * precision))
+        for centre, precision, odds in different.reshape(len(different), -1, 3).transpose(1, 2, 0)
+    )
+    wall_costs = -np.log(np.minimum(likelihood, 1.0)) / azimuths
     table = np.zeros((azimuths * (bins + OPENING_ROWS), *shape), np.float32)
     walls = table[: azimuths * bins].reshape(azimuths, bins, *shape)
     openings = table[azimuths * bins :].reshape(azimuths, OPENING_ROWS, *shape)
-    for azimuth, pair in enumerate(which.reshape(centre.shape).T):
+    for azimuth, pair in enumerate(which.reshape(modes.shape[:2]).T):
         walls[azimuth] = wall_costs[:, :, pair]
     if loss is not None:
         loss = loss.transpose(1, 2, 0)[:, :, None] / azimuths

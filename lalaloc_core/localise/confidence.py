@@ -75,7 +75,7 @@ def signals_of(
     return Signals(
         log_odds=max(-_MAX_LOG_ODDS, min(_MAX_LOG_ODDS, log_odds)),
         cost=answer.cost,
-        uncertainty=0.0 if query.profile is None else float(query.profile.log_scale.mean()),
+        uncertainty=0.0 if query.profile is None else float(query.profile.log_scale[query.profile.seen].mean()),
         latent_distance=answer.latent_distance,
         cost_to_chance=log_cost_to_chance(grid_cost, by_chance),
         answer_to_chance=log_cost_to_chance(answer.cost, by_chance),

@@ -205,8 +205,8 @@ class Encoders:
     ) -> dict[str, Any]:
         """Return the predictions of a query, rolled to the right by numbers of sectors."""
         columns = shifts * (len(outputs["log_profile"]) // sectors)
-        profile = PredictedProfile.rolled(outputs["log_profile"], outputs["log_scale"], columns)
-        predictions: dict[str, Any] = {"profile": profile}
+        profile = PredictedProfile(outputs["log_profile"][None], outputs["log_scale"][None])
+        predictions: dict[str, Any] = {"profile": profile.moved(columns)}
         if self.predicts_structure:
             openings = rolled(_log_softmax(outputs["opening_logits"]), columns)
             predictions["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))

@@ -11,7 +11,9 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   `s_w² = b_w² + (reach / exp μ_w)²`. κ is the tail factor, δ the log of true over stated camera height, and `reach` the
   distance (m) from the camera within which the best of the compared poses lies. At a door or passage the prediction can
   be of the wall behind it. `1 / (1 + r²)` is then replaced by `min(1, 1 / (1 + r²) + o / (1 + r'²))`, with r' for the
-  wall behind and o for the odds that the prediction is of that wall.
+  wall behind and o for the odds that the prediction is of that wall. Likewise for a model that predicts a second mode,
+  with r' for that mode and o for its odds. Azimuths that the photograph does not show have an infinite b and cost
+  nothing.
 * **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, with `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the predicted
   probability p of the class c_w that the plan shows, over the frequency π of that class. Kinds that the plan does not
   claim to show completely count as wall.
@@ -26,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -120,6 +122,36 @@ class _Views(NamedTuple):
     odds: Float[np.ndarray, "e"]
 
 
+class _Mode(NamedTuple):
+    """Mode of the predicted walls: centres, precisions and odds, each (k, w) or broadcast to that."""
+
+    centre: Float[np.ndarray, "k w"]
+    precision: Float[np.ndarray, "k w"]
+    odds: Float[np.ndarray, "#k #w"]
+
+    @classmethod
+    def of(
+        cls,
+        log_m: Float[np.ndarray, "k w"],
+        log_scale: Float[np.ndarray, "k w"],
+        odds: Float[np.ndarray, "#k #w"],
+        reach_m: float,
+        config: MatchingConfig,
+        stride: int,
+    ) -> _Mode:
+        values = log_m, precisions(log_m, log_scale, reach_m, config), odds
+        return cls(*(np.ascontiguousarray(value[:, ::stride], np.float32) for value in values))
+
+    def likelihood(self, log_m: np.ndarray, place: Any) -> np.ndarray:
+        """Return the likelihoods of log distances at places: an index into (k, w)."""
+        centre, precision = self.centre[place], self.precision[place]
+        return np.broadcast_to(self.odds, self.centre.shape)[place] / (1.0 + np.square((log_m - centre) * precision))
+
+    def likelihood_at(self, log_m: Float[np.ndarray, "n"], place: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the likelihoods of log distances at flat places."""
+        return self.odds.take(place) / (1.0 + np.square((log_m - self.centre.take(place)) * self.precision.take(place)))
+
+
 class MatchingCost:
     """Matching cost of the poses of one plan for one query.
 
@@ -140,8 +172,9 @@ class MatchingCost:
         assert query.profile is not None, "without a predicted profile poses are compared by their latents"
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
-        self._centre = np.ascontiguousarray(query.profile.log_m[:, ::stride], np.float32)
-        self._precision = np.ascontiguousarray(precisions(query, reach_m, config)[:, ::stride], np.float32)
+        first, rival = query.profile, query.profile.rival
+        self._first = _Mode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, config, stride)
+        self._rival = None if rival is None else _Mode.of(*vars(rival).values(), reach_m, config, stride)
 
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
@@ -187,16 +220,30 @@ class MatchingCost:
         views = self._views(layouts, np.arange(len(layouts)))
         share = np.ones(views.log_profile.shape)
         k, pose, column = hypothesis[views.pose], views.pose, views.column
-        centre, precision = self._centre[k, column] + offset[pose].astype(np.float32), self._precision[k, column]
-        shut = 1.0 / (1.0 + np.square((views.log_profile[pose, column] - centre) * precision))
-        opened = views.odds / (1.0 + np.square((views.log_behind - centre) * precision))
+        moved = offset[pose].astype(np.float32)
+        shut = self._likelihood(views.log_profile[pose, column] - moved, (k, column))
+        opened = views.odds * self._likelihood(views.log_behind - moved, (k, column))
         share[pose, column] = shut / (shut + opened)
         return share
+
+    def nearest_mode(
+        self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n w"], Float[np.ndarray, "n w"]]:
+        """Return centre and precision, by azimuth, of the predicted mode that each pose's own wall fits better."""
+        centre, precision = self._first.centre[hypothesis], self._first.precision[hypothesis]
+        if self._rival is None:
+            return centre, precision
+        log_m = layouts.log_profile - offset[:, None].astype(np.float32)
+        is_rival = self._rival.likelihood(log_m, hypothesis) > self._first.likelihood(log_m, hypothesis)
+        return (
+            np.where(is_rival, self._rival.centre[hypothesis], centre),
+            np.where(is_rival, self._rival.precision[hypothesis], precision),
+        )
 
     @property
     def hypotheses(self) -> int:
         """Number of hypotheses of the heading."""
-        return len(self._centre)
+        return len(self._first.centre)
 
     @property
     def offsets(self) -> Float[np.ndarray, "j"]:
@@ -210,13 +257,22 @@ class MatchingCost:
         types = self._weights.room_type * self._room_types
         return (penalty + self._weights.ceiling * self._ceilings(self.offsets) + types).astype(np.float32)
 
-    def predicted(
-        self, columns: Int[np.ndarray, "a"]
-    ) -> tuple[Float[np.ndarray, "k a"], Float[np.ndarray, "k a"], Float[np.ndarray, "k a c"] | None]:
-        """Return centres, precisions and weighted costs of opening classes (None: not compared) at some azimuths."""
+    def predicted_modes(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k a v"]:
+        """Return the predictions of walls at some azimuths: centre, precision and odds of each mode."""
+        modes = [self._first] if self._rival is None else [self._first, self._rival]
+        shape = self._first.centre[:, columns].shape
+        values = [np.broadcast_to(part, self._first.centre.shape)[:, columns] for mode in modes for part in mode]
+        return np.stack(values, axis=2).reshape(*shape, -1)
+
+    def opening_costs(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k a c"] | None:
+        """Return the weighted cost of every opening class at some azimuths; None if openings are not compared."""
         loss = self._opening_losses
-        loss = None if loss is None else self._weights.openings * loss[:, columns]
-        return self._centre[:, columns], self._precision[:, columns], loss
+        return None if loss is None else self._weights.openings * loss[:, columns]
+
+    def _likelihood(self, log_m: Float[np.ndarray, "n"], place: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Return the likelihood of walls at places (hypothesis, column), over that of the first mode's centre."""
+        likelihood = self._first.likelihood(log_m, place)
+        return likelihood if self._rival is None else likelihood + self._rival.likelihood(log_m, place)
 
     def _views(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Views:
         """Gather the layouts of some poses."""
@@ -246,16 +302,16 @@ class MatchingCost:
         self, views: _Views, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
-        precision, offset = self._precision[hypothesis], offset.astype(np.float32)
+        precision, offset = self._first.precision[hypothesis], offset.astype(np.float32)
         # Residuals at δ = 0 for the opening or the pose's own wall; the offset is subtracted for each δ.
-        residual = views.log_profile - self._centre[hypothesis]
+        residual = views.log_profile - self._first.centre[hypothesis]
         residual *= precision
         # Residuals of the walls behind openings, by flat indices, which numpy takes fastest.
         count, columns = residual.shape
         place = views.pose * columns + views.column
         predicted = np.broadcast_to(hypothesis * columns, count)[views.pose] + views.column
-        precision_behind = self._precision.take(predicted)
-        residual_behind = (views.log_behind - self._centre.take(predicted)) * precision_behind
+        precision_behind = self._first.precision.take(predicted)
+        residual_behind = (views.log_behind - self._first.centre.take(predicted)) * precision_behind
         offset_behind = offset if offset.shape[1] == 1 else offset[:, views.pose]
         cost = np.empty((len(offset), count), np.float32)
         for j in range(len(offset)):
@@ -264,8 +320,15 @@ class MatchingCost:
             factor = np.subtract(residual, offset[j, :, None] * precision, out=out)
             np.square(factor, out=factor)
             factor += 1.0
+            if self._rival is not None:
+                rival = self._rival.likelihood(views.log_profile - offset[j, :, None], hypothesis)
+                factor = np.maximum(1.0 / (1.0 / factor + rival), 1.0)
             if len(place):
                 behind = np.square(residual_behind - offset_behind[j] * precision_behind) + 1.0
+                if self._rival is not None:
+                    behind = 1.0 / (
+                        1.0 / behind + self._rival.likelihood_at(views.log_behind - offset_behind[j], predicted)
+                    )
                 # At least 1: an opening costs nothing where its own wall fits, as networks learn to see that wall.
                 either = np.maximum(1.0 / (1.0 / factor.take(place) + views.odds / behind), 1.0)
                 factor.put(place, either)
@@ -288,7 +351,7 @@ class MatchingCost:
             return None
         probability = merged_into_walls(np.exp(predicted.log_probability), claimed)
         # Openings appear displaced by up to the reach, seen at the median distance.
-        probability = smoothed(probability, float(self._reach_m / np.exp(np.median(self._centre[0]))))
+        probability = smoothed(probability, float(self._reach_m / np.exp(np.median(self._first.centre[0]))))
         prior = merged_into_walls(predicted.prior, claimed)
         loss = class_losses(probability, prior, claimed, self._config.floor)
         loss -= loss.min(axis=-1, keepdims=True)
@@ -312,11 +375,12 @@ class MatchingCost:
         return ceiling_costs(predicted, clearance_m, offset[:, None], self._config)
 
 
-def precisions(query: Query, reach_m: float, config: MatchingConfig) -> Float[np.ndarray, "k w"]:
+def precisions(
+    log_m: Float[np.ndarray, "k w"], log_scale: Float[np.ndarray, "k w"], reach_m: float, config: MatchingConfig
+) -> Float[np.ndarray, "k w"]:
     """Return 1 / (κ s) for every hypothesis and azimuth, the factor of differences of log distance."""
-    assert query.profile is not None
-    scale = np.maximum(np.exp(query.profile.log_scale), _MIN_SCALE)
-    return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-query.profile.log_m)))
+    scale = np.maximum(np.exp(log_scale), _MIN_SCALE)
+    return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-log_m)))
 
 
 def ceiling_costs(

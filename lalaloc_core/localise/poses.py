@@ -102,18 +102,52 @@ class PoseGrid:
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedProfile:
-    """Laplace distributions of the log wall profile (m), with their log scales, for every hypothesis of the heading."""
+class RivalWall:
+    """Second mode of a predicted wall profile, such as the wall behind a passage, or at an edge that is hidden.
+
+    Attributes:
+        log_m: (k, w) centres.
+        log_scale: (k, w) logs of the scales.
+        odds: (k, w) height of this mode's density at its centre over that of the first mode.
+    """
 
     log_m: Float[np.ndarray, "k w"]
     log_scale: Float[np.ndarray, "k w"]
+    odds: Float[np.ndarray, "k w"]
 
-    @classmethod
-    def rolled(
-        cls, log_m: Float[np.ndarray, "w"], log_scale: Float[np.ndarray, "w"], shifts: Int[np.ndarray, "k"]
-    ) -> PredictedProfile:
-        """Return one prediction, moved to the right by a number of columns for each hypothesis."""
-        return cls(rolled(log_m, shifts), rolled(log_scale, shifts))
+
+@dataclass(frozen=True, eq=False)
+class PredictedProfile:
+    """Laplace distributions of the log wall profile (m), for every hypothesis of the heading.
+
+    Attributes:
+        log_m: (k, w) centres.
+        log_scale: (k, w) logs of the scales; infinite at azimuths that the photograph does not show.
+        rival: second modes; None if the model predicts one only.
+    """
+
+    log_m: Float[np.ndarray, "k w"]
+    log_scale: Float[np.ndarray, "k w"]
+    rival: RivalWall | None = None
+
+    def moved(self, shifts: Int[np.ndarray, "j"]) -> PredictedProfile:
+        """Return a profile of one hypothesis, moved to the right by a number of columns for each of several."""
+        rival = self.rival
+        return PredictedProfile(
+            rolled(self.log_m[0], shifts),
+            rolled(self.log_scale[0], shifts),
+            None if rival is None else RivalWall(*(rolled(values[0], shifts) for values in vars(rival).values())),
+        )
+
+    def scaled(self, offset: float) -> PredictedProfile:
+        """Return the profile if the camera stood higher by the factor `exp(offset)`."""
+        rival = None if self.rival is None else replace(self.rival, log_m=self.rival.log_m + offset)
+        return replace(self, log_m=self.log_m + offset, rival=rival)
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "k w"]:
+        """Azimuths that the photograph shows."""
+        return np.isfinite(self.log_scale)
 
 
 def rolled(values: Float[np.ndarray, "w *c"], shifts: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k w *c"]:
@@ -187,7 +221,7 @@ class Query:
         profile, ceiling = self.profile, self.ceiling
         return replace(
             self,
-            profile=None if profile is None else replace(profile, log_m=profile.log_m + offset),
+            profile=None if profile is None else profile.scaled(offset),
             ceiling=None if ceiling is None else replace(ceiling, log_m=ceiling.log_m + offset),
         )
 

@@ -17,7 +17,7 @@ from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, precisions
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
 from lalaloc_core.render.sampling import PoseSet
 
@@ -33,7 +33,8 @@ def refinement_job(
     """Return the job that refines candidates, each within its own room.
 
     The refiner compares walls, or latents if the model predicts no walls; other terms do not move poses. An azimuth
-    with a view through an opening counts by the probability that the prediction is of the pose's own wall.
+    with a view through an opening counts by the probability that the prediction is of the pose's own wall; of two
+    predicted modes, the one that the wall fits better is its target.
     """
     rooms = np.array([candidate.room_index for candidate in candidates])
     hypotheses = np.array([candidate.hypothesis for candidate in candidates])
@@ -55,14 +56,15 @@ def refinement_job(
     layouts = layouts_at(plan, PoseSet(job.position_m, rooms), job.heading, columns)
     matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
     wall_shares = matching_cost.wall_shares(layouts, hypotheses, offsets)
+    log_profile, precision = matching_cost.nearest_mode(layouts, hypotheses, offsets)
     # The refiner sums over azimuths, the matching cost averages: the height's prior is stiffer by the same factor.
     stiffness = 0.0
     if not (height.is_exact or height.is_unknown):
         stiffness = math.sqrt(0.5 * columns / weights.temperature) / height.log_std
     return replace(
         job,
-        log_profile=query.profile.log_m[hypotheses],
-        precision=precisions(query, matching.fine_reach_m, matching)[hypotheses] * np.sqrt(wall_shares),
+        log_profile=log_profile,
+        precision=precision * np.sqrt(wall_shares),
         height_offset=None if height.is_exact else offsets,
         height_stiffness=stiffness,
         height_bounds=height.bounds,

@@ -78,14 +78,14 @@ class TestWalls:
         assert through < 0.5 * wrong
 
     def test_reach_lowers_the_precision_most_beside_walls(self) -> None:
-        query = make_query(np.log(np.array([[0.3, 1.0, 4.0]])), np.full((1, 3), -3.0))
-        fine, coarse = (precisions(query, r, CONFIG)[0] for r in (0.05, 0.3))
+        profile = np.log(np.array([[0.3, 1.0, 4.0]])), np.full((1, 3), -3.0)
+        fine, coarse = (precisions(*profile, reach_m, CONFIG)[0] for reach_m in (0.05, 0.3))
         assert (coarse < fine).all()
         assert (np.diff(coarse / fine) > 0.0).all()
 
     def test_precision_is_bounded(self) -> None:
         np.testing.assert_allclose(
-            precisions(make_query(np.zeros((1, 4)), np.full((1, 4), -80.0)), 0.0, CONFIG), 1.0 / (2.0 * 1e-3)
+            precisions(np.zeros((1, 4)), np.full((1, 4), -80.0), 0.0, CONFIG), 1.0 / (2.0 * 1e-3)
         )
 
     def test_opening_fits_the_wall_or_the_room_behind(self) -> None:

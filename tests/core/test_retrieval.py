@@ -156,7 +156,8 @@ class TestRetrieval:
         )
         config = MatchingConfig(latent_weight=0.7)
         residual = np.log(grid.profile_m)[None] - present(query.profile).log_m[:, None]
-        costs = np.log1p(np.square(residual * precisions(query, 0.3, config)[:, None])).mean(axis=2)
+        precision = precisions(query.profile.log_m, query.profile.log_scale, 0.3, config)
+        costs = np.log1p(np.square(residual * precision[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(present(grid.latents), query.latents)
         best = best_candidates(grid, query, top_k=1, config=config)[0]
         assert best.cost == pytest.approx(costs.min(), rel=1e-4)
@@ -297,7 +298,7 @@ def queries(building: Building) -> list[Query]:
         log_m[hidden] -= rng.exponential(0.3, int(hidden.sum()))
         probability = np.full((COLUMNS, 4), 0.05)
         probability[np.arange(COLUMNS), present(layouts.kind)[0]] += 0.8
-        profile = PredictedProfile.rolled(log_m, np.full(COLUMNS, np.log(0.06)), shifts)
+        profile = PredictedProfile(log_m[None], np.full((1, COLUMNS), np.log(0.06))).moved(shifts)
         openings = PredictedOpenings(rolled(np.log(probability), shifts), np.array([0.7, 0.1, 0.15, 0.05]))
         roll = np.arange(HYPOTHESES) * (2.0 * np.pi / HYPOTHESES)
         height = CameraHeight(1.5) if index % 2 else CameraHeight(1.5, float("inf"))

@@ -98,7 +98,7 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
         0.0,
         hypotheses == 1,
         CameraHeight(1.5),
-        PredictedProfile.rolled(log_m, np.full(COLUMNS, np.log(0.05)), shifts),
+        PredictedProfile(log_m[None], np.full((1, COLUMNS), np.log(0.05))).moved(shifts),
         PredictedOpenings(rolled(log_probability, shifts), np.array([0.5, 0.2, 0.2, 0.1])),
         PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
         PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),

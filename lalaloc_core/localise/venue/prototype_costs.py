@@ -61,7 +61,9 @@ class PrototypeCosts:
         self._every = max(1, len(query.roll) // AZIMUTHS)
         self._reach_m = config.grid_reach * STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
-        self.precision = precisions(query, self._reach_m, config)[:: self._every, self._columns].astype(np.float32)
+        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, config)[
+            :: self._every, self._columns
+        ].astype(np.float32)
         self.offsets = _offsets(query)
         self.penalty = query.camera_height.penalty(self.offsets) / weights.temperature
 
