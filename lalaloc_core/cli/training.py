@@ -98,6 +98,12 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--name", help="name of the model (default: name of the folder --out)")
     export.add_argument("--version", required=True, dest="model_version", help="version of the model")
     export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="note for the manifest")
+    export.add_argument(
+        "--views-of",
+        type=Path,
+        metavar="BUNDLE",
+        help="copy this bundle and add the run's encoder of views, instead of exporting the other stages",
+    )
     export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
     export.set_defaults(run=_export)
 
@@ -186,8 +192,14 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.learn.export.run import export_run
+    from lalaloc_core.learn.export.run import export_run, export_views
 
+    if arguments.views_of is not None:
+        bundle = export_views(
+            arguments.folder, arguments.views_of, arguments.out, version=arguments.model_version, last=arguments.last
+        )
+        print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
+        return
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
     name = arguments.name or arguments.out.resolve().name

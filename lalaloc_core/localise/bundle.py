@@ -35,9 +35,21 @@ HEAD_ONNX = "head.onnx"
 LAYOUT_WEIGHTS = "layout_encoder.safetensors"
 IMAGE_WEIGHTS = "image_encoder.safetensors"
 DECODER_WEIGHTS = "decoder.safetensors"
+# Encoder of views, photographs that show a part of the horizon; not every bundle has one.
+VIEW_ONNX = "view_encoder.onnx"
+VIEW_WEIGHTS = "view_encoder.safetensors"
 # Made by calibration, not by export.
 COHORT = "cohort.npz"
-BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS, DECODER_WEIGHTS)
+BUNDLE_FILES = (
+    LAYOUT_ONNX,
+    IMAGE_ONNX,
+    HEAD_ONNX,
+    LAYOUT_WEIGHTS,
+    IMAGE_WEIGHTS,
+    DECODER_WEIGHTS,
+    VIEW_ONNX,
+    VIEW_WEIGHTS,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +135,27 @@ class FileEntry:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ViewManifest:
+    """Encoder of views.
+
+    Attributes:
+        config: arguments that rebuild it in torch.
+        image_height, image_width: pixels of a patch.
+        sectors: sectors of the ring that a patch covers.
+        top_deg: elevation of a patch's upper border.
+        opening_prior, room_type_prior: as those of the manifest.
+    """
+
+    config: dict[str, Any]
+    image_height: int
+    image_width: int
+    sectors: int
+    top_deg: float
+    opening_prior: list[float]
+    room_type_prior: list[float]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Manifest:
     """Manifest of a bundle: architecture, inputs and outputs, calibration, and provenance.
 
@@ -137,6 +170,7 @@ class Manifest:
         opening_classes: opening classes that the image encoder predicts; empty if it predicts none.
         opening_prior: frequencies of the classes that its probabilities presume.
         room_types: room types that it predicts; `room_type_prior` are their frequencies in the training data.
+        view: encoder of views; None if the bundle has none.
         confidence: models of the confidence; None leaves answers without one.
         evidence: weights of the matching cost.
         training: commands, seeds, hardware and counts of the training.
@@ -159,6 +193,7 @@ class Manifest:
     opening_prior: list[float] = field(default_factory=list)
     room_types: list[str] = field(default_factory=list)
     room_type_prior: list[float] = field(default_factory=list)
+    view: ViewManifest | None = None
     confidence: ConfidenceModel | None = None
     evidence: MatchingWeights = field(default_factory=MatchingWeights)
     training: dict[str, Any] = field(default_factory=dict)

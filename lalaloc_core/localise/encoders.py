@@ -32,8 +32,8 @@ from lalaloc_core.render.sweep import profiles_at
 _LAYOUT_BATCH = 256
 # Headings at which an architecture without a ring encodes the panorama, one pass each.
 _HEADINGS_WITHOUT_RING = 32
-_PROFILE_OUTPUTS = ["log_profile", "log_scale"]
-_STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
+PROFILE_OUTPUTS = ["log_profile", "log_scale"]
+STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
 # Outputs with a value for every azimuth column.
 _BY_COLUMN = ("log_profile", "log_scale", "opening_logits")
 
@@ -57,18 +57,18 @@ class Encoders:
         """
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
-        self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
+        self._layout = session(bundle.read(LAYOUT_ONNX), threads)
         # A bundle without an image encoder serves layout queries only.
         image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self.manifest.files else None
-        self._image = None if image is None else _session(image, threads)
+        self._image = None if image is None else session(image, threads)
         inputs = [] if self._image is None else self._image.get_inputs()
         self._image_takes_height = any(node.name == "camera_height_m" for node in inputs)
         outputs = [] if self._image is None else self._image.get_outputs()
-        self.predicts_profile = {node.name for node in outputs}.issuperset(_PROFILE_OUTPUTS)
-        self.predicts_structure = {node.name for node in outputs}.issuperset(_STRUCTURE_OUTPUTS)
+        self.predicts_profile = {node.name for node in outputs}.issuperset(PROFILE_OUTPUTS)
+        self.predicts_structure = {node.name for node in outputs}.issuperset(STRUCTURE_OUTPUTS)
         if self.predicts_structure:
             _check_classes(self.manifest)
-        self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
+        self._head = session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
 
     def layouts(
         self,
@@ -85,7 +85,7 @@ class Encoders:
         parts = []
         for first in range(0, len(profile_m), _LAYOUT_BATCH):
             batch = {name: value[first : first + _LAYOUT_BATCH] for name, value in inputs.items()}
-            parts.append(_array(self._layout.run(["latent"], batch)[0]))
+            parts.append(array(self._layout.run(["latent"], batch)[0]))
         return np.concatenate(parts) if parts else np.empty((0, self.manifest.latent_size), np.float32)
 
     def poses(
@@ -155,7 +155,7 @@ class Encoders:
         if query.profile is None:
             raise BundleError(
                 f"model '{self.manifest.name}' (architecture '{self.manifest.architecture}') predicts no wall profile: "
-                f"{IMAGE_ONNX} has no output '{_PROFILE_OUTPUTS[0]}'"
+                f"{IMAGE_ONNX} has no output '{PROFILE_OUTPUTS[0]}'"
             )
         return np.exp(query.profile.log_m[0]), query.frame_heading
 
@@ -182,7 +182,7 @@ class Encoders:
         assert self._head is not None
         sectors = outputs["ring"].shape[1]
         ring = np.ascontiguousarray(rolled(outputs["ring"].T, shifts).transpose(0, 2, 1))
-        latents = _array(self._head.run(["latent"], {"ring": ring})[0])
+        latents = array(self._head.run(["latent"], {"ring": ring})[0])
         predictions = self._predictions(outputs, shifts, sectors) if self.predicts_profile else {}
         return Query(latents, frame_roll + shifts * (TWO_PI / sectors), 0.0, False, camera_height, **predictions)
 
@@ -193,7 +193,7 @@ class Encoders:
         """
         if not self.predicts_profile:
             return {"ring": self._run_image(image[None], camera_height_m, ["ring"])[0][0]}
-        names = [*_PROFILE_OUTPUTS, *(_STRUCTURE_OUTPUTS if self.predicts_structure else [])]
+        names = [*PROFILE_OUTPUTS, *(STRUCTURE_OUTPUTS if self.predicts_structure else [])]
         ring, *outputs = self._run_image(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
         averaged = {}
         for name, (value, mirrored) in zip(names, outputs, strict=True):
@@ -208,11 +208,11 @@ class Encoders:
         profile = PredictedProfile(outputs["log_profile"][None], outputs["log_scale"][None])
         predictions: dict[str, Any] = {"profile": profile.moved(columns)}
         if self.predicts_structure:
-            openings = rolled(_log_softmax(outputs["opening_logits"]), columns)
+            openings = rolled(log_softmax(outputs["opening_logits"]), columns)
             predictions["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))
             ceiling = float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])
             predictions["ceiling"] = PredictedCeiling(*ceiling)
-            types = _log_softmax(outputs["room_type_logits"])
+            types = log_softmax(outputs["room_type_logits"])
             predictions["room_type"] = PredictedRoomType(types, np.array(self.manifest.room_type_prior))
         return predictions
 
@@ -227,7 +227,7 @@ class Encoders:
         inputs = {"image": np.ascontiguousarray(images)}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.full(len(images), camera_height_m, dtype=np.float32)
-        return [_array(value) for value in self._image.run(outputs, inputs)]
+        return [array(value) for value in self._image.run(outputs, inputs)]
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
@@ -254,18 +254,20 @@ def _check_classes(manifest: Manifest) -> None:
             raise BundleError(f"model '{manifest.name}': {name} needs one value for each of {list(classes)}")
 
 
-def _log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]:
+def log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]:
+    """Return the logs of the probabilities of classes."""
     shifted = logits - logits.max(axis=-1, keepdims=True)
     return shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
 
 
-def _array(value: object) -> np.ndarray:
+def array(value: object) -> np.ndarray:
     """Return a network's output, which onnxruntime types as any object, as an array."""
     assert isinstance(value, np.ndarray)
     return value
 
 
-def _session(model: bytes, threads: int) -> onnxruntime.InferenceSession:
+def session(model: bytes, threads: int) -> onnxruntime.InferenceSession:
+    """Create a session with a number of intra-op threads, 0 for one per core."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3

@@ -224,7 +224,7 @@ class TestEncoder:
     def test_sectors_align_with_their_pixels(self) -> None:
         """Check that interpolation maps the centre of a column's receptive field to its sector."""
         for stride in TAP_STRIDES:
-            weights = _interpolation(256, stride, 64)
+            weights = _interpolation(256, stride, 64, circular=True)
             torch.testing.assert_close(weights.sum(dim=1), torch.ones(64))
             # Column i is centred on pixel stride (i + 1) - 1; away from the border the mean place is the sector's own.
             place = (torch.arange(256 // stride) + 1.0) * stride - 1.0

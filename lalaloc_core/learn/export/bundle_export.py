@@ -33,8 +33,11 @@ from lalaloc_core.localise.bundle import (
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
     MANIFEST_NAME,
+    VIEW_ONNX,
+    VIEW_WEIGHTS,
     Bundle,
     Manifest,
+    ViewManifest,
     write_manifest,
 )
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
@@ -42,11 +45,14 @@ from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
+from lalaloc_core.nets.view_encoder import ViewEncoder
 
 PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4
 # Smaller tensors (biases, normalisation statistics) keep single precision at negligible size.
 _HALF_FROM_ELEMENTS = 1024
+# Fields of `StructureFeatures`, in order.
+_STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
 
 
 def export_bundle(
@@ -91,6 +97,37 @@ def export_bundle(
     return write_manifest(folder, manifest)
 
 
+def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, training: dict[str, Any]) -> Bundle:
+    """Add an encoder of views to a bundle, or replace it; its weights are rounded in place.
+
+    Raises:
+        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
+    """
+    encoder.cpu().eval().requires_grad_(False)
+    _round_to_half(encoder)
+    generator = torch.Generator().manual_seed(0)
+    size = (_PARITY_BATCH, config.view.image_height, config.view.image_width, 4)
+    image = torch.randint(0, 256, size, dtype=torch.uint8, generator=generator)
+    heights = torch.empty(_PARITY_BATCH).uniform_(1.0, 1.9, generator=generator)
+    outputs = ["log_profile", "log_scale", "log_share", "seen", *_STRUCTURE_OUTPUTS]
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        path = Path(scratch) / VIEW_ONNX
+        _export(path, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
+        (bundle.folder / VIEW_ONNX).write_bytes(path.read_bytes())
+    _save_weights(encoder, bundle.folder / VIEW_WEIGHTS)
+    view = ViewManifest(
+        config=dataclasses.asdict(config.view),
+        image_height=config.view.image_height,
+        image_width=config.view.image_width,
+        sectors=config.view.sectors,
+        top_deg=config.view.top_deg,
+        opening_prior=losses.opening_prior(encoder.opening_share, config.image.opening_balance).tolist(),
+        room_type_prior=encoder.room_type_share.tolist(),
+    )
+    training = {**bundle.manifest.training, "view": training}
+    return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
+
+
 def reexport_networks(
     bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> Bundle:
@@ -131,7 +168,7 @@ def _export_networks(
         inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
         outputs = ["ring", "log_profile", "log_scale"]
         if isinstance(image_encoder, TrunkImageEncoder):
-            outputs += ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
+            outputs += _STRUCTURE_OUTPUTS
         differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
     elif image_encoder is not None:
         differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
@@ -148,10 +185,20 @@ class _RingOutputs(nn.Module):
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         features = self.encoder(image, camera_height_m)
         outputs = (features.ring, features.log_profile, features.log_scale)
-        extra = features.structure
-        if extra is None:
-            return outputs
-        return (*outputs, extra.opening_logits, extra.log_ceiling, extra.log_ceiling_scale, extra.room_type_logits)
+        return outputs if features.structure is None else (*outputs, *vars(features.structure).values())
+
+
+class _ViewOutputs(nn.Module):
+    """Encoder of views with its features as a plain tuple."""
+
+    def __init__(self, encoder: ViewEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
+        features = self.encoder(image, camera_height_m)
+        predictions = (features.log_profile, features.log_scale, features.log_share, features.seen)
+        return (*predictions, *vars(features.structure).values())
 
 
 def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:

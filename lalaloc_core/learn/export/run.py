@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.learn.export.bundle_export import export_bundle, reexport_networks
+from lalaloc_core.learn.export.bundle_export import add_view_encoder, export_bundle, reexport_networks
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.stages import build_image_encoder
 from lalaloc_core.learn.training.warm_start import (
@@ -20,6 +21,7 @@ from lalaloc_core.learn.training.warm_start import (
 )
 from lalaloc_core.localise.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.nets.view_encoder import ViewEncoder
 
 
 def export_run(
@@ -66,6 +68,32 @@ def export_run(
         version=version,
         training={**training, **(notes or {})},
     )
+
+
+def export_views(folder: Path, bundle: Path, out: Path, *, version: str, last: bool = False) -> Bundle:
+    """Copy a bundle with the encoder of views that was trained in `folder` added.
+
+    Args:
+        folder: of the training run.
+        bundle: folder of the bundle to copy.
+        out: folder of the copy.
+        version: of the model.
+        last: export the last weights instead of the best by validation.
+
+    Raises:
+        CheckpointError: there is no checkpoint of stage "view", or it has another ring than the bundle.
+        ExportError: the exported network differs from torch.
+    """
+    checkpoint = find_checkpoint("view", folder, last=last)
+    origin = Bundle.open(bundle)
+    check_same_networks("layout", checkpoint.config, bundle_weights(origin, "layout").checkpoint.config, str(bundle))
+    encoder = ViewEncoder(checkpoint.config.view, checkpoint.config.ring)
+    encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
+    out.mkdir(parents=True, exist_ok=True)
+    for name in origin.manifest.files:
+        (out / name).write_bytes(origin.read(name))
+    copied = dataclasses.replace(origin, folder=out, manifest=dataclasses.replace(origin.manifest, version=version))
+    return add_view_encoder(copied, checkpoint.config, encoder, _summary(checkpoint, folder, last=last))
 
 
 def reexport_bundle(folder: Path) -> Bundle:

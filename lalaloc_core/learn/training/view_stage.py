@@ -21,10 +21,9 @@ from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches
+from lalaloc_core.localise.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
 
-# Smallest share of an azimuth column that must be seen to count.
-MIN_SEEN = 0.25
 # Size of the spheres from which views of photographs are cut, about as fine as the views.
 PHOTOGRAPH_SIZE = (384, 768)
 

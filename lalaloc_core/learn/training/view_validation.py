@@ -17,7 +17,8 @@ from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.view_stage import MIN_SEEN, middle, view_window
+from lalaloc_core.learn.training.view_stage import middle, view_window
+from lalaloc_core.localise.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder
 from lalaloc_core.render.sweep import profiles_at
 

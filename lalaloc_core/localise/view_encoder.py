@@ -1,0 +1,134 @@
+"""Exported encoder of views on onnxruntime: queries from photographs that show a part of the horizon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.bundle import VIEW_ONNX, Bundle
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import PROFILE_OUTPUTS, STRUCTURE_OUTPUTS, array, log_softmax, session
+from lalaloc_core.localise.poses import (
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    Query,
+    RivalWall,
+    rolled,
+)
+
+# Smallest share of an azimuth column that must be seen to count.
+MIN_SEEN = 0.25
+_OUTPUTS = [*PROFILE_OUTPUTS, "log_share", "seen", *STRUCTURE_OUTPUTS]
+
+
+class OnnxViewEncoder:
+    """Encoder of views of one bundle, ready to run; safe to share between threads."""
+
+    def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
+        """Create the onnxruntime session, with `threads` intra-op threads, 0 for one per core.
+
+        Raises:
+            BundleError: the bundle has no encoder of views, or its file is missing or altered.
+        """
+        self._manifest = bundle.manifest
+        if self._manifest.view is None:
+            raise BundleError(f"model '{self._manifest.name}' has no encoder of views ({VIEW_ONNX}); it needs spheres")
+        self._view = self._manifest.view
+        self._session = session(bundle.read(VIEW_ONNX), threads)
+
+    def query(
+        self,
+        patches: Sequence[tuple[UInt8[np.ndarray, "h w 4"], float]],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """Return the query of a photograph that shows a part of the horizon.
+
+        Args:
+            patches: level patches of the size that the manifest's `view` states, RGB and opacity, each with the azimuth
+                (radians) of its centre column relative to the photograph's; where they overlap, the nearer centre
+                counts.
+            heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
+            camera_height: gives the picture its metric scale.
+            heading_tolerance: as in `Encoders.query`.
+        """
+        columns = self._manifest.profile_columns
+        outputs = self._outputs(patches, camera_height.height_m)
+        column = TWO_PI / columns
+        frame = 0 if heading is None else round(heading / column)
+        frame_heading = 0.0 if heading is None else float(wrap_angle(heading - frame * column))
+        all_shifts = np.arange(columns)
+        max_shift = min(math.ceil(heading_tolerance / column), (columns - 1) // 2)
+        shifts = all_shifts if heading is None else np.arange(-max_shift, max_shift + 1)
+        query = self._hypotheses(outputs, frame + shifts, camera_height)
+        searched = None if heading is None else self._hypotheses(outputs, all_shifts, camera_height)
+        known = heading is not None and heading_tolerance == 0.0
+        return replace(query, frame_heading=frame_heading, heading_known=known, searched=searched)
+
+    def _outputs(
+        self, patches: Sequence[tuple[UInt8[np.ndarray, "h w 4"], float]], camera_height_m: float
+    ) -> dict[str, np.ndarray]:
+        """Run the encoder of views; return its predictions by azimuth column of the full circle."""
+        columns, prior = self._manifest.profile_columns, np.array(self._view.opening_prior)
+        inputs = {
+            "image": np.stack([image for image, _ in patches]),
+            "camera_height_m": np.full(len(patches), camera_height_m, np.float32),
+        }
+        values = [array(value) for value in self._session.run(_VIEW_OUTPUTS, inputs)]
+        predicted = dict(zip(_VIEW_OUTPUTS, values, strict=True))
+        modes = predicted["log_profile"].shape[2]
+        circle = {
+            "log_profile": np.zeros((columns, modes), np.float32),
+            "log_scale": np.full((columns, modes), np.inf, np.float32),
+            "log_share": np.full((columns, modes), -math.log(modes), np.float32),
+            "opening_logits": np.tile(np.log(prior).astype(np.float32), (columns, 1)),
+        }
+        width = predicted["seen"].shape[1]
+        offset = np.arange(width) - width // 2
+        distance = np.full(columns, np.inf)
+        for row, (_, azimuth) in enumerate(patches):
+            place = (columns // 2 + round(azimuth / TWO_PI * columns) + offset) % columns
+            nearer = (predicted["seen"][row] >= MIN_SEEN) & (np.abs(offset + 0.5) < distance[place])
+            distance[place[nearer]] = np.abs(offset + 0.5)[nearer]
+            for name, values in circle.items():
+                values[place[nearer]] = predicted[name][row][nearer]
+        for name in STRUCTURE_OUTPUTS[1:]:
+            circle[name] = predicted[name].mean(axis=0)
+        return circle
+
+    def _hypotheses(
+        self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight
+    ) -> Query:
+        """Return a query with one hypothesis for each shift, a number of columns to the right."""
+        density = outputs["log_share"] - outputs["log_scale"]
+        order = np.argsort(-density, axis=1, kind="stable")
+        log_m, log_scale, density = (
+            np.take_along_axis(value, order, axis=1)
+            for value in (outputs["log_profile"], outputs["log_scale"], density)
+        )
+        with np.errstate(invalid="ignore"):
+            odds = np.nan_to_num(np.exp(density[:, 1] - density[:, 0]))
+        rival = RivalWall(log_m[None, :, 1], log_scale[None, :, 1], odds[None])
+        profile = PredictedProfile(log_m[None, :, 0], log_scale[None, :, 0], rival)
+        openings = rolled(log_softmax(outputs["opening_logits"]), shifts)
+        return Query(
+            np.zeros((len(shifts), self._manifest.latent_size), np.float32),
+            shifts * (TWO_PI / self._manifest.profile_columns),
+            0.0,
+            False,
+            camera_height,
+            profile=profile.moved(shifts),
+            openings=PredictedOpenings(openings, np.array(self._view.opening_prior)),
+            ceiling=PredictedCeiling(float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])),
+            room_type=PredictedRoomType(log_softmax(outputs["room_type_logits"]), np.array(self._view.room_type_prior)),
+        )
