@@ -174,7 +174,9 @@ class MatchingCost:
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
         self._first = _Mode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, config, stride)
-        self._rival = None if rival is None else _Mode.of(*vars(rival).values(), reach_m, config, stride)
+        self._rival = None
+        if rival is not None:
+            self._rival = _Mode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, config, stride)
 
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None

@@ -85,8 +85,11 @@ class ViewValidation:
 
     def _measure(self, encoder: ViewEncoder, field_deg: float) -> dict[str, float]:
         config = self._config
-        angles = config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring)
-        seen = seen_by(*(torch.from_numpy(part).float() for part in angles), field_deg, field_deg / _ASPECT)
+        azimuths, elevations = (
+            torch.from_numpy(angles).float()
+            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
+        )
+        seen = seen_by(azimuths, elevations, field_deg, field_deg / _ASPECT)
         opacity = 255 * seen.to(torch.uint8)[None, :, :, None]
         nll, errors, confusion = [], [], np.zeros((len(OPENING_CLASSES),) * 2, dtype=int)
         for first in range(0, len(self._images), _BATCH):
@@ -96,10 +99,12 @@ class ViewValidation:
             features = encoder(images.to(self._device), self._heights[part].to(self._device))
             known = features.seen.cpu() >= MIN_SEEN
             target = self._log_profile[part]
-            modes = [value.cpu() for value in (features.log_profile, features.log_scale, features.log_share)]
-            nll.append(len(images) * float(losses.laplace_mixture(*modes, target, known)))
-            best = (modes[2] - modes[1]).argmax(dim=2, keepdim=True)
-            error = (modes[0].gather(2, best)[..., 0] - target).abs()
+            log_profile, log_scale, log_share = (
+                value.cpu() for value in (features.log_profile, features.log_scale, features.log_share)
+            )
+            nll.append(len(images) * float(losses.laplace_mixture(log_profile, log_scale, log_share, target, known)))
+            best = (log_share - log_scale).argmax(dim=2, keepdim=True)
+            error = (log_profile.gather(2, best)[..., 0] - target).abs()
             errors += [float(row[shown].median()) for row, shown in zip(error, known, strict=True)]
             prior = losses.opening_prior(encoder.opening_share, config.image.opening_balance)
             logits = torch.log_softmax(features.structure.opening_logits, dim=2) - prior.log()
