@@ -84,8 +84,8 @@ class OnnxViewEncoder:
             "image": np.stack([image for image, _ in patches]),
             "camera_height_m": np.full(len(patches), camera_height_m, np.float32),
         }
-        values = [array(value) for value in self._session.run(_VIEW_OUTPUTS, inputs)]
-        predicted = dict(zip(_VIEW_OUTPUTS, values, strict=True))
+        values = [array(value) for value in self._session.run(_OUTPUTS, inputs)]
+        predicted = dict(zip(_OUTPUTS, values, strict=True))
         modes = predicted["log_profile"].shape[2]
         circle = {
             "log_profile": np.zeros((columns, modes), np.float32),
