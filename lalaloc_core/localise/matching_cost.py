@@ -25,27 +25,28 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.cost_terms import (
+    WallMode,
+    ceiling_costs,
+    class_losses,
+    mean_log,
+    merged_into_walls,
+    room_type_losses,
+    smoothed,
+)
 from lalaloc_core.localise.layouts import Layouts
-from lalaloc_core.localise.poses import PredictedCeiling, PredictedRoomType, Query
+from lalaloc_core.localise.poses import Query
 
-# Smallest trusted scale of a predicted log distance: a centimetre at ten metres.
-_MIN_SCALE = 1e-3
-# Smallest trusted scale of a predicted log ceiling height, as plans round their ceilings.
-_MIN_CEILING_SCALE = 0.04
-_MIN_CLEARANCE_M = 0.05
-# `log` is slow, so multiply this many factors, each at most the maximum, before taking it.
-_FACTORS, _MAX_FACTOR = 4, 1e9
 # Pairs compared at a time, few enough to stay in the processor's cache.
 _CHUNK = 512
 
@@ -122,36 +123,6 @@ class _Views(NamedTuple):
     odds: Float[np.ndarray, "e"]
 
 
-class _Mode(NamedTuple):
-    """Mode of the predicted walls: centres, precisions and odds, each (k, w) or broadcast to that."""
-
-    centre: Float[np.ndarray, "k w"]
-    precision: Float[np.ndarray, "k w"]
-    odds: Float[np.ndarray, "#k #w"]
-
-    @classmethod
-    def of(
-        cls,
-        log_m: Float[np.ndarray, "k w"],
-        log_scale: Float[np.ndarray, "k w"],
-        odds: Float[np.ndarray, "#k #w"],
-        reach_m: float,
-        config: MatchingConfig,
-        stride: int,
-    ) -> _Mode:
-        values = log_m, precisions(log_m, log_scale, reach_m, config), odds
-        return cls(*(np.ascontiguousarray(value[:, ::stride], np.float32) for value in values))
-
-    def likelihood(self, log_m: np.ndarray, place: Any) -> np.ndarray:
-        """Return the likelihoods of log distances at places: an index into (k, w)."""
-        centre, precision = self.centre[place], self.precision[place]
-        return np.broadcast_to(self.odds, self.centre.shape)[place] / (1.0 + np.square((log_m - centre) * precision))
-
-    def likelihood_at(self, log_m: Float[np.ndarray, "n"], place: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the likelihoods of log distances at flat places."""
-        return self.odds.take(place) / (1.0 + np.square((log_m - self.centre.take(place)) * self.precision.take(place)))
-
-
 class MatchingCost:
     """Matching cost of the poses of one plan for one query.
 
@@ -173,10 +144,10 @@ class MatchingCost:
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
-        self._first = _Mode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, config, stride)
+        self._first = WallMode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, config.tail, stride)
         self._rival = None
         if rival is not None:
-            self._rival = _Mode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, config, stride)
+            self._rival = WallMode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, config.tail, stride)
 
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
@@ -365,7 +336,7 @@ class MatchingCost:
         predicted = self._query.room_type
         if predicted is None or not self._config.use_room_type:
             return np.zeros(len(self._plan.rooms))
-        losses = room_type_losses(predicted, self._config)
+        losses = room_type_losses(predicted, self._config.floor)
         return losses[[ROOM_TYPES.index(room.type) for room in self._plan.rooms]]
 
     def _ceilings(self, offset: Float[np.ndarray, "j"]) -> Float[np.ndarray, "j r"]:
@@ -374,92 +345,4 @@ class MatchingCost:
         if predicted is None or not self._config.use_ceiling:
             return np.zeros((len(offset), len(self._plan.rooms)))
         clearance_m = self._plan.ceiling_heights_m[None] - height.height_m * np.exp(offset)[:, None]
-        return ceiling_costs(predicted, clearance_m, offset[:, None], self._config)
-
-
-def precisions(
-    log_m: Float[np.ndarray, "k w"], log_scale: Float[np.ndarray, "k w"], reach_m: float, config: MatchingConfig
-) -> Float[np.ndarray, "k w"]:
-    """Return 1 / (κ s) for every hypothesis and azimuth, the factor of differences of log distance."""
-    scale = np.maximum(np.exp(log_scale), _MIN_SCALE)
-    return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-log_m)))
-
-
-def ceiling_costs(
-    predicted: PredictedCeiling,
-    clearance_m: Float[np.ndarray, "*#n"],
-    offset: Float[np.ndarray, "*#n"],
-    config: MatchingConfig,
-) -> Float[np.ndarray, "*n"]:
-    """Return the cost of ceilings at some heights (m) above the camera, each at a δ."""
-    difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)
-    scale = config.tail * np.hypot(np.exp(predicted.log_scale), _MIN_CEILING_SCALE)
-    return np.log1p(np.square(difference / scale))
-
-
-def room_type_losses(predicted: PredictedRoomType, config: MatchingConfig) -> Float[np.ndarray, "t"]:
-    """Return the cost of every room type; the unknown type costs as much as an uninformative prediction."""
-    ratio = config.floor + (1.0 - config.floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
-    loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))
-    return np.maximum(loss, 0.0)
-
-
-def merged_into_walls(share: Float[np.ndarray, "*n c"], claimed: Collection[int]) -> Float[np.ndarray, "*n c"]:
-    """Return shares of opening classes with those of classes outside `claimed` added to the walls'."""
-    merged = share.copy()
-    for code in range(len(OPENING_CLASSES)):
-        if code != WALL_CODE and code not in claimed:
-            merged[..., WALL_CODE] += share[..., code]
-    return merged
-
-
-def class_losses(
-    probability: Float[np.ndarray, "*n c"], prior: Float[np.ndarray, "c"], claimed: Collection[int], floor: float
-) -> Float[np.ndarray, "*n c"]:
-    """Return `-log q` of every opening class; classes outside `claimed` cost what walls do.
-
-    `probability` and `prior` are merged (`merged_into_walls`); `claimed` are the codes of the classes that the plan
-    shows completely; `floor` is ε.
-    """
-    loss = -np.log(floor + (1.0 - floor) * probability / prior)
-    unclaimed = [code for code in range(len(OPENING_CLASSES)) if code not in claimed]
-    loss[..., unclaimed] = loss[..., [WALL_CODE]]
-    return loss
-
-
-def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
-    """Return the Euclidean distance of each target to each latent, both of unit length."""
-    return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))
-
-
-def mean_log(
-    factor: Float[np.ndarray, "n w"], *, factors: int = _FACTORS, max_factor: float = _MAX_FACTOR
-) -> Float[np.ndarray, "n"]:
-    """Return the mean logarithm of each row.
-
-    Values of `factor`, from 1 upwards, are overwritten. So many `factors` are multiplied before the logarithm if they
-    divide the number of columns; values above `max_factor` count as that, so that products stay finite.
-    """
-    columns = factor.shape[1]
-    if columns % factors:
-        return np.log(factor).mean(axis=1)
-    np.minimum(factor, max_factor, out=factor)
-    width = columns // factors
-    product = factor[:, :width].copy()
-    for begin in range(width, columns, width):
-        product *= factor[:, begin : begin + width]
-    return np.log(product).sum(axis=1) / columns
-
-
-def smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np.ndarray, "k w c"]:
-    """Return probabilities by azimuth, blurred around the horizon by a Gaussian of `spread` radians."""
-    columns = probability.shape[1]
-    deviation = spread / TWO_PI * columns
-    if deviation < 0.3:
-        return probability
-    offset = (np.arange(columns) + columns // 2) % columns - columns // 2
-    kernel = np.exp(-0.5 * np.square(offset / deviation))
-    kernel = (kernel / kernel.sum())[(np.arange(columns)[:, None] - np.arange(columns)[None]) % columns]
-    # One matrix product for all hypotheses.
-    blurred = kernel @ probability.transpose(1, 0, 2).reshape(columns, -1)
-    return blurred.reshape(columns, len(probability), -1).transpose(1, 0, 2)
+        return ceiling_costs(predicted, clearance_m, offset[:, None], self._config.tail)

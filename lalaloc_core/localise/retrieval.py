@@ -13,9 +13,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.coarse_pass import PairLimits, likeliest
+from lalaloc_core.localise.cost_terms import latent_distances
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import NEGLIGIBLE, GridCosts
 from lalaloc_core.localise.ranking import suppress

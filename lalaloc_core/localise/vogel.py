@@ -10,10 +10,11 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.cost_terms import latent_distances
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.render.sampling import PoseSet
 

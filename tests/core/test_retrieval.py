@@ -18,9 +18,10 @@ from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, coarse_costs, likeliest
+from lalaloc_core.localise.cost_terms import latent_distances, precisions
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances, precisions
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled
 from lalaloc_core.localise.ranking import suppress
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve
@@ -156,7 +157,7 @@ class TestRetrieval:
         )
         config = MatchingConfig(latent_weight=0.7)
         residual = np.log(grid.profile_m)[None] - present(query.profile).log_m[:, None]
-        precision = precisions(query.profile.log_m, query.profile.log_scale, 0.3, config)
+        precision = precisions(query.profile.log_m, query.profile.log_scale, 0.3, config.tail)
         costs = np.log1p(np.square(residual * precision[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(present(grid.latents), query.latents)
         best = best_candidates(grid, query, top_k=1, config=config)[0]

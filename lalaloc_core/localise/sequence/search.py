@@ -17,8 +17,9 @@ from lalaloc_core.localise.bundle import ConfidenceModel, MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
+from lalaloc_core.localise.cost_terms import latent_distances
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingCost, latent_distances
+from lalaloc_core.localise.matching_cost import MatchingCost
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, run_steps
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import Posterior, area_shares

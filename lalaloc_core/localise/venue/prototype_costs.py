@@ -19,14 +19,8 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.matching_cost import (
-    MatchingConfig,
-    ceiling_costs,
-    mean_log,
-    precisions,
-    room_type_losses,
-    smoothed,
-)
+from lalaloc_core.localise.cost_terms import ceiling_costs, mean_log, precisions, room_type_losses, smoothed
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import PredictedCeiling, Query
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
@@ -61,7 +55,7 @@ class PrototypeCosts:
         self._every = max(1, len(query.roll) // AZIMUTHS)
         self._reach_m = config.grid_reach * STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
-        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, config)[
+        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, config.tail)[
             :: self._every, self._columns
         ].astype(np.float32)
         self.offsets = _offsets(query)
@@ -109,7 +103,7 @@ class PrototypeCosts:
         """Cost of each room type."""
         if self._query.room_type is None or not self._config.use_room_type:
             return np.zeros(len(ROOM_TYPES))
-        return self._weights.room_type * room_type_losses(self._query.room_type, self._config)
+        return self._weights.room_type * room_type_losses(self._query.room_type, self._config.floor)
 
     def _room_costs(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the cost of each prototype's room type and ceiling, and the penalty of its height hypothesis."""
@@ -120,7 +114,7 @@ class PrototypeCosts:
 
     def _ceilings(self, predicted: PredictedCeiling, ceiling_m: np.ndarray, offset: np.ndarray) -> np.ndarray:
         clearance_m = ceiling_m - self._query.camera_height.height_m * np.exp(offset)
-        return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._config)
+        return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._config.tail)
 
     def _openings(self, rows: np.ndarray, hypothesis: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the openings' term, by one table entry for every byte."""
