@@ -33,13 +33,16 @@ _ROLLS = np.radians(np.arange(-17.5, 17.6, 2.5))
 _YAWS = np.radians(np.arange(0.0, 90.0, 3.0))
 # Angular error of the coarse search, which steps over narrow peaks.
 _COARSE_SIGMA = math.radians(2.0)
-_STARTS = 12
-_REFINED = 4
-_STEPS = 12
+_STARTS = 16
+_REFINED = 3
+_APART = math.radians(3.0)
+_STEPS = 10
+# Step (radians) of numeric derivatives.
+_DELTA = 1e-5
 # Likelihoods of segments are not independent: one edge gives several.
-_TEMPERATURE = 0.2
+_TEMPERATURE = 0.15
 # Errors that lines do not show: lenses, edges that are not quite upright. Fitted on views cut from spheres.
-_FLOOR = np.radians([0.45, 0.3])
+_FLOOR = np.radians([0.5, 0.4])
 
 
 # Field of view of the longer side, if unknown: values to try, and the prior of log focal length of phones.
@@ -84,7 +87,7 @@ def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
     if not len(lines.length):
         return _attitude([(np.zeros(3), 0.0, np.diag(_PRIOR**2))])
-    return _attitude([_refined(lines, start) for start in _starts(lines)[:_REFINED]])
+    return _attitude([_refined(lines, start) for start in _starts(lines)])
 
 
 def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
@@ -135,8 +138,13 @@ def _directions(angles: np.ndarray) -> np.ndarray:
 
 def _errors(lines: Lines, directions: np.ndarray) -> np.ndarray:
     """Return the sine of the angle between each segment and the great circle to each direction, (n, d)."""
+    return (lines.normal @ directions.T) / _distances(lines, directions)
+
+
+def _distances(lines: Lines, directions: np.ndarray) -> np.ndarray:
+    """Return the sine of the angle between the middle of each segment and each direction, (n, d)."""
     along = lines.middle @ directions.T
-    return (lines.normal @ directions.T) / np.sqrt(np.maximum(1.0 - along * along, 1e-3))
+    return np.sqrt(np.maximum(1.0 - along * along, 1e-3))
 
 
 def _sigmas(lines: Lines, least: float) -> np.ndarray:
@@ -171,7 +179,12 @@ def _starts(lines: Lines) -> list[np.ndarray]:
         best = int(np.argmax(full))
         found.append((full[best] + prior[index], np.array([pitch[index], roll[index], _YAWS[best]])))
     found.sort(key=lambda start: -start[0])
-    return [start for _, start in found]
+    starts: list[np.ndarray] = []
+    for _, start in found:
+        # Neighbours on the grid lead to the same attitude.
+        if all(np.abs(start[:2] - kept[:2]).max() > _APART for kept in starts):
+            starts.append(start)
+    return starts[:_REFINED]
 
 
 def _refined(lines: Lines, angles: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
@@ -179,16 +192,18 @@ def _refined(lines: Lines, angles: np.ndarray) -> tuple[np.ndarray, float, np.nd
     prior = np.array([*(1.0 / _PRIOR**2), 0.0])
     weight = _weights(lines)
     for step in range(_STEPS):
-        least = max(_SIGMA, _COARSE_SIGMA * 0.7**step)
-        sigma = _sigmas(lines, least)[:, None]
-        error = _errors(lines, _directions(angles))
+        sigma = _sigmas(lines, max(_SIGMA, _COARSE_SIGMA * 0.7**step))[:, None]
+        directions = _directions(angles)
+        distance = _distances(lines, directions)
+        error = (lines.normal @ directions.T) / distance
         density = _SHARES * _densities(error, sigma)
         share = weight[:, None] * density / (density.sum(axis=1, keepdims=True) + _OUTLIERS) / sigma**2
-        slopes = np.stack(
-            [(_errors(lines, _directions(angles + delta)) - error) / 1e-5 for delta in 1e-5 * np.eye(3)], axis=-1
-        )
-        information = np.einsum("nd,ndi,ndj->ij", share, slopes, slopes) + np.diag(prior) + 1e-3 * np.eye(3)
-        gradient = np.einsum("nd,ndi,nd->i", share, slopes, error) + prior * angles
+        # The distance changes as well, but for small errors it does not matter.
+        change = [(_directions(angles + delta) - directions) / _DELTA for delta in _DELTA * np.eye(3)]
+        slopes = np.stack([(lines.normal @ turn.T) / distance for turn in change])
+        weighted = share * slopes
+        information = np.einsum("ind,jnd->ij", weighted, slopes) + np.diag(prior) + 1e-3 * np.eye(3)
+        gradient = np.einsum("ind,nd->i", weighted, error) + prior * angles
         angles = angles - np.linalg.solve(information, gradient)
     density = _SHARES * _densities(_errors(lines, _directions(angles)), sigma)
     score = float(weight @ np.log(density.sum(axis=1) + _OUTLIERS) - 0.5 * (prior * angles * angles).sum())

@@ -12,7 +12,7 @@ from lalaloc_core.photograph.cameras import Camera
 
 # Shorter segments, as a share of the picture's longer side, are mostly texture.
 _MIN_LENGTH = 0.025
-_MAX_SEGMENTS = 250
+_MAX_SEGMENTS = 150
 # OpenCV counts from the centre of the first pixel.
 _HALF_PIXEL = 0.5
 

@@ -133,6 +133,22 @@ class TestProjection:
         with pytest.raises(InvalidPanoramaError, match="nothing tells the photograph's field of view"):
             opened(content)
 
+    def test_damaged_exif_is_an_error_or_ignored(self) -> None:
+        content = jpeg(np.full((96, 128, 3), 200, np.uint8), PHONE, orientation=6)
+        begin = content.index(b"Exif") + 6
+        rng = np.random.default_rng(0)
+        messages = []
+        for _ in range(100):
+            damaged = bytearray(content)
+            for position in rng.integers(begin, begin + 80, 3):
+                damaged[position] = rng.integers(0, 256)
+            try:
+                opened(bytes(damaged))
+            except InvalidPanoramaError as error:
+                messages.append(str(error))
+        assert 0 < len(messages) < 100
+        assert all("send hfov_deg" in message or "damaged" in message for message in messages)
+
     def test_similar_borders_alone_make_no_sphere(self) -> None:
         tile = np.random.default_rng(0).integers(0, 256, (8, 16, 3)).astype(np.uint8)
         smooth = cv2.resize(np.concatenate([tile, tile[:, ::-1]], axis=1), (256, 128))
