@@ -41,6 +41,8 @@ from service.storage.disk_reserve import LOG_BYTES, DiskReserve
 from service.telemetry import LOGGER_NAME
 
 Result = TypeVar("Result")
+# Steps of `give_back` per call, and the pause (s) after each, longer than the interval at which SQLite polls its lock.
+_MAX_STEPS, _PAUSE_S = 40, 0.12
 _WRITER = "lalaloc_writer"
 _SQLITE_WAIT_MS = 5000
 # Time limits of the server, so that a stuck statement or lock never holds a connection for good.
@@ -152,12 +154,16 @@ class Database:
         if (disk := self._disk) is None:
             return
         with self._driver_cursor() as cursor:
-            while disk.has_surplus(cursor):
+            for _ in range(_MAX_STEPS):
+                if not disk.has_surplus(cursor):
+                    break
                 try:
                     disk.return_pages(cursor)
                 except sqlite3.OperationalError:
                     if not disk.release():
                         raise
+                # SQLite polls for its lock, so without a pause other writers would starve.
+                time.sleep(_PAUSE_S)
             disk.copy_log(cursor)
         disk.restore()
 
