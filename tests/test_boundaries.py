@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -272,3 +273,21 @@ def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr or "torch was imported"
+
+
+def test_no_name_is_undefined() -> None:
+    # ruff's own check is off, because it takes the dimensions in array types for names.
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "json", "."]
+    found = json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout)
+    undefined = []
+    for path in {entry["filename"] for entry in found}:
+        names = {
+            (node.lineno, node.col_offset + 1): node.id
+            for node in ast.walk(ast.parse(Path(path).read_text(encoding="utf-8")))
+            if isinstance(node, ast.Name)
+        }
+        places = [
+            (entry["location"]["row"], entry["location"]["column"]) for entry in found if entry["filename"] == path
+        ]
+        undefined += [f"{path}:{place[0]}: {names[place]}" for place in places if place in names]
+    assert undefined == []
