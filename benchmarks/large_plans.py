@@ -92,9 +92,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     grids: list[PoseGrid] = []
 
     def prepare() -> None:
-        grid = embed(
-            plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m, after_chunk=lambda _share, _s: None
-        )
+        grid = embed(plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m)
         grid.binned(plan)
         grids.append(grid)
 

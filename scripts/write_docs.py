@@ -76,6 +76,7 @@ def folder_map() -> str:
 def metrics_table() -> str:
     """Return the service's metrics as a Markdown table, from the calls that create them."""
     kinds = {"counter": "counter", "gauge": "gauge", "_gauge": "gauge", "Histogram": "histogram"}
+    kinds |= {"tenant_counter": "counter", "tenant_gauge": "gauge"}
     metrics = {}
     for path in sorted((ROOT / "service").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -11,6 +11,7 @@ grids/      pose grids of plans, computed once for all replicas
 storage/    database: plans, pose grids, keys, kept answers
 pools/      pools of worker processes
 workers/    programs of the worker processes
+tenancy/    sharing of CPU time and uploads between tenants
 telemetry/  metrics, logs and traces
 renditions/ files made from plans
 conversion/ plan files, read and written in worker processes
@@ -18,6 +19,6 @@ on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
 Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP),
-`cores.py` (division of the cores), `fair_share.py` (sharing between tenants), `threads.py`, `bounded_cache.py`,
-`stored_plan.py`, and the command lines `cli.py`, `openapi.py`, `__main__.py`.
+`cores.py` (division of the cores), `threads.py`, `bounded_cache.py`, `stored_plan.py`, `uploaded_file.py`, and the
+command lines `cli.py`, `openapi.py`, `__main__.py`.
 """

@@ -11,6 +11,8 @@ LaLaLocError
     ├── UnanchoredPlanError         the floor plan has no anchor
     ├── NoPlanNearbyError           no anchored floor plan near the given place
     ├── UploadTooLargeError         the body exceeds its size limit
+    ├── SpoolFullError              no disk space for the body
+    ├── BytesInFlightError          no room for the body beside others in progress
     ├── UploadTimeoutError          an upload that is too slow
     ├── UnsupportedMediaError       an unsupported media type
     │   └── UnsupportedEncodingError    a compressed body
@@ -130,6 +132,19 @@ class UploadTooLargeError(ServiceError):
     def __init__(self, name: str, limit: int, stated: int | None = None) -> None:
         size = "is too large" if stated is None else f"has {stated} bytes"
         super().__init__(f"the body {size}; the limit is {limit} bytes (LALALOC_{name.upper()})")
+
+
+class BytesInFlightError(ServiceError):
+    """The bodies in progress, of the tenant or of all together, leave no room for this one."""
+
+    retry_after_s = 2
+
+    def __init__(self, count: int, in_use: int, limit: int, setting: str) -> None:
+        whose = "all uploads" if setting.endswith("TOTAL_BYTES") else "your uploads"
+        super().__init__(
+            f"the body needs {count} bytes; {whose} in progress have {in_use} of {limit} bytes ({setting}). Retry "
+            f"after {self.retry_after_s} s"
+        )
 
 
 class UploadTimeoutError(ServiceError):
@@ -286,6 +301,18 @@ class StoreFullError(StoreUnavailableError):
 
     def __init__(self) -> None:
         super().__init__("the database's disk is full; nothing can be stored until space is freed")
+
+
+class SpoolFullError(ServiceError):
+    """An upload could not be written to a temporary file."""
+
+    retry_after_s = 60
+
+    def __init__(self, memory_bytes: int) -> None:
+        super().__init__(
+            f"an upload of more than {memory_bytes} bytes (LALALOC_UPLOAD_MEMORY_BYTES) could not be written to a "
+            "temporary file: the disk is full or read-only (TMPDIR)"
+        )
 
 
 class UnauthenticatedError(ServiceError):

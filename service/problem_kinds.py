@@ -22,6 +22,7 @@ from lalaloc_core.errors import (
     SeveralLevelsError,
 )
 from service.errors import (
+    BytesInFlightError,
     ConverterNotReadyError,
     DamagedDataError,
     DeadlineExceededError,
@@ -42,6 +43,7 @@ from service.errors import (
     RevisionMismatchError,
     ServiceError,
     ShareExceededError,
+    SpoolFullError,
     StoppingError,
     StorageQuotaError,
     StoreBusyError,
@@ -102,6 +104,8 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     UnanchoredPlanError: ProblemKind(409, "floorplan-unanchored", "Floor plan has no anchor"),
     NoPlanNearbyError: ProblemKind(404, "no-floorplan-nearby", "No floor plan nearby"),
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
+    BytesInFlightError: ProblemKind(503, "overloaded", "Overloaded"),
+    SpoolFullError: ProblemKind(507, "store-full", "Storage full"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload timed out"),
     UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
     UnsupportedEncodingError: ProblemKind(415, "unsupported-media", "Unsupported media type"),

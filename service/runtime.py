@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -17,7 +17,7 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from service.conversion import Converter, RenditionCache
-from service.fair_share import with_headroom
+from service.cores import usable_cores
 from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
@@ -35,8 +35,10 @@ from service.schemas import ModelAnswer
 from service.security import AccessControl
 from service.settings import Settings
 from service.storage import PlanLookup, Store, open_store
+from service.storage.records import DEFAULT_TENANT
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
+from service.tenancy.fair_share import FairSemaphore, with_headroom
 from service.threads import BoundedReads, Threads
 
 # Queries read little: a plan, and a pose grid that is not in memory.
@@ -73,6 +75,7 @@ class Runtime:
         file_uploads: threads for uploads that wait for the converter.
         reads: store reads of queries.
         renditions: files made from stored plans.
+        permits: permits to compute, of which each piece of work holds one.
     """
 
     settings: Settings
@@ -92,6 +95,7 @@ class Runtime:
     file_uploads: Threads
     reads: BoundedReads
     renditions: RenditionCache
+    permits: FairSemaphore
 
     @property
     def ready(self) -> bool:
@@ -109,7 +113,7 @@ class Backends:
         localisers: builds the localisers; None: this process computes answers.
     """
 
-    optimiser: Callable[[Bundle, Settings, Telemetry], OptimiserBackend]
+    optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore], OptimiserBackend]
     encoders: Callable[[Bundle, Settings], Encoders]
     localisers: Callable[[ModelAnswer, Settings, Telemetry], tuple[LocaliserBackend, VenueLocaliserBackend]] | None = (
         None
@@ -153,9 +157,10 @@ def start_runtime(
     store = _closing(cleanup, open_store(settings))
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
     components = _QueryComponents.start(settings, telemetry, cleanup, backends, bundle, store)
-    uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS))
+    uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts))
     # As many threads as converter processes. Closed after the converter, because its waiting jobs must end first.
-    file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.imports.workers)))
+    file_threads = Threads("lalaloc-files", with_headroom(settings.imports.workers), telemetry.cpu_accounts)
+    file_uploads = _closing(cleanup, file_threads)
     converter = _closing(cleanup, Converter(settings, telemetry))
     # A file can take its worker longer than the service may take to stop.
     components.admission.at_stop(converter.close)
@@ -199,6 +204,7 @@ def start_runtime(
         file_uploads=file_uploads,
         reads=components.reads,
         renditions=_closing(cleanup, renditions),
+        permits=components.permits,
     )
 
 
@@ -216,6 +222,7 @@ class _QueryComponents:
     decoder: Decoder
     admission: Admission
     reads: BoundedReads
+    permits: FairSemaphore
 
     @classmethod
     def start(
@@ -228,10 +235,13 @@ class _QueryComponents:
         store: Store,
     ) -> _QueryComponents:
         """Start the worker processes in the background and load the model."""
+        cores = settings.cores
+        count = cores.compute_threads + cores.workers + settings.decode.workers
+        permits = FairSemaphore(with_headroom(count), telemetry.cpu_accounts, cores=usable_cores())
         # Start the workers first: they load torch while this process loads the model.
-        optimiser = backends.optimiser(bundle, settings, telemetry)
+        optimiser = backends.optimiser(bundle, settings, telemetry, permits)
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
-        decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry))
+        decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry, permits))
         decoder.start()
         encoders = backends.encoders(bundle, settings)
         return cls(
@@ -240,11 +250,12 @@ class _QueryComponents:
             bundle=bundle,
             store=store,
             encoders=encoders,
-            grids=_closing(cleanup, GridProvider(store, encoders, bundle.sha256, settings, telemetry)),
+            grids=_closing(cleanup, GridProvider(store, encoders, bundle.sha256, settings, telemetry, permits)),
             optimiser=optimiser,
             decoder=decoder,
-            admission=Admission(AdmissionLimits.from_settings(settings), telemetry),
+            admission=_admission(settings, telemetry, store),
             reads=_closing(cleanup, _reads(settings, threads=_READ_THREADS, max_pending=settings.pending_limit)),
+            permits=permits,
         )
 
     def localiser(self) -> Localiser:
@@ -259,6 +270,7 @@ class _QueryComponents:
             queries=self.admission.queries,
             reads=self.reads,
             telemetry=self.telemetry,
+            permits=self.permits,
         )
 
     def venue_plans(self) -> VenuePlans:
@@ -290,6 +302,21 @@ def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
     """Register a component to be closed, and return it."""
     cleanup.callback(part.close, *arguments)
     return part
+
+
+def _admission(settings: Settings, telemetry: Telemetry, store: Store) -> Admission:
+    def by_tenant(values: Mapping[str, float]) -> Mapping[str, float]:
+        # Without keys clients are addresses, and all of them are one tenant.
+        return values if settings.access.api_keys else {DEFAULT_TENANT: sum(values.values())}
+
+    limits = store.tenant_limits
+    telemetry.cpu_accounts.share = lambda client: limits.of(client).cpu_share or 1.0
+    return Admission(
+        AdmissionLimits.from_settings(settings),
+        telemetry,
+        bytes_limit_of=lambda client: limits.of(client).bytes_in_flight,
+        by_tenant=by_tenant,
+    )
 
 
 def _reads(settings: Settings, *, threads: int, max_pending: int) -> BoundedReads:

@@ -199,6 +199,20 @@ class UploadSettings(SettingGroup):
         allow_inf_nan=False,
         description="Minimum upload rate; an upload can lag behind it by `LALALOC_UPLOAD_IDLE_S`.",
     )
+    memory_bytes: Count = Field(
+        default=2**20,
+        description="Uploaded files beyond this size pass through unnamed temporary files in `TMPDIR`, which end with "
+        "the request; without such a folder they stay in memory. Mount it in memory to keep photographs off the disk.",
+    )
+    tenant_bytes: Count = Field(
+        default=256 * 2**20,
+        description="Bytes of request bodies in progress per tenant, for tenants without a limit of their own "
+        "(`lalaloc-service tenants limit`); further ones get 503, or 413 if the body alone exceeds it.",
+    )
+    total_bytes: Count = Field(
+        default=448 * 2**20,
+        description="Bytes of request bodies in progress, of all tenants together; further ones get 503.",
+    )
 
 
 class RequestSettings(SettingGroup):

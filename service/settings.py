@@ -17,7 +17,6 @@ from pydantic.fields import FieldInfo
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.bundle import default_bundle
 from service.cores import CoreShares, share_cores, usable_cores
-from service.fair_share import with_headroom
 from service.setting_groups import (
     AccessSettings,
     ComputeSettings,
@@ -33,6 +32,7 @@ from service.setting_groups import (
     StorageSettings,
     UploadSettings,
 )
+from service.tenancy.fair_share import with_headroom
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from contextvars import copy_context
 from typing import Any, ParamSpec, TypeVar
 
 from service.errors import StoreUnavailableError
-from service.fair_share import FairSemaphore
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,30 +22,39 @@ class Threads:
     Args:
         name: prefix of thread names.
         count: number of threads.
+        accounts: CPU time of the clients; calls are charged to theirs.
+        permits: permits to compute, of which each call holds one; None: calls need none.
     """
 
-    def __init__(self, name: str, count: int) -> None:
+    def __init__(
+        self, name: str, count: int, accounts: CpuAccounts | None = None, permits: FairSemaphore | None = None
+    ) -> None:
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
-        self._semaphore = FairSemaphore(count)
+        self._accounts = accounts or CpuAccounts()
+        self._semaphore = FairSemaphore(count, self._accounts)
+        self._permits = permits
 
     async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a call for a client and return its result; a call that has begun is never cancelled."""
         await self._semaphore.acquire(client)
-        loop = asyncio.get_running_loop()
-
-        def release(_future: Future[T]) -> None:
-            # The loop can be closed already.
-            with suppress(RuntimeError):
-                loop.call_soon_threadsafe(self._semaphore.release, client)
-
+        taken = [self._semaphore]
         try:
-            future = self.submit(work, *args, **kwargs)
+            if self._permits is not None:
+                await self._permits.acquire(client)
+                taken.append(self._permits)
+            future = self.submit(self._charged, client, work, *args, **kwargs)
         except BaseException:
-            self._semaphore.release(client)
+            for semaphore in taken:
+                semaphore.release(client)
             raise
         # Released when the thread is done, even if the caller was cancelled.
-        future.add_done_callback(release)
+        for semaphore in taken:
+            future.add_done_callback(lambda _future, semaphore=semaphore: semaphore.release(client))
         return await asyncio.wrap_future(future)
+
+    def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._accounts.charged(client):
+            return work(*args, **kwargs)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Start a call in the caller's context, so that its log lines have the request's ids."""

@@ -86,7 +86,7 @@ FORBIDDEN = {
 }
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
-    "fair_share",
+    "tenancy uploaded_file",
     "cores settings setting_groups setting_types errors problem_kinds schemas stored_plan threads bounded_cache "
     "telemetry",
     "renditions",

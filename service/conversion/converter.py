@@ -27,6 +27,8 @@ _Pool = WorkerPool[ImportJob | RenditionJob, _Result]
 _QUEUE = 16
 # A worker that spends longer than `max_import_s` plus this margin on a file is replaced.
 _STALL_MARGIN_S = 10.0
+# Beside busy cores, a worker gets a tenth of the time of a query.
+_NICE = 10
 
 
 class Converter:
@@ -132,12 +134,14 @@ class Converter:
                     run_converter,
                     (settings.plans.import_limits, settings.imports.memory_bytes),
                     stall_s=settings.plans.max_import_s + _STALL_MARGIN_S,
+                    nice=_NICE,
                 )
                 self._pool = WorkerPool(
                     spec,
                     workers=settings.imports.workers,
                     queue_limit=_QUEUE,
                     keep_spare=True,
+                    accounts=self._telemetry.cpu_accounts,
                     on_restart=lambda _reason: self._telemetry.note_restart("import"),
                 )
                 self._pool.start()

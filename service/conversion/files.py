@@ -15,6 +15,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, detect_format, detect_media_type, import_if_native, is_json
 from service.conversion.converter import Converter
 from service.settings import Settings
+from service.tenancy.fair_share import FairSemaphore
+from service.uploaded_file import UploadedFile
 from service.workers.convert import report_of
 
 _MAX_IN_PROCESS_BYTES = 2 * 2**20
@@ -35,13 +37,32 @@ class PlanFile:
     media_type: str
 
 
-def seems_native(content: bytes) -> bool:
+def seems_native(file: UploadedFile) -> bool:
     """Return whether a file looks like a small native plan, which needs no worker."""
+    return len(file) <= _MAX_IN_PROCESS_BYTES and _seems_native(file.read())
+
+
+def _seems_native(content: bytes) -> bool:
     return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and describe_file(content) is None
 
 
-def convert(content: bytes, options: ImportOptions, converter: Converter, settings: Settings, client: str) -> PlanFile:
+def convert(
+    content: bytes,
+    options: ImportOptions,
+    converter: Converter,
+    settings: Settings,
+    client: str,
+    permits: FairSemaphore,
+) -> PlanFile:
     """Convert an uploaded file to a plan. Blocks.
+
+    Args:
+        content: the file.
+        options: options of the import.
+        converter: workers for files that are not in the native format.
+        settings: the settings.
+        client: client of the upload.
+        permits: permits to compute in this process.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
@@ -55,12 +76,14 @@ def convert(content: bytes, options: ImportOptions, converter: Converter, settin
     if not content.strip():
         raise InvalidFloorPlanError("the body is empty; send a plan file")
     limits = settings.plans.import_limits
-    if seems_native(content):
-        imported = import_if_native(content, options, limits)
-        if imported is not None:
-            return PlanFile(imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native"))
+    if _seems_native(content):
+        with permits.hold(client):
+            imported = import_if_native(content, options, limits)
+            if imported is not None:
+                return PlanFile(imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native"))
     elif not is_json(content):
         # Reject unsupported formats before they take a worker.
         detect_format(content, limits)
     result = converter.read(content, options, client)
-    return PlanFile(FloorPlan.from_dict(result.document, limits.plan), result.report, result.media_type)
+    with permits.hold(client):
+        return PlanFile(FloorPlan.from_dict(result.document, limits.plan), result.report, result.media_type)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 
 from lalaloc_core.errors import LaLaLocError
@@ -22,12 +23,12 @@ from service.errors import (
 from service.grids.embedding import check_size, embed
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob, GridJobs
-from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
 from service.storage.records import millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
+from service.tenancy.fair_share import FairSemaphore
 
 # Duration and interval (s) of retries to store a finished grid.
 _KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0
@@ -77,7 +78,7 @@ class GridBuilder:
         store: Store,
         encoders: Encoders,
         cache: GridCache,
-        throttle: BackgroundThrottle,
+        permits: FairSemaphore,
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
@@ -87,14 +88,14 @@ class GridBuilder:
             store: the store.
             encoders: the networks.
             cache: receives finished grids.
-            throttle: gives queries priority.
+            permits: permits to compute, which queries need as well.
             settings: the settings.
             telemetry: the metrics.
         """
         self._store = store
         self._encoders = encoders
         self._cache = cache
-        self._throttle = throttle
+        self._permits = permits
         self._settings = settings
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
@@ -132,9 +133,12 @@ class GridBuilder:
         if attempts > _MAX_ATTEMPTS:
             reason = f"its pose grid was begun {_MAX_ATTEMPTS} times and never finished"
             raise PlanFailedError(job.plan_id, reason)
-        with self._telemetry.timed(self._telemetry.grid_seconds):
-            grid = self._embed(job, record.plan)
-        prototypes = SortedPrototypes.of_grid(grid, record.plan)
+        # Small grids that interrupt this one are charged to the same client.
+        with self._telemetry.cpu_accounts.charged(record.tenant):
+            with self._telemetry.timed(self._telemetry.grid_seconds):
+                grid = self._embed(job, record.plan, record.tenant)
+            with self._permits.hold(record.tenant):
+                prototypes = SortedPrototypes.of_grid(grid, record.plan)
         try:
             if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
                 raise UnknownFloorPlanError(job.plan_id)
@@ -146,27 +150,37 @@ class GridBuilder:
         self._cache.put(job.key, grid)
         return grid
 
-    def _embed(self, job: GridJob, plan: FloorPlan) -> PoseGrid:
+    def _embed(self, job: GridJob, plan: FloorPlan, client: str) -> PoseGrid:
         heartbeat = _LeaseHeartbeat(lambda: self._renew(job), self._settings.grids.grid_lease_s / _HEARTBEATS)
 
-        def after_chunk(progress: float, worked_s: float) -> None:
-            job.progress = progress
+        def check() -> None:
             # All of them: during a small grid, the lease of the large one that it interrupts must be renewed, too.
             for running in self._heartbeats:
                 running.beat()
             if heartbeat.lost:
                 # Leases are deleted with their plan; in that case the job fails when it is polled.
                 raise _LeaseLostError
-            if progress < 1.0:
-                self.jobs.preempt(job)
-                self._throttle.pause(worked_s)
             if job.cancelled.is_set():
                 raise self._why_cancelled(job)
+
+        def after_chunk(progress: float) -> None:
+            job.progress = progress
+            if progress < 1.0:
+                self.jobs.preempt(job)
+            check()
 
         height_m = job.key.camera_height_m
         self._heartbeats.append(heartbeat)
         try:
-            return embed(plan, self._encoders, step_m=job.key.step_m, camera_height_m=height_m, after_chunk=after_chunk)
+            return embed(
+                plan,
+                self._encoders,
+                step_m=job.key.step_m,
+                camera_height_m=height_m,
+                computing=partial(self._permits.hold, client),
+                after_room=check,
+                after_chunk=after_chunk,
+            )
         finally:
             self._heartbeats.pop()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import perf_counter
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 
@@ -29,7 +29,9 @@ def embed(
     *,
     step_m: float,
     camera_height_m: float,
-    after_chunk: Callable[[float, float], None],
+    computing: Callable[[], AbstractContextManager[None]] = nullcontext,
+    after_room: Callable[[], None] = lambda: None,
+    after_chunk: Callable[[float], None] = lambda _progress: None,
 ) -> PoseGrid:
     """Sample and render the poses of a plan, and embed them if the model compares latents.
 
@@ -38,34 +40,37 @@ def embed(
         encoders: the networks.
         step_m: grid step (m).
         camera_height_m: camera height (m).
-        after_chunk: called with the share done (0 to 1) and the duration (s) of the last chunk, and with zeros after
-            each room of the sampling; an error that it raises ends the work.
+        computing: entered for the sampling and for each chunk, so that queries take turns with them.
+        after_room: called after each room of the sampling; an error that it or `after_chunk` raises ends the work.
+        after_chunk: called with the share done (0 to 1), without a permit.
 
     Raises:
         InvalidPoseError: the networks return non-finite latents at this camera height.
     """
-    poses = pose_grid(plan, step_m, after_room=lambda: after_chunk(0.0, 0.0))
+    with computing():
+        poses = pose_grid(plan, step_m, after_room)
     chunk = _RENDERED if encoders.predicts_profile else _EMBEDDED
     layouts, latents = [], []
     for first in range(0, len(poses), chunk):
-        begin = perf_counter()
         part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])
-        seen = encoders.rendered(plan, part)
-        layouts.append(seen)
-        is_finite = bool(np.isfinite(seen.log_profile).all())
-        if not encoders.predicts_profile:
-            heights = np.full(len(part), camera_height_m)
-            latent = encoders.layouts(np.exp(seen.log_profile), heights, plan.ceiling_heights_m[part.room_index])
-            latents.append(latent.astype(np.float32, copy=False))
-            is_finite &= bool(np.isfinite(latent).all())
+        with computing():
+            seen = encoders.rendered(plan, part)
+            layouts.append(seen)
+            is_finite = bool(np.isfinite(seen.log_profile).all())
+            if not encoders.predicts_profile:
+                heights = np.full(len(part), camera_height_m)
+                latent = encoders.layouts(np.exp(seen.log_profile), heights, plan.ceiling_heights_m[part.room_index])
+                latents.append(latent.astype(np.float32, copy=False))
+                is_finite &= bool(np.isfinite(latent).all())
         if not is_finite:
             raise InvalidPoseError(f"the model has no latents at camera_height_m {camera_height_m:g}")
-        after_chunk(min(first + chunk, len(poses)) / len(poses), perf_counter() - begin)
-    whole = joined_layouts(layouts, poses.room_index)
-    if not latents:
-        return PoseGrid.without_latents(poses, whole, step_m, camera_height_m)
-    profile_m = np.exp(whole.log_profile)
-    return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
+        after_chunk(min(first + chunk, len(poses)) / len(poses))
+    with computing():
+        whole = joined_layouts(layouts, poses.room_index)
+        if not latents:
+            return PoseGrid.without_latents(poses, whole, step_m, camera_height_m)
+        profile_m = np.exp(whole.log_profile)
+        return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
 
 
 def check_size(plan: FloorPlan, settings: Settings) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-import threading
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 from lalaloc_core.floorplan import FloorPlan
@@ -18,18 +18,16 @@ from service.grids.builder import GridBuilder
 from service.grids.embedding import check_size, embed
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
-from service.grids.throttle import BackgroundThrottle
 from service.schemas import PlanStatus
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
+from service.tenancy.fair_share import FairSemaphore
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16
-# Time (s) that an upload waits for its turn to compute a small grid before it leaves it to the background.
-_INLINE_WAIT_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,13 @@ class GridState:
 class GridProvider:
     """Pose grids of one model at one grid step.
 
-    Attributes:
-        throttle: priority of queries over the computation of grids.
+    Args:
+        store: the store.
+        encoders: the networks.
+        model_sha256: digest of the model.
+        settings: the settings.
+        telemetry: the metrics.
+        permits: permits to compute, which queries need as well.
     """
 
     def __init__(
@@ -77,16 +80,16 @@ class GridProvider:
         model_sha256: str,
         settings: Settings,
         telemetry: Telemetry,
+        permits: FairSemaphore,
     ) -> None:
         self._store = store
         self._encoders = encoders
         self._model_sha256 = model_sha256
         self._settings = settings
         self._telemetry = telemetry
-        self.throttle = BackgroundThrottle()
+        self._permits = permits
         self._cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
-        self._inline = threading.Lock()
-        self._jobs = GridBuilder(store, encoders, self._cache, self.throttle, settings, telemetry).jobs
+        self._jobs = GridBuilder(store, encoders, self._cache, permits, settings, telemetry).jobs
         self._unprepared = 0
         telemetry.gauge(
             "lalaloc_grids_pending", "Pose grids being computed or queued in this replica.", lambda: self.pending
@@ -145,11 +148,9 @@ class GridProvider:
         """
         check_size(plan, self._settings)
 
-    def prepare(self, plan: FloorPlan) -> ComputedGrid | None:
-        """Compute the own grid of a small plan at once; None leaves it to the background."""
-        if self._estimate(plan) > self._settings.grids.inline_grid_poses or not self._inline.acquire(
-            timeout=_INLINE_WAIT_S
-        ):
+    def prepare(self, plan: FloorPlan, client: str) -> ComputedGrid | None:
+        """Compute the own grid of a client's small plan at once; None leaves it to the background."""
+        if self._estimate(plan) > self._settings.grids.inline_grid_poses:
             return None
         try:
             with self._telemetry.timed(self._telemetry.grid_seconds):
@@ -158,16 +159,15 @@ class GridProvider:
                     self._encoders,
                     step_m=self._settings.grids.grid_step_m,
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
-                    after_chunk=lambda _progress, worked_s: self.throttle.pause(worked_s),
+                    computing=partial(self._permits.hold, client),
                 )
-            prototypes = SortedPrototypes.of_grid(grid, plan)
+            with self._permits.hold(client):
+                prototypes = SortedPrototypes.of_grid(grid, plan)
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
             # The background will fail as well, and store the error with the plan.
             logging.getLogger(LOGGER_NAME).exception("pose grid failed")
             return None
-        finally:
-            self._inline.release()
 
     def expected_bytes(self, plan: FloorPlan) -> int:
         """Estimate the stored bytes of a plan's own grid."""
@@ -218,7 +218,8 @@ class GridProvider:
         """
         key = self.key(record.revision_id, camera_height_m)
         on_demand = key.camera_height_mm != millimetres(record.plan.camera_height_m)
-        return self._jobs.add(key, plan_id=record.id, poses=self._estimate(record.plan), on_demand=on_demand).future
+        poses = self._estimate(record.plan)
+        return self._jobs.add(key, plan_id=record.id, poses=poses, on_demand=on_demand).future
 
     def progress(self, key: GridKey) -> float:
         """Return the computed share of a grid, 0 to 1; 0 for one that is not computed here."""

@@ -9,15 +9,17 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from time import monotonic
 
 from service.errors import DeadlineExceededError, OverloadedError, ShareExceededError, StoppingError
-from service.fair_share import FairQueue, FairSemaphore, Shares
+from service.http.bytes_in_flight import BytesInFlight
 from service.settings import Settings
 from service.telemetry import Telemetry
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairQueue, FairSemaphore, Shares
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 # Errors of every request whose path is not exempt.
@@ -47,12 +49,13 @@ class Slots:
     Args:
         limit: number of slots.
         max_waiting: number of requests that can wait for a slot in `wait_and_hold`, shared between clients as well.
+        accounts: CPU time of the clients, by which the waiting ones are served.
     """
 
-    def __init__(self, limit: int, max_waiting: int = 0) -> None:
+    def __init__(self, limit: int, max_waiting: int = 0, accounts: CpuAccounts | None = None) -> None:
         self._shares = Shares(limit)
         self._places = Shares(max_waiting)
-        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
+        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue(accounts or CpuAccounts())
         self._held_s = 0.0
 
     @property
@@ -80,7 +83,7 @@ class Slots:
 
     @asynccontextmanager
     async def wait_and_hold(self, client: str, deadline: float) -> AsyncIterator[None]:
-        """Wait for a slot and hold it; clients take turns.
+        """Wait for a slot and hold it; the client that used the least CPU time lately is first.
 
         Args:
             client: tenant or client address.
@@ -171,6 +174,8 @@ class AdmissionLimits:
         waiting_queries: queries that wait for a slot.
         reads: read-only requests.
         streams: event streams.
+        tenant_bytes: bytes of bodies in progress per client, for clients without a limit of their own.
+        total_bytes: bytes of bodies in progress.
         deadline_s: timeout of every request except streams; other timeouts normally end a request earlier.
     """
 
@@ -179,6 +184,8 @@ class AdmissionLimits:
     waiting_queries: int
     reads: int
     streams: int
+    tenant_bytes: int
+    total_bytes: int
     deadline_s: float
 
     @classmethod
@@ -190,6 +197,8 @@ class AdmissionLimits:
             waiting_queries=settings.requests.max_waiting_queries,
             reads=settings.requests.max_reads,
             streams=settings.requests.max_streams,
+            tenant_bytes=settings.uploads.tenant_bytes,
+            total_bytes=settings.uploads.total_bytes,
             # Time for the upload, the query or conversion, and sending the answer to a slow client.
             deadline_s=settings.uploads.deadline_s
             + max(settings.requests.request_deadline_s, settings.plans.import_deadline_s)
@@ -198,19 +207,49 @@ class AdmissionLimits:
 
 
 class Admission:
-    """Slots of one running app."""
+    """Slots of one running app.
 
-    def __init__(self, limits: AdmissionLimits, telemetry: Telemetry) -> None:
+    Args:
+        limits: limits of requests in progress.
+        telemetry: metrics, and the CPU time of the clients.
+        by_tenant: returns the values of clients as values of tenants.
+        bytes_limit_of: returns the limit of a client's bytes in flight; None: the one in `limits`.
+    """
+
+    def __init__(
+        self,
+        limits: AdmissionLimits,
+        telemetry: Telemetry,
+        bytes_limit_of: Callable[[str], int | None] = lambda _client: None,
+        by_tenant: Callable[[Mapping[str, float]], Mapping[str, float]] = lambda values: values,
+    ) -> None:
+        self.cpu_accounts = telemetry.cpu_accounts
         self.limits = limits
         self.requests = Slots(limits.requests)
-        self.queries = Slots(limits.queries, limits.waiting_queries)
+        self.queries = Slots(limits.queries, limits.waiting_queries, telemetry.cpu_accounts)
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
+
+        def limit_of(client: str) -> int:
+            own = bytes_limit_of(client)
+            return limits.tenant_bytes if own is None else own
+
+        self.bytes_in_flight = BytesInFlight(limits.total_bytes, limit_of)
         # More reads at a time would only delay queries, because they share one interpreter.
-        self.reading = FairSemaphore(_READS_AT_A_TIME)
+        self.reading = FairSemaphore(_READS_AT_A_TIME, telemetry.cpu_accounts)
         self.draining = False
         self.stopping = False
         self._at_stop: list[Callable[[], None]] = []
+        telemetry.tenant_counter(
+            "lalaloc_tenant_cpu_seconds",
+            "CPU time of each tenant's requests and pose grids.",
+            lambda: by_tenant(self.cpu_accounts.totals()),
+        )
+        telemetry.tenant_gauge(
+            "lalaloc_tenant_bytes_in_flight",
+            "Bytes of each tenant's request bodies in progress.",
+            lambda: by_tenant(self.bytes_in_flight.held()),
+        )
         telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in progress.", lambda: self.requests.in_use)
         telemetry.gauge(
             "lalaloc_queries_in_work",

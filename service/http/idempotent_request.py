@@ -209,10 +209,12 @@ def parts_sha256(parts: Parts) -> str:
     digest = hashlib.sha256()
     for kind, named in (("field", parts.fields), ("file", parts.files)):
         for name, value in sorted(named.items()):
-            content = value.encode("utf-8", "surrogatepass") if isinstance(value, str) else value
+            chunks = [value.encode("utf-8", "surrogatepass")] if isinstance(value, str) else value.chunks()
+            length = len(chunks[0]) if isinstance(chunks, list) else len(value)
             # Lengths make the encoding unambiguous.
-            digest.update(json.dumps([kind, name, len(content)]).encode("ascii"))
-            digest.update(content)
+            digest.update(json.dumps([kind, name, length]).encode("ascii"))
+            for chunk in chunks:
+                digest.update(chunk)
     return digest.hexdigest()
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from tempfile import SpooledTemporaryFile, TemporaryFile
 from time import monotonic
 from types import MappingProxyType
 from typing import Literal, Self, TypeVar
@@ -22,13 +23,16 @@ from starlette.requests import ClientDisconnect
 from service.errors import (
     InvalidRequestError,
     MalformedRequestError,
+    SpoolFullError,
     UnsupportedEncodingError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
 )
 from service.http.fields import describe_fault
+from service.http.request_end import on_request_end
 from service.settings import Settings
+from service.uploaded_file import UploadedFile
 
 JSON = "application/json"
 GEOJSON = "application/geo+json"
@@ -54,6 +58,7 @@ class UploadLimits:
         deadline_s: timeout of the whole upload.
         idle_s: timeout for the next bytes; also the tolerated delay behind `bytes_per_s`.
         bytes_per_s: minimum rate.
+        memory_bytes: size beyond which a file is written to disk.
     """
 
     max_bytes: int
@@ -61,6 +66,7 @@ class UploadLimits:
     deadline_s: float
     idle_s: float
     bytes_per_s: float
+    memory_bytes: int
 
     @classmethod
     def of(cls, settings: Settings, name: Settable) -> Self:
@@ -71,17 +77,18 @@ class UploadLimits:
             deadline_s=settings.uploads.deadline_s,
             idle_s=settings.uploads.idle_s,
             bytes_per_s=settings.uploads.bytes_per_s,
+            memory_bytes=settings.uploads.memory_bytes,
         )
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Multipart body: fields, and bytes of files; repeated files are `name[0]`, `name[1]`..."""
+    """Multipart body: fields and files; repeated files are `name[0]`, `name[1]`..."""
 
     fields: dict[str, str]
-    files: dict[str, bytes]
+    files: dict[str, UploadedFile]
 
-    def repeated(self, name: str) -> list[bytes]:
+    def repeated(self, name: str) -> list[UploadedFile]:
         """Return the repeated files of a name, in order."""
         count = sum(key.startswith(f"{name}[") for key in self.files)
         return [self.files[f"{name}[{index}]"] for index in range(count)]
@@ -111,14 +118,20 @@ def media_type(request: Request, accepted: tuple[str, ...]) -> str:
     return media
 
 
-async def read_body(request: Request, limits: UploadLimits) -> bytes:
+async def read_body(request: Request, limits: UploadLimits) -> UploadedFile:
     """Read the whole body.
 
     Raises:
-        UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
+        UploadTooLargeError, UploadTimeoutError, BytesInFlightError: a limit is exceeded.
+        StoreFullError: the body cannot be written to disk.
     """
-    async with _in_time(limits):
-        return b"".join([chunk async for chunk in _counted(request, limits)])
+    # Closed by `_kept`.
+    body = UploadFile(SpooledTemporaryFile(_memory_bytes(limits)), size=0)  # noqa: SIM115  # pyright: ignore[reportArgumentType]
+    with _spooling(limits):
+        async with _in_time(limits):
+            async for chunk in _counted(request, limits):
+                await body.write(chunk)
+    return _kept(request, body)
 
 
 async def read_parts(
@@ -157,19 +170,18 @@ async def read_parts(
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
     )
-    # Files stay in memory, within the limit: panoramas are never written to disk.
-    parser.spool_max_size = limits.max_bytes + _ENVELOPE_BYTES
+    parser.spool_max_size = _memory_bytes(limits)
     try:
-        async with _in_time(limits):
-            form = await parser.parse()
+        with _spooling(limits):
+            async with _in_time(limits):
+                form = await parser.parse()
     except MultiPartException as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
-    try:
-        return await _sort(form.multi_items(), limits, files, fields, check, repeated)
-    finally:
-        await form.close()
+    uploaded = {id(value): _kept(request, value) for _, value in form.multi_items() if isinstance(value, UploadFile)}
+    items = [(name, value if isinstance(value, str) else uploaded[id(value)]) for name, value in form.multi_items()]
+    return _sort(items, limits, files, fields, check, repeated)
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
@@ -195,8 +207,8 @@ def faults_of(
     return []
 
 
-async def _sort(
-    items: list[tuple[str, UploadFile | str]],
+def _sort(
+    items: list[tuple[str, UploadedFile | str]],
     limits: UploadLimits,
     files: set[str],
     fields: set[str],
@@ -218,15 +230,14 @@ async def _sort(
         if name in found.fields or name in found.files:
             faults.append((label, "given more than once"))
         elif part in fields:
-            if isinstance(value, UploadFile):
+            if isinstance(value, UploadedFile):
                 faults.append((label, "must be a plain field, not a file"))
             else:
                 found.fields[name] = value
-        elif isinstance(value, UploadFile):
-            content = await value.read()
-            if len(content) > limits.max_bytes:
-                raise UploadTooLargeError(limits.name, limits.max_bytes, len(content))
-            found.files[name] = content
+        elif isinstance(value, UploadedFile):
+            if len(value) > limits.max_bytes:
+                raise UploadTooLargeError(limits.name, limits.max_bytes, len(value))
+            found.files[name] = value
         else:
             faults.append((label, "must be a file (a part with a file name)"))
     given = {name for name, _ in items}
@@ -238,6 +249,33 @@ async def _sort(
     if faults:
         raise InvalidRequestError(faults)
     return found
+
+
+def _kept(request: Request, upload: UploadFile) -> UploadedFile:
+    """Return an uploaded file, which is deleted at the end of the request."""
+    file = UploadedFile(upload.file)
+    on_request_end(request.scope, file.close)
+    return file
+
+
+def _memory_bytes(limits: UploadLimits) -> int:
+    """Return the size beyond which a file is written to disk; 0, never, without a usable folder for it."""
+    try:
+        with TemporaryFile():
+            return limits.memory_bytes
+    except OSError:
+        return 0
+
+
+@contextmanager
+def _spooling(limits: UploadLimits) -> Iterator[None]:
+    """Turn errors of temporary files into the error of a full disk."""
+    try:
+        yield
+    except TimeoutError:
+        raise
+    except OSError as error:
+        raise SpoolFullError(limits.memory_bytes) from error
 
 
 async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:

@@ -11,9 +11,9 @@ from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.bundle import Bundle
-from service.fair_share import with_headroom
 from service.on_ray.replicas import EncoderReplica, IngressReplica, LpoReplica, SearchReplica
 from service.settings import Settings
+from service.tenancy.fair_share import with_headroom
 
 Replicas = Annotated[int, Field(ge=1, le=1000)]
 

@@ -72,7 +72,7 @@ class SearchReplica:
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
         backends = Backends(
-            optimiser=lambda _bundle, _settings, telemetry: RemoteOptimiser(lpo, telemetry),
+            optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(lpo, telemetry),
             encoders=lambda bundle, settings: RemoteEncoders(bundle, settings, encoder),
         )
         self._cleanup = ExitStack()
@@ -153,7 +153,7 @@ class IngressReplica:
             return plans, RemoteVenueLocaliser(self._search, settings, telemetry)
 
         backends = Backends(
-            optimiser=lambda _bundle, _settings, telemetry: RemoteOptimiser(self._lpo, telemetry),
+            optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(self._lpo, telemetry),
             encoders=warm_encoders,
             localisers=localisers,
         )

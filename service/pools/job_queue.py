@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from cachetools import TTLCache
 
-from service.fair_share import FairQueue, Shares
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairQueue, Shares
 
 LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
 
@@ -61,19 +62,31 @@ class PendingJob:
 
 
 class JobQueue:
-    """Jobs that wait for a worker, oldest first and clients in turn; safe to use from any thread."""
+    """Jobs that wait for a worker, those of the client with the least recent CPU time first. Thread-safe.
 
-    def __init__(self, limit: int, served_by: Callable[[float], bool], workers: Shares | None = None) -> None:
+    Attributes:
+        accounts: CPU time of the clients.
+    """
+
+    def __init__(
+        self,
+        limit: int,
+        served_by: Callable[[float], bool],
+        accounts: CpuAccounts,
+        workers: Shares | None = None,
+    ) -> None:
         """Create an empty queue.
 
         Args:
             limit: maximum number of waiting jobs, besides the running ones.
             served_by: tells whether a worker is expected to be warm at a time (`monotonic`).
+            accounts: CPU time of the clients; jobs are charged to theirs.
             workers: shares of the clients in the workers; None lets a client use all of them.
         """
+        self.accounts = accounts
         self._served_by = served_by
         self._workers = workers
-        self._waiting: FairQueue[PendingJob] = FairQueue()
+        self._waiting: FairQueue[PendingJob] = FairQueue(accounts)
         self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
         self._changed = threading.Condition()

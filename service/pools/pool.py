@@ -7,13 +7,15 @@ import hashlib
 import pickle
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from service.fair_share import Shares
 from service.pools.job_queue import JobLostError, JobQueue, PendingJob
 from service.pools.supervisor import Supervisor, WorkerSpec
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore, Shares
 
 # Several, so that no client waits while large jobs of others are copied.
 _SUBMITTING_THREADS = 8
@@ -42,6 +44,8 @@ class WorkerPool(Generic[Job, Result]):
         workers: int,
         queue_limit: int,
         keep_spare: bool = False,
+        accounts: CpuAccounts | None = None,
+        permits: FairSemaphore | None = None,
         on_restart: Callable[[str], None] = lambda _reason: None,
     ) -> None:
         """Create a pool, which `start` starts.
@@ -51,9 +55,14 @@ class WorkerPool(Generic[Job, Result]):
             workers: number of workers.
             queue_limit: maximum number of waiting jobs, besides the running ones.
             keep_spare: keep one worker free of clients that already have jobs running; for jobs that take seconds.
+            accounts: CPU time of the clients; jobs are charged to theirs.
+            permits: permits to compute, of which a job of `run_job` holds one; None: jobs need none.
             on_restart: called with the reason whenever a worker is replaced.
         """
-        self._queue = JobQueue(queue_limit, self._served_by, Shares(workers) if keep_spare else None)
+        self._queue = JobQueue(
+            queue_limit, self._served_by, accounts or CpuAccounts(), Shares(workers) if keep_spare else None
+        )
+        self._permits = permits
         self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
         self._submitting = ThreadPoolExecutor(_SUBMITTING_THREADS, thread_name_prefix=f"{spec.name}-submit")
 
@@ -108,16 +117,20 @@ class WorkerPool(Generic[Job, Result]):
         Raises:
             JobLostError: there is no result within `timeout_s`.
         """
+        deadline = monotonic() + timeout_s
+        try:
+            async with asyncio.timeout(timeout_s), self._permits.held(client) if self._permits else nullcontext():
+                return await self._run(job, deadline, client)
+        except TimeoutError:
+            raise JobLostError("deadline") from None
+
+    async def _run(self, job: Job, deadline: float, client: str) -> Result:
         if self._queue.closed:
             raise JobLostError("closing")
         # On a thread, because copying and hashing a large job would block the event loop.
-        submitted = self._submitting.submit(self.submit, job, timeout_s, client)
+        submitted = self._submitting.submit(self.submit, job, deadline - monotonic(), client)
         try:
-            async with asyncio.timeout(timeout_s):
-                return await asyncio.wrap_future(await asyncio.wrap_future(submitted))
-        except TimeoutError:
-            submitted.add_done_callback(_take_back)
-            raise JobLostError("deadline") from None
+            return await asyncio.wrap_future(await asyncio.wrap_future(submitted))
         except asyncio.CancelledError:
             submitted.add_done_callback(_take_back)
             raise

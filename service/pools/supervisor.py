@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -41,6 +42,7 @@ class WorkerSpec:
         stall_s: time limit (s) of a job; the worker is killed after it.
         start_s: usual duration (s) of a start, until one has been measured.
         max_start_s: time limit (s) of a start.
+        nice: niceness above the service's own, for work that no query waits for.
     """
 
     name: str
@@ -49,6 +51,7 @@ class WorkerSpec:
     stall_s: float = 10.0
     start_s: float = 5.0
     max_start_s: float = 120.0
+    nice: int = 0
 
 
 class Supervisor:
@@ -176,6 +179,10 @@ class Supervisor:
             # Closing our copy of its end makes the pipe break when the worker dies.
             process.start()
         self._process = process
+        if self._spec.nice:
+            # It can have ended already.
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid or 0, os.getpriority(os.PRIO_PROCESS, 0) + self._spec.nice)
         return ours, process
 
     def _await_ready(self, connection: Connection, process: BaseProcess) -> str | None:
@@ -198,10 +205,14 @@ class Supervisor:
             if pending is None:
                 continue
             self._held = pending
+            begin = monotonic()
             with _Watchdog(process, self._spec.stall_s) as watchdog:
                 # A worker that died before it had the whole job was not crashed by it.
                 sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
+            # A worker that died or stalled has not told its CPU time, which is at most this long.
+            cpu_s = answer.cpu_s if isinstance(answer, JobResult | WorkerFailure) else monotonic() - begin
+            self._queue.accounts.charge(pending.client, cpu_s)
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()

@@ -21,6 +21,8 @@ from service.errors import (
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
+from service.tenancy.fair_share import FairSemaphore
+from service.uploaded_file import UploadedFile
 from service.workers.decode import DecodeJob, DecodeRefusal, RasteriseJob, run_decoder
 
 # Panoramas that can wait to be decoded.
@@ -30,7 +32,7 @@ _QUEUE = 32
 class Decoder:
     """Bounded pool of decoding workers."""
 
-    def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry) -> None:
+    def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
         self._settings = settings
         self._size = manifest.image_height, manifest.image_width
         self._pool: WorkerPool[DecodeJob | RasteriseJob, Panorama | DecodeRefusal | bytes] = WorkerPool(
@@ -48,6 +50,8 @@ class Decoder:
             workers=settings.decode.workers,
             queue_limit=_QUEUE,
             keep_spare=True,
+            accounts=telemetry.cpu_accounts,
+            permits=permits,
             on_restart=lambda _reason: telemetry.note_restart("decode"),
         )
         telemetry.gauge(
@@ -72,7 +76,7 @@ class Decoder:
         return self._pool.state
 
     async def decode(
-        self, content: bytes, deadline: float, client: str = "", *, size: tuple[int, int] | None = None
+        self, content: bytes | UploadedFile, deadline: float, client: str = "", *, size: tuple[int, int] | None = None
     ) -> Panorama:
         """Decode an uploaded panorama file.
 

@@ -20,7 +20,6 @@ from lalaloc_core.localise.sequence.search import localise_sequence_steps
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
-from service.fair_share import with_headroom
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
 from service.query.answers import compose_answer, compose_sequence_answer, locate_in, model_answer, posterior_answer
@@ -31,6 +30,7 @@ from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.settings import Settings
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
+from service.tenancy.fair_share import FairSemaphore, with_headroom
 from service.threads import BoundedReads, Threads
 
 # LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
@@ -66,6 +66,7 @@ class Localiser:
         queries: Slots,
         reads: BoundedReads,
         telemetry: Telemetry,
+        permits: FairSemaphore,
     ) -> None:
         self._settings = settings
         self._bundle = bundle
@@ -76,7 +77,9 @@ class Localiser:
         self._queries = queries
         self._reads = reads
         self._telemetry = telemetry
-        self._threads = Threads("localise", with_headroom(settings.cores.compute_threads))
+        self._threads = Threads(
+            "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, permits
+        )
 
     @property
     def model(self) -> ModelAnswer:
@@ -240,14 +243,9 @@ class Localiser:
         Raises:
             DeadlineExceededError: the deadline passed.
         """
-
-        def run() -> T:
-            with self._grids.throttle.query():
-                return work()
-
         try:
             async with asyncio.timeout(max(context.left_s, 0.0)):
-                return await self._threads.run(context.client, run)
+                return await self._threads.run(context.client, work)
         except TimeoutError as error:
             raise DeadlineExceededError(self._settings.requests.request_deadline_s) from error
 

@@ -10,6 +10,7 @@ from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
+from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import run_worker
 
 # Loading torch takes seconds, on a busy machine many.
@@ -19,7 +20,7 @@ _START_S, _MAX_START_S = 5.0, 120.0
 class LpoPool:
     """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
 
-    def __init__(self, bundle: Bundle, settings: Settings, telemetry: Telemetry) -> None:
+    def __init__(self, bundle: Bundle, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
         self._telemetry = telemetry
         cores = settings.cores
         spec = WorkerSpec(
@@ -34,6 +35,8 @@ class LpoPool:
             spec,
             workers=cores.workers,
             queue_limit=settings.lpo.queue,
+            accounts=telemetry.cpu_accounts,
+            permits=permits,
             on_restart=lambda _reason: telemetry.note_restart("lpo"),
         )
         # Counters exist with value 0 from the start, so that the first miss shows as a rise.

@@ -59,6 +59,13 @@ def decode_picture(request: OscpRequest) -> bytes:
     return content
 
 
+def without_picture(request: OscpRequest) -> OscpRequest:
+    """Return a request without its picture in Base64, which is large."""
+    reading = request.camera_reading.model_copy(update={"image_bytes": ""})
+    readings = request.sensor_readings.model_copy(update={"camera_readings": [reading]})
+    return request.model_copy(update={"sensor_readings": readings})
+
+
 def reading_place(reading: OscpGeolocationReading) -> tuple[EarthPoint, float]:
     """Return the place of a geolocation reading, and its accuracy as a radius (m)."""
     known = reading.accuracy is not None and reading.accuracy > 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic
 from typing import Protocol, Self
@@ -21,6 +21,7 @@ from service.schemas import (
     SequenceForm,
 )
 from service.storage.records import PlanRecord, VenueRecord
+from service.uploaded_file import UploadedFile
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +31,7 @@ class QueryContext:
     Pickling keeps the elapsed time and restarts the clock, because machines do not share `monotonic`.
 
     Attributes:
-        client: fairness group that shares decoders, threads and workers; see `service.fair_share`.
+        client: fairness group that shares decoders, threads and workers; see `service.tenancy.fair_share`.
         begin: end of the upload (`monotonic`).
         deadline: time limit of the answer (`monotonic`).
         clock: durations of the stages, failed ones and the wait for the plan's grid included.
@@ -83,7 +84,7 @@ class PanoramaQuery:
     """
 
     form: LocaliseForm
-    content: bytes
+    content: bytes | UploadedFile
     context: QueryContext
 
 
@@ -98,7 +99,7 @@ class SequenceQuery:
     """
 
     form: SequenceForm
-    contents: list[bytes]
+    contents: Sequence[bytes | UploadedFile]
     context: QueryContext
 
 

@@ -213,10 +213,11 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
 
 def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
     """Return the plan in an uploaded file, the file as stored, and the pose grid if it is computed at once."""
-    file = convert(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
+    content = uploaded.file.read()
+    file = convert(content, uploaded.options, runtime.converter, runtime.settings, client, runtime.permits)
     runtime.grids.check_size(file.plan)
-    original = Original(uploaded.content, file.media_type, json.dumps(file.report))
-    return file.plan, original, runtime.grids.prepare(file.plan)
+    original = Original(content, file.media_type, json.dumps(file.report))
+    return file.plan, original, runtime.grids.prepare(file.plan, client)
 
 
 def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:

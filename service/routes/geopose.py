@@ -21,15 +21,24 @@ from service.errors import (
 from service.http import IdempotentRequest
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
+from service.http.request_end import on_request_end
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.query import PanoramaQuery, QueryContext
-from service.query.oscp import compose_oscp_answer, decode_picture, distance_to_plan_m, reading_place, unused_warnings
+from service.query.oscp import (
+    compose_oscp_answer,
+    decode_picture,
+    distance_to_plan_m,
+    reading_place,
+    unused_warnings,
+    without_picture,
+)
 from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.query_request import QUERY_ERRORS
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.schemas.oscp import OscpAnswer, OscpRequest
 from service.telemetry import add_log_fields
+from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
 # Size of a request without its picture.
@@ -83,12 +92,13 @@ async def geopose(
         body = await read_body(request, replace(limits, max_bytes=4 * -(-max_bytes // 3) + _ENVELOPE_BYTES))
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
 
-    def read() -> tuple[OscpRequest, bytes]:
-        parsed = parse_document(OscpRequest, body)
-        content = decode_picture(parsed)
+    def read() -> tuple[OscpRequest, UploadedFile]:
+        parsed = parse_document(OscpRequest, body.read())
+        content = UploadedFile.of(decode_picture(parsed), limits.memory_bytes)
+        on_request_end(request.scope, content.close)
         if len(content) > max_bytes:
             raise UploadTooLargeError(limits.name, max_bytes, len(content))
-        return parsed, content
+        return without_picture(parsed), content
 
     async def respond() -> Response:
         parsed, content = await runtime.uploads.run(client, read)
@@ -106,7 +116,7 @@ class _Query:
     """Query of one request."""
 
     def __init__(
-        self, runtime: Runtime, tenant: str, parsed: OscpRequest, content: bytes, context: QueryContext
+        self, runtime: Runtime, tenant: str, parsed: OscpRequest, content: UploadedFile, context: QueryContext
     ) -> None:
         self._runtime = runtime
         self._tenant = tenant

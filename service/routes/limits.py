@@ -7,10 +7,10 @@ from dataclasses import asdict
 from fastapi import APIRouter
 
 from service.errors import StoreUnavailableError
-from service.fair_share import max_per_client
 from service.http.problems import problem_responses
 from service.routes.dependencies import Running, Tenant
 from service.schemas import LimitsAnswer, StoredBytesAnswer, StoredBytesByKind, UsageAnswer
+from service.tenancy.fair_share import max_per_client
 
 router = APIRouter(tags=["operations"])
 

@@ -20,6 +20,7 @@ from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, ch
 from service.schemas import SequenceAnswer, SequenceForm
 from service.settings import Settings
 from service.telemetry import add_log_fields
+from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
 _MIN_PANORAMAS = 2
@@ -74,7 +75,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     return await idempotent.run_async(parts, respond, runtime.reads)
 
 
-def _panoramas(parts: Parts, form: SequenceForm, settings: Settings) -> list[bytes]:
+def _panoramas(parts: Parts, form: SequenceForm, settings: Settings) -> list[UploadedFile]:
     """Return the panoramas in order.
 
     Raises:

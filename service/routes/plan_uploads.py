@@ -12,11 +12,13 @@ from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, Severa
 from lalaloc_core.importers import ImportOptions
 from service.conversion import seems_native
 from service.errors import (
+    BytesInFlightError,
     ConverterNotReadyError,
     InvalidRequestError,
     MalformedRequestError,
     PlanTooLargeError,
     StorageQuotaError,
+    SpoolFullError,
     StoreFullError,
     StoreUnavailableError,
     UnsupportedMediaError,
@@ -27,6 +29,7 @@ from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_typ
 from service.runtime import Runtime
 from service.schemas import ImportForm
 from service.threads import Threads
+from service.uploaded_file import UploadedFile
 
 _FILE = "file"
 # Media types that clients send; the actual format is detected from the content.
@@ -54,6 +57,8 @@ REFUSED_UPLOADS = (
     UnsupportedMediaError,
     UploadTooLargeError,
     UploadTimeoutError,
+    BytesInFlightError,
+    SpoolFullError,
     ConverterNotReadyError,
     StoreUnavailableError,
     StoreFullError,
@@ -88,18 +93,18 @@ UPLOAD_BODY: dict[str, Any] = {
 class PlanUpload:
     """Uploaded file with its options."""
 
-    content: bytes
+    file: UploadedFile
     options: ImportOptions
     fields: Mapping[str, str]
 
     @property
     def parts(self) -> Parts:
         """The parts that identify the request for idempotency."""
-        return Parts(dict(self.fields), {_FILE: self.content})
+        return Parts(dict(self.fields), {_FILE: self.file})
 
     def threads(self, runtime: Runtime) -> Threads:
         """Return the threads to read and store it on; files that wait for a worker have threads of their own."""
-        return runtime.uploads if seems_native(self.content) else runtime.file_uploads
+        return runtime.uploads if seems_native(self.file) else runtime.file_uploads
 
 
 async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:

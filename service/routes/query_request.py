@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from lalaloc_core.errors import InvalidPanoramaError, InvalidPoseError
 from lalaloc_core.localise.pipeline import StageClock
 from service.errors import (
+    BytesInFlightError,
     DeadlineExceededError,
     DecoderNotReadyError,
     IdempotencyInProgressError,
@@ -21,6 +22,7 @@ from service.errors import (
     OverloadedError,
     PlanFailedError,
     PlanNotReadyError,
+    SpoolFullError,
     StoppingError,
     StoreUnavailableError,
     UnknownFloorPlanError,
@@ -50,6 +52,8 @@ QUERY_ERRORS: tuple[type[Exception], ...] = (
     UnsupportedMediaError,
     UploadTooLargeError,
     UploadTimeoutError,
+    BytesInFlightError,
+    SpoolFullError,
     OverloadedError,
     StoreUnavailableError,
     StoppingError,

@@ -10,12 +10,14 @@ from pydantic import BaseModel
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.errors import (
+    BytesInFlightError,
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
     InvalidRequestError,
     MalformedRequestError,
     RevisionMismatchError,
     StorageQuotaError,
+    SpoolFullError,
     StoreFullError,
     StoreUnavailableError,
     TooManyVenuesError,
@@ -54,6 +56,7 @@ from service.schemas import (
 )
 from service.storage.records import Cursor, VenueMember, VenuePlace, VenueRecord
 from service.telemetry import add_log_fields
+from service.uploaded_file import UploadedFile
 
 router = APIRouter(prefix="/venues", tags=["venues"])
 
@@ -64,6 +67,8 @@ _REFUSED_BODIES = (
     UnsupportedMediaError,
     UploadTooLargeError,
     UploadTimeoutError,
+    BytesInFlightError,
+    SpoolFullError,
     StoreUnavailableError,
     StoreFullError,
     StorageQuotaError,
@@ -93,7 +98,7 @@ async def create_venue(request: Request, runtime: Running, tenant: Tenant, clien
     content = await _read(request, runtime)
 
     def store(token: str) -> Response:
-        document = parse_document(VenueDocument, content)
+        document = parse_document(VenueDocument, content.read())
         members = _members(document.plans, runtime)
         limit = runtime.settings.plans.max_venues
         record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
@@ -176,7 +181,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
     def store() -> Response:
         current = _stored(tenant, venue_id, runtime)
         expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = parse_document(VenueDocument, content)
+        document = parse_document(VenueDocument, content.read())
         record = runtime.store.venues.change(
             tenant,
             current.id,
@@ -207,7 +212,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
     def store() -> Response:
         current = _stored(tenant, venue_id, runtime)
         expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = parse_document(VenueChangeDocument, content)
+        document = parse_document(VenueChangeDocument, content.read())
         given = document.model_fields_set
         if not given:
             raise InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
@@ -249,7 +254,7 @@ def _stored(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
     return record
 
 
-async def _read(request: Request, runtime: Runtime) -> bytes:
+async def _read(request: Request, runtime: Runtime) -> UploadedFile:
     media_type(request, (JSON,))
     return await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
 

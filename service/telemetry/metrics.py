@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from time import perf_counter
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from service.telemetry.tracing import Tracing
+from service.tenancy.cpu_accounts import CpuAccounts
 
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _GRID_SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
+
+
+class _PerTenant(Collector):
+    """Metric with a value per tenant."""
+
+    def __init__(
+        self,
+        family: type[CounterMetricFamily | GaugeMetricFamily],
+        name: str,
+        meaning: str,
+        read: Callable[[], Mapping[str, float]],
+    ) -> None:
+        self._family = family
+        self._name = name
+        self._meaning = meaning
+        self._read = read
+
+    def collect(self) -> Iterator[Metric]:
+        """Return the current values."""
+        family = self._family(self._name, self._meaning, labels=["tenant"])
+        for tenant, value in self._read().items():
+            family.add_metric([tenant], value)
+        yield family
 
 
 class Telemetry:
@@ -23,13 +49,16 @@ class Telemetry:
     Attributes:
         registry: the registry.
         tracing: exporter of spans; None without an endpoint.
+        cpu_accounts: CPU time of each client.
     """
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.tracing: Tracing | None = None
+        self.cpu_accounts = CpuAccounts()
         self._gauges: dict[str, Gauge] = {}
         self._counters: dict[str, Counter] = {}
+        self._collectors: dict[str, Collector] = {}
         ProcessCollector(registry=self.registry)
         self.requests = self.counter("lalaloc_http_requests", "Answered requests.", ["method", "route", "status"])
         self.request_seconds = Histogram(
@@ -84,6 +113,14 @@ class Telemetry:
         """Add a gauge that is read on each scrape; a restarted app replaces it."""
         self._gauge(name, meaning).set_function(read)
 
+    def tenant_counter(self, name: str, meaning: str, read: Callable[[], Mapping[str, float]]) -> None:
+        """Add a counter per tenant that is read on each scrape; a restarted app replaces it."""
+        self._add_per_tenant(_PerTenant(CounterMetricFamily, name, meaning, read), name)
+
+    def tenant_gauge(self, name: str, meaning: str, read: Callable[[], Mapping[str, float]]) -> None:
+        """Add a gauge per tenant that is read on each scrape; a restarted app replaces it."""
+        self._add_per_tenant(_PerTenant(GaugeMetricFamily, name, meaning, read), name)
+
     def describe_build(self, version: str, model: str, model_version: str, model_sha256: str) -> None:
         """Set the info gauge with the versions of software and model."""
         labels = ("version", "model", "model_version", "sha256")
@@ -107,6 +144,12 @@ class Telemetry:
     def render(self) -> bytes:
         """Return all metrics in Prometheus' text format."""
         return generate_latest(self.registry)
+
+    def _add_per_tenant(self, collector: Collector, name: str) -> None:
+        if name in self._collectors:
+            self.registry.unregister(self._collectors[name])
+        self._collectors[name] = collector
+        self.registry.register(collector)
 
     def _gauge(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Gauge:
         if name not in self._gauges:

@@ -13,14 +13,15 @@ from multiprocessing.connection import Connection
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama, PanoramaLimits, open_panorama, warm_up
+from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
 
 
 @dataclass(frozen=True)
 class DecodeJob:
-    """Uploaded picture, and the size (pixels) of the panorama to return."""
+    """Uploaded picture, and the size (pixels) of the panorama to return; the worker gets the picture as bytes."""
 
-    content: bytes
+    content: bytes | UploadedFile
     height: int
     width: int
 
@@ -62,6 +63,7 @@ def _load(
         if isinstance(job, RasteriseJob):
             return rasterise(job.svg)
         try:
+            assert isinstance(job.content, bytes)
             return open_panorama(job.content, height=job.height, width=job.width, limits=limits)
         except InvalidPanoramaError as error:
             return DecodeRefusal(str(error))

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
@@ -25,16 +26,18 @@ class Ready:
 
 @dataclass(frozen=True)
 class JobResult:
-    """Message with the result of a job."""
+    """Message with the result of a job, and the CPU time (s) that it took."""
 
     value: Any
+    cpu_s: float
 
 
 @dataclass(frozen=True)
 class WorkerFailure:
-    """Message with the error of a job, or of a failed start."""
+    """Message with the error of a job, or of a failed start, and the CPU time (s) of the job."""
 
     reason: str
+    cpu_s: float = 0.0
 
 
 def serve_jobs(
@@ -63,10 +66,11 @@ def serve_jobs(
             job = connection.recv()
         except (EOFError, OSError):
             return
+        begin = process_time()
         try:
-            message = JobResult(work(job))
+            message = JobResult(work(job), process_time() - begin)
         except Exception as error:
-            message = WorkerFailure(f"{type(error).__name__}: {error}")
+            message = WorkerFailure(f"{type(error).__name__}: {error}", process_time() - begin)
 
 
 def limit_memory(memory_bytes: int) -> None:

@@ -6,17 +6,18 @@ import asyncio
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic, sleep, thread_time
 
 import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
 from service.security.permissions import network_of
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
 from service.threads import Threads
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
@@ -70,7 +71,7 @@ def test_greedy_clients_get_equal_shares(limit: int, clients: int) -> None:
 
 @given(st.lists(st.sampled_from("abc"), max_size=40))
 def test_queue_is_round_robin_and_oldest_first(clients: list[str]) -> None:
-    queue: FairQueue[int] = FairQueue()
+    queue: FairQueue[int] = FairQueue(CpuAccounts())
     for number, client in enumerate(clients):
         queue.append(client, number)
     served = [queue.take() for _ in clients]
@@ -85,7 +86,7 @@ def test_queue_is_round_robin_and_oldest_first(clients: list[str]) -> None:
 
 
 def test_queue_drops_unwanted_items() -> None:
-    queue: FairQueue[int] = FairQueue()
+    queue: FairQueue[int] = FairQueue(CpuAccounts())
     for number in range(6):
         queue.append("ab"[number % 2], number)
     queue.append_first("a", 6)
@@ -94,9 +95,97 @@ def test_queue_drops_unwanted_items() -> None:
     assert [queue.take() for _ in range(4)] == [("a", 6), ("a", 2), ("a", 4), None]
 
 
+def test_client_with_least_recent_cpu_time_is_first() -> None:
+    now = [0.0]
+    accounts = CpuAccounts(lambda: now[0])
+    accounts.charge("a", 8.0)
+    accounts.charge("b", 1.0)
+    accounts.share = {"a": 1.0, "b": 1.0, "c": 1.0}.__getitem__
+
+    def served() -> list[str]:
+        queue: FairQueue[int] = FairQueue(accounts)
+        for client in "aabbcc":
+            queue.append(client, 0)
+        return [found[0] for _ in range(6) if (found := queue.take()) is not None]
+
+    assert served() == list("ccbbaa")
+    now[0] = 20.0
+    accounts.charge("c", 1.9)
+    # Two half-lives later, 8 s count 2 s.
+    assert accounts.recent_s("a") == pytest.approx(2.0)
+    assert served() == list("bbccaa")
+    # A weight of 2 counts them half again.
+    accounts.share = {"a": 2.0, "b": 1.0, "c": 1.0}.__getitem__
+    assert served() == list("bbaacc")
+    assert accounts.totals() == {"a": 8.0, "b": 1.0, "c": 1.9}
+
+
+def test_steps_of_a_coroutine_are_charged_without_other_tasks() -> None:
+    accounts = CpuAccounts()
+
+    async def scenario() -> str:
+        async def work() -> str:
+            await asyncio.sleep(0)
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(asyncio.Event().wait(), 0.01)
+            return "done"
+
+        async def busy() -> None:
+            begin = thread_time()
+            while thread_time() - begin < 0.2:
+                pass
+
+        other = asyncio.create_task(busy())
+        result = await accounts.charged_steps("a", work())
+        await other
+        return result
+
+    assert asyncio.run(scenario()) == "done"
+    assert 0.0 < accounts.total_s("a") < 0.2
+
+
+def test_many_clients_do_not_fill_memory() -> None:
+    accounts = CpuAccounts()
+    for number in range(5000):
+        accounts.charge(f"client {number}", 1.0)
+    accounts.charge("busy", 5.0)
+    for number in range(5000):
+        accounts.charge(f"another {number}", 1.0)
+    assert len(accounts.totals()) == 4096
+    assert accounts.total_s("busy") == 5.0
+
+
+def test_client_leaves_cores_to_active_clients() -> None:
+    async def scenario() -> None:
+        permits = FairSemaphore(8, CpuAccounts(), cores=3)
+
+        async def most(client: str) -> int:
+            """Return the number of permits that the client gets."""
+            held = 0
+            with suppress(TimeoutError):
+                while True:
+                    await asyncio.wait_for(permits.acquire(client), 0.05)
+                    held += 1
+            return held
+
+        alone = await most("a")
+        # More than the cores, because pieces of work also wait for each other.
+        assert alone == max_per_client(8)
+        await permits.acquire("b")
+        for _ in range(alone):
+            permits.release("a")
+        assert await most("a") == 2
+        await permits.acquire("c")
+        for _ in range(2):
+            permits.release("a")
+        assert await most("a") == 1
+
+    asyncio.run(scenario())
+
+
 def test_permits_are_shared_fairly() -> None:
     async def scenario() -> list[str]:
-        semaphore, order = FairSemaphore(2), list[str]()
+        semaphore, order = FairSemaphore(2, CpuAccounts()), list[str]()
 
         async def take(client: str) -> None:
             await semaphore.acquire(client)

@@ -37,12 +37,13 @@ from service.grids.grid_jobs import MAX_ON_DEMAND
 from service.grids.grid_provider import GridProvider
 from service.grids.heights import check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
-from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage.plan_lookup import PlanLookup
 from service.storage.records import Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -109,6 +110,10 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened.close()
 
 
+def _permits() -> FairSemaphore:
+    return FairSemaphore(2, CpuAccounts())
+
+
 def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
     return store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=20)
 
@@ -118,7 +123,7 @@ def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvide
     made: list[GridProvider] = []
 
     def make(store: Store, own_encoders: Encoders | None = None, **settings: Any) -> GridProvider:
-        made.append(GridProvider(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry()))
+        made.append(GridProvider(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry(), _permits()))
         return made[-1]
 
     yield make
@@ -194,7 +199,7 @@ def test_bounded_cache_drops_the_least_recently_used(puts: list[tuple[int, int]]
 
 def test_cache_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
     telemetry = Telemetry()
-    grids = GridProvider(store, encoders, "m1", Settings(), telemetry)
+    grids = GridProvider(store, encoders, "m1", Settings(), telemetry, _permits())
     record = _add(store)
     key = grids.key(record.revision_id, 1.5)
     assert grids.find(key) is None
@@ -294,7 +299,7 @@ def test_non_finite_grid_fails(store: Store, make_grids: MakeGrids, bundle: Bund
     grids = make_grids(store, Overflowing(bundle))
     with pytest.raises(InvalidPoseError, match=r"no latents at camera_height_m 1\.5"):
         grids.compute(record, 1.5).result(30.0)
-    assert grids.prepare(PLAN) is None
+    assert grids.prepare(PLAN, "") is None
     state = grids.states(store.plans.list_plans("default", limit=1))[0]
     assert state.status == "failed"
 
@@ -302,17 +307,17 @@ def test_non_finite_grid_fails(store: Store, make_grids: MakeGrids, bundle: Bund
 def test_lease_is_renewed_during_sampling(bundle: Bundle) -> None:
     square = [[0, 0], [2, 0], [2, 2], [0, 2]]
     rooms = [{"name": f"{k}", "polygon": [[x + 3 * k, y] for x, y in square]} for k in range(5)]
-    plan, reported = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms}), []
+    plan, rooms_done = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms}), list[int]()
 
-    def lose_after_three(progress: float, _worked_s: float) -> None:
-        reported.append(progress)
-        if len(reported) == 3:
+    def lose_after_three() -> None:
+        rooms_done.append(len(rooms_done))
+        if len(rooms_done) == 3:
             raise StoppingError
 
     encoders = CountingEncoders(bundle)
     with pytest.raises(StoppingError):
-        embed(plan, encoders, step_m=0.5, camera_height_m=1.5, after_chunk=lose_after_three)
-    assert reported == [0.0] * 3
+        embed(plan, encoders, step_m=0.5, camera_height_m=1.5, after_room=lose_after_three)
+    assert len(rooms_done) == 3
     assert encoders.embedded == 0
 
 
@@ -498,22 +503,6 @@ def test_grid_of_replaced_revision_is_cancelled(
     encoders.go_on.set()
     assert isinstance(future.exception(30.0), PlanNotReadyError)
     assert len(grids.compute(new, 1.5).result(30.0).poses) == 110
-
-
-def test_background_pauses_for_queries() -> None:
-    queries = BackgroundThrottle()
-    with queries.query(), queries.query():
-        begin = time.monotonic()
-        queries.pause(0.05)
-        assert 0.19 < time.monotonic() - begin < 5.0
-        waiting = threading.Thread(target=queries.pause, args=(60.0,))
-        begin = time.monotonic()
-        waiting.start()
-    waiting.join(10.0)
-    assert time.monotonic() - begin < 0.9
-    begin = time.monotonic()
-    queries.pause(60.0)
-    assert time.monotonic() - begin < 0.5
 
 
 # Outages of the database

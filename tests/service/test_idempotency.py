@@ -176,7 +176,7 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
     with start_app(tmp_path) as client:
         store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
-        digest = parts_sha256(Parts({}, {"file": CONTENT}))
+        digest = parts_sha256(Parts({}, {"file": UploadedFile.of(CONTENT)}))
         claim = IdempotencyKeys(store._database, store.quota, lease_s=1.0).begin(
             "default", "POST /floorplans", "a", digest
         )
@@ -341,12 +341,16 @@ PARTS = st.dictionaries(st.text(max_size=3), st.text(max_size=3), max_size=3)
 FILES = st.dictionaries(st.text(max_size=3), st.binary(max_size=3), max_size=3)
 
 
+def _files(contents: dict[str, bytes]) -> dict[str, UploadedFile]:
+    return {name: UploadedFile.of(content) for name, content in contents.items()}
+
+
 @given(PARTS, FILES, PARTS, FILES)
 def test_digests_differ_for_different_parts(
     fields: dict[str, str], files: dict[str, bytes], other_fields: dict[str, str], other_files: dict[str, bytes]
 ) -> None:
-    turned = Parts(dict(reversed(fields.items())), dict(reversed(files.items())))
-    digest = parts_sha256(Parts(fields, files))
+    turned = Parts(dict(reversed(fields.items())), _files(dict(reversed(files.items()))))
+    digest = parts_sha256(Parts(fields, _files(files)))
     assert parts_sha256(turned) == digest
     same = (fields, files) == (other_fields, other_files)
-    assert (parts_sha256(Parts(other_fields, other_files)) == digest) == same
+    assert (parts_sha256(Parts(other_fields, _files(other_files))) == digest) == same

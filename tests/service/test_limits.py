@@ -10,9 +10,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.fair_share import max_per_client
 from service.schemas import LimitsAnswer
 from service.settings import Settings
+from service.tenancy.fair_share import max_per_client
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
 
 

@@ -24,13 +24,15 @@ from lalaloc_core.localise.sequence import SequenceResult
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import warm_up_job
 from tests.service.conftest import wait_for
 
 
 @contextmanager
 def _pool(bundle: Bundle, **overrides: Any) -> Iterator[LpoPool]:
-    pool = LpoPool(bundle, Settings(**overrides), Telemetry())
+    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(2, CpuAccounts()))
     pool.start()
     try:
         yield pool

@@ -92,10 +92,9 @@ def test_form_can_state_utf_8(client: httpx.Client) -> None:
     assert client.post("/floorplans", content=content, headers=headers).status_code == 201
 
 
-def test_large_form_is_not_written_to_disk(
+def test_large_form_needs_no_temporary_folder(
     client: httpx.Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As full as a disk can be.
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "not there"))
     content = json.dumps(FLAT).encode() + b" " * 1_500_000
     headers = {"content-type": "multipart/form-data; boundary=BB"}

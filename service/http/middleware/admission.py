@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from typing import Any, cast
 
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.fair_share import FairSemaphore
 from service.http.admission_control import EXEMPT, Admission, is_read, is_stream
+from service.http.bytes_in_flight import BodyBudget
 from service.http.problems import problem_answer
+from service.http.request_end import ending_request
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of
+from service.tenancy.fair_share import FairSemaphore
 
 
 class AdmissionMiddleware:
@@ -40,12 +44,16 @@ class AdmissionMiddleware:
     async def _handle(self, admission: Admission, client: str, scope: Scope, receive: Receive, send: Send) -> None:
         path = routed_path(scope)
         semaphore = admission.reading if is_read(scope["method"], path) else None
-        connection = _Connection(receive, send)
+        stated = Headers(scope=scope).get("content-length", "")
+        body = BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
+        connection = _Connection(receive, send, body)
         limit_s = None if is_stream(scope["method"], path) else admission.limits.deadline_s
         try:
             async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client) as permit:
                 connection.on_answer = permit.end
-                await self._app(scope, connection.receive, connection.send)
+                with ending_request(scope):
+                    handled = self._app(scope, connection.receive, connection.send)
+                    await admission.cpu_accounts.charged_steps(client, cast(Coroutine[Any, Any, None], handled))
         except asyncio.CancelledError:
             # The stopping server cancels requests that did not finish in time.
             if not admission.stopping or connection.answered:
@@ -84,7 +92,9 @@ class _Permit:
 class _Connection:
     """Connection of a request. Once the body is read, a disconnect cancels the work on the answer."""
 
-    def __init__(self, receive: Receive, send: Send) -> None:
+    def __init__(self, receive: Receive, send: Send, body: BodyBudget) -> None:
+        self._body = body
+        self._begun = False
         self.answered = False
         self.on_answer: Callable[[], None] = lambda: None
         self._receive = receive
@@ -98,6 +108,7 @@ class _Connection:
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_error: object) -> bool:
+        self._body.end()
         if self._watch is not None:
             self._watch.cancel()
             with suppress(asyncio.CancelledError):
@@ -113,7 +124,11 @@ class _Connection:
         if self._watch is not None:
             await self._gone.wait()
             return {"type": "http.disconnect"}
+        if not self._begun:
+            self._begun = True
+            self._body.begin()
         message = await self._receive()
+        self._body.receive(len(message.get("body", b"")))
         if message["type"] == "http.request" and not message.get("more_body", False):
             self._watch = asyncio.create_task(self._wait_for_disconnect())
         return message

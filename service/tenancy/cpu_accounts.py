@@ -1,0 +1,109 @@
+"""CPU time that each client used, in total and recently."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Coroutine, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import monotonic, thread_time
+from types import coroutine
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+# CPU time counts half after this time, so that a client that used much is served last for some tens of seconds.
+_HALF_LIFE_S = 10.0
+# Clients whose recent CPU time differs by less take turns.
+_RANK_S = 0.02
+# Without API keys every client address is a client.
+_MAX_CLIENTS = 4096
+
+
+@dataclass
+class _Account:
+    total_s: float = 0.0
+    recent_s: float = 0.0
+    charged_at: float = 0.0
+
+    def recent_at(self, now: float) -> float:
+        return self.recent_s * 0.5 ** ((now - self.charged_at) / _HALF_LIFE_S)
+
+
+class CpuAccounts:
+    """CPU seconds per client. Thread-safe.
+
+    Attributes:
+        share: returns the weight of a client; the recent CPU time of a client with weight 2 counts half.
+
+    Args:
+        clock: monotonic clock (s).
+    """
+
+    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+        self.share: Callable[[str], float] = lambda _client: 1.0
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._accounts: dict[str, _Account] = {}
+
+    def charge(self, client: str, cpu_s: float) -> None:
+        """Add CPU time (s) to a client's account."""
+        with self._lock:
+            now = self._clock()
+            account = self._accounts.get(client)
+            if account is None:
+                self._make_room(now)
+                account = self._accounts[client] = _Account()
+            account.recent_s, account.charged_at = account.recent_at(now) + cpu_s, now
+            account.total_s += cpu_s
+
+    @contextmanager
+    def charged(self, client: str) -> Iterator[None]:
+        """Charge the CPU time that this thread uses in the block."""
+        begin = thread_time()
+        try:
+            yield
+        finally:
+            self.charge(client, thread_time() - begin)
+
+    @coroutine
+    def charged_steps(self, client: str, work: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
+        """Run a coroutine and charge the CPU time of its steps, without those of other tasks in between."""
+        value, error = None, None
+        while True:
+            begin = thread_time()
+            try:
+                awaited = work.send(value) if error is None else work.throw(error)
+            except StopIteration as done:
+                return done.value
+            finally:
+                self.charge(client, thread_time() - begin)
+            value, error = None, None
+            try:
+                value = yield awaited
+            except BaseException as thrown:
+                error = thrown
+
+    def recent_s(self, client: str) -> float:
+        """Return the CPU time (s) that a client used lately, by its weight."""
+        account = self._accounts.get(client)
+        return 0.0 if account is None else account.recent_at(self._clock()) / self.share(client)
+
+    def rank(self, client: str) -> int:
+        """Return the place of a client in a queue, the lowest first: its recent CPU time in units that matter."""
+        return int(self.recent_s(client) / _RANK_S)
+
+    def total_s(self, client: str) -> float:
+        """Return all CPU time (s) that a client used since the start."""
+        account = self._accounts.get(client)
+        return 0.0 if account is None else account.total_s
+
+    def totals(self) -> dict[str, float]:
+        """Return `total_s` of every client."""
+        with self._lock:
+            return {client: account.total_s for client, account in self._accounts.items()}
+
+    def _make_room(self, now: float) -> None:
+        """Forget the client that used the least CPU time lately if there are too many."""
+        if len(self._accounts) >= _MAX_CLIENTS:
+            del self._accounts[min(self._accounts, key=lambda client: self._accounts[client].recent_at(now))]

@@ -1,0 +1,52 @@
+"""Uploaded files, in memory while small and else in unnamed temporary files."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable, Iterator
+from tempfile import SpooledTemporaryFile
+from typing import IO
+
+_CHUNK_BYTES = 2**20
+
+
+class UploadedFile:
+    """Content of an uploaded file, out of memory until it is read. Thread-safe; it is pickled as `bytes`."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._lock = threading.Lock()
+        self._size = file.seek(0, io.SEEK_END)
+
+    @classmethod
+    def of(cls, content: bytes, memory_bytes: int = 0) -> UploadedFile:
+        """Return a file with a content, which is written to disk beyond `memory_bytes`; 0: never."""
+        file = SpooledTemporaryFile(memory_bytes)  # noqa: SIM115  closed by `close`
+        file.write(content)
+        return cls(file)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def read(self) -> bytes:
+        """Return the content."""
+        with self._lock:
+            self._file.seek(0)
+            return self._file.read()
+
+    def chunks(self) -> Iterator[bytes]:
+        """Return the content in parts of bounded size."""
+        for offset in range(0, self._size, _CHUNK_BYTES):
+            with self._lock:
+                self._file.seek(offset)
+                chunk = self._file.read(_CHUNK_BYTES)
+            yield chunk
+
+    def close(self) -> None:
+        """Delete the content."""
+        with self._lock:
+            self._file.close()
+
+    def __reduce__(self) -> tuple[Callable[[bytes], bytes], tuple[bytes]]:
+        return bytes, (self.read(),)
