@@ -16,11 +16,11 @@ from functools import partial
 from service.bounded_cache import BoundedCache
 from service.conversion.converter import Converter
 from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError
-from service.fair_share import Shares
 from service.renditions import make_rendition
 from service.storage.plans import Plans
 from service.stored_plan import Rendition, RenditionKind
 from service.telemetry import LOGGER_NAME
+from service.tenancy.fair_share import Shares
 from service.threads import Threads
 from service.workers.convert import RenditionJob
 
