@@ -36,6 +36,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
 from service.threads import BoundedReads
+from service.uploaded_file import UploadedFile
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()

@@ -32,7 +32,7 @@ from tests.service.conftest import wait_for
 
 @contextmanager
 def _pool(bundle: Bundle, **overrides: Any) -> Iterator[LpoPool]:
-    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(2, CpuAccounts()))
+    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()))
     pool.start()
     try:
         yield pool
