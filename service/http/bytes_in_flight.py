@@ -28,6 +28,10 @@ class BytesInFlight:
         self._held: Counter[str] = Counter()
         self.in_use = 0
 
+    def limit_of(self, client: str) -> int:
+        """Return the limit (bytes) of a client."""
+        return min(self._limit_of(client), self._total_bytes)
+
     def held_by(self, client: str) -> int:
         """Return the bytes that a client holds."""
         return self._held[client]
@@ -43,7 +47,7 @@ class BytesInFlight:
             UploadTooLargeError: they exceed the client's limit even if it holds nothing else.
             BytesInFlightError: they exceed what the client can hold now.
         """
-        held, limit = self._held[client], min(self._limit_of(client), self._total_bytes)
+        held, limit = self._held[client], self.limit_of(client)
         if count > limit:
             raise UploadTooLargeError(TENANT_SETTING, limit, count)
         if held + count > limit:

@@ -8,8 +8,8 @@ from fastapi import APIRouter
 
 from service.errors import StoreUnavailableError
 from service.http.problems import problem_responses
-from service.routes.dependencies import Running, Tenant
-from service.schemas import LimitsAnswer, StoredBytesAnswer, StoredBytesByKind, UsageAnswer
+from service.routes.dependencies import Client, Running, Tenant
+from service.schemas import BytesInFlightAnswer, LimitsAnswer, StoredBytesAnswer, StoredBytesByKind, UsageAnswer
 from service.tenancy.fair_share import max_per_client
 
 router = APIRouter(tags=["operations"])
@@ -30,10 +30,15 @@ async def limits(runtime: Running) -> LimitsAnswer:
 
 
 @router.get("/usage", summary="Get the tenant's usage", responses=problem_responses(StoreUnavailableError))
-def usage(runtime: Running, tenant: Tenant) -> UsageAnswer:
+def usage(runtime: Running, tenant: Tenant, client: Client) -> UsageAnswer:
     """Return what the tenant of the API key uses, with its limits."""
     account = runtime.store.quota.account(tenant)
     stored = StoredBytesAnswer(
         used=account.used.total, limit=account.limit, by_kind=StoredBytesByKind(**asdict(account.used))
     )
-    return UsageAnswer(tenant=tenant, stored_bytes=stored)
+    admission = runtime.admission
+    in_flight = BytesInFlightAnswer(
+        used=admission.bytes_in_flight.held_by(client), limit=admission.bytes_in_flight.limit_of(client)
+    )
+    cpu_s = round(admission.cpu_accounts.total_s(client), 3)
+    return UsageAnswer(tenant=tenant, stored_bytes=stored, bytes_in_flight=in_flight, cpu_seconds=cpu_s)

@@ -47,6 +47,7 @@ from service.schemas.problem_details import Fault, Problem
 from service.schemas.query_fields import EarthPoint, PlanPoint
 from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading, StatedMotion
 from service.schemas.service_state import (
+    BytesInFlightAnswer,
     HealthAnswer,
     LimitsAnswer,
     PoolAnswer,
@@ -83,6 +84,7 @@ from service.schemas.venues import (
 
 __all__ = [
     "BoundsAnswer",
+    "BytesInFlightAnswer",
     "CandidateAnswer",
     "EarthPoint",
     "Fault",

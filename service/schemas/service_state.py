@@ -74,11 +74,20 @@ class StoredBytesAnswer(ResponseModel):
     by_kind: StoredBytesByKind
 
 
+class BytesInFlightAnswer(ResponseModel):
+    """Bytes of request bodies in progress of a tenant with their limit, in this replica."""
+
+    used: int = Field(description="Bytes of request bodies in progress.")
+    limit: int = Field(description="Limit of `used`; requests beyond it get 503.")
+
+
 class UsageAnswer(ResponseModel):
     """Use of the service by a tenant."""
 
     tenant: str
     stored_bytes: StoredBytesAnswer
+    bytes_in_flight: BytesInFlightAnswer
+    cpu_seconds: float = Field(description="CPU time (s) of the tenant's requests in this replica since it started.")
 
 
 class HealthAnswer(ResponseModel):

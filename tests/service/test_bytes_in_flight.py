@@ -135,9 +135,12 @@ def _in_flight(client: httpx.Client) -> float:
     return sum(float(line.removeprefix(name)) for line in lines if line.startswith(name))
 
 
-def test_cpu_time_is_in_the_metrics(start_app: StartApp, tmp_path: Path) -> None:
+def test_cpu_time_is_in_metrics_and_usage(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         assert client.post("/floorplans", content=json.dumps(FLAT), headers={"content-type": "application/json"})
         name = 'lalaloc_tenant_cpu_seconds_total{tenant="default"} '
         (line,) = [line for line in client.get("/metrics").text.splitlines() if line.startswith(name)]
         assert float(line.removeprefix(name)) > 0.0
+        usage = client.get("/usage").json()
+        assert usage["cpu_seconds"] > 0.0
+        assert usage["bytes_in_flight"] == {"used": 0, "limit": 256 * 2**20}
