@@ -228,17 +228,19 @@ class Fisheye:
 
 @dataclass(frozen=True, kw_only=True)
 class Around:
-    """Picture of a cylinder or a sphere around the camera, centred on the horizon, with square pixels there.
+    """Picture of a cylinder or a sphere around the camera, with square pixels at the horizon.
 
     Attributes:
         width, height: size of the picture, pixels.
         hfov: horizontal field of view, radians; at most 2π.
+        elevation: that of the middle row, radians; the axis of the cylinder stays vertical.
         spherical: rows are elevations (equirectangular) instead of their tangents (cylindrical).
     """
 
     width: int
     height: int
     hfov: float
+    elevation: float = 0.0
     spherical: bool = False
 
     @property
@@ -252,19 +254,25 @@ class Around:
         across = np.hypot(rays[..., 0], rays[..., 1])
         rise = np.arctan2(rays[..., 2], across) if self.spherical else rays[..., 2] / np.maximum(across, _TINY)
         pixels = np.stack(
-            [0.5 * self.width + azimuth * self.resolution, 0.5 * self.height - rise * self.resolution], axis=-1
+            [0.5 * self.width + azimuth * self.resolution, self._horizon - rise * self.resolution], axis=-1
         )
         return pixels, _inside(pixels, self.width, self.height)
 
     def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
         """Return the unit rays of pixel coordinates (x, y)."""
         azimuth = (pixels[..., 0] - 0.5 * self.width) / self.resolution
-        rise = (0.5 * self.height - pixels[..., 1]) / self.resolution
+        rise = (self._horizon - pixels[..., 1]) / self.resolution
         return _unit(np.sin(azimuth), np.cos(azimuth), np.tan(rise) if self.spherical else rise)
 
     def scaled(self, width: int, height: int) -> Around:
         """Return the camera of the picture scaled to another size."""
         return dataclasses.replace(self, width=width, height=height)
+
+    @property
+    def _horizon(self) -> float:
+        """Row of the horizon, pixels from the top."""
+        middle = self.elevation if self.spherical else math.tan(self.elevation)
+        return 0.5 * self.height + middle * self.resolution
 
 
 Camera = Perspective | Fisheye | Around

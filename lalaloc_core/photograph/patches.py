@@ -33,18 +33,20 @@ class PatchSize:
     Attributes:
         height, width: pixels.
         hfov_deg: range of azimuths.
-        bottom_deg: elevation of the lower border.
+        top_deg: elevation of the upper border.
+        step_deg: azimuths of patches are multiples of this, a column of the network's predictions.
     """
 
     height: int = 192
     width: int = 256
     hfov_deg: float = 112.5
-    bottom_deg: float = -45.0
+    top_deg: float = 39.375
+    step_deg: float = 1.40625
 
     @property
-    def top_deg(self) -> float:
-        """Elevation of the upper border."""
-        return self.bottom_deg + self.hfov_deg * self.height / self.width
+    def bottom_deg(self) -> float:
+        """Elevation of the lower border."""
+        return self.top_deg - self.hfov_deg * self.height / self.width
 
     @property
     def hfov(self) -> float:
@@ -71,6 +73,11 @@ class Patch:
     seen: Bool[np.ndarray, "h w"]
     azimuth_rad: float
 
+    @property
+    def rgba(self) -> UInt8[np.ndarray, "h w 4"]:
+        """Pixels with an opacity of 255 where they are seen, as the encoder of views expects them."""
+        return np.dstack([self.pixels, np.where(self.seen, 255, 0).astype(np.uint8)])
+
 
 def cut_patches(
     picture: UInt8[np.ndarray, "h w 3"], camera: Camera, *, pitch: float, roll: float, size: PatchSize
@@ -93,12 +100,14 @@ def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
     """Return the azimuths of the patches that cover a horizontal field of view, relative to its centre."""
     if hfov <= _SLACK * size.hfov:
         return [0.0]
-    step = (1.0 - _OVERLAP) * size.hfov
+    apart = (1.0 - _OVERLAP) * size.hfov
     if hfov > TWO_PI - 0.5 * size.hfov:
-        count = math.ceil(TWO_PI / step)
-        return [((index + 0.5) / count - 0.5) * TWO_PI for index in range(count)]
-    count = 1 + math.ceil((hfov - size.hfov) / step)
-    return [float(azimuth) for azimuth in np.linspace(-0.5, 0.5, count) * (hfov - size.hfov)]
+        count = math.ceil(TWO_PI / apart)
+        azimuths = ((np.arange(count) + 0.5) / count - 0.5) * TWO_PI
+    else:
+        azimuths = np.linspace(-0.5, 0.5, 1 + math.ceil((hfov - size.hfov) / apart)) * (hfov - size.hfov)
+    step = math.radians(size.step_deg)
+    return [float(azimuth) for azimuth in np.round(azimuths / step) * step]
 
 
 def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float, size: PatchSize) -> Patch:

@@ -63,7 +63,7 @@ class StatedView:
         projection: one of `PROJECTIONS`, or "auto".
         hfov_deg: horizontal field of view of the upright picture.
         intrinsics: camera matrix and distortion, instead of `hfov_deg`.
-        pitch_deg: elevation of the picture's centre above the horizon.
+        pitch_deg: elevation of the picture's centre above the horizon; of its whole middle row, if it is cylindrical.
         roll_deg: clockwise rotation of the camera about its optical axis.
     """
 

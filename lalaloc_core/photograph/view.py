@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -14,7 +14,7 @@ from lalaloc_core.panorama.images import Panorama, open_panorama
 from lalaloc_core.panorama.levelling import camera_axes
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.panorama.pictures import PanoramaLimits, opened_picture, orientation_of, scaled, turned
-from lalaloc_core.photograph.cameras import Camera, Perspective
+from lalaloc_core.photograph.cameras import Around, Camera, Perspective
 from lalaloc_core.photograph.exif import read_exif_lens
 from lalaloc_core.photograph.levelling import (
     MAX_ESTIMATED_SD,
@@ -171,14 +171,19 @@ def _view(
         attitude = estimate_attitude(lines_of(segments, small))
     pitch = _tilt(stated.pitch_deg, attitude.pitch, attitude.pitch_sd)
     roll = _tilt(stated.roll_deg, attitude.roll, attitude.roll_sd)
+    tilt = pitch.value
+    if isinstance(camera, Around) and lens.projection == "cylindrical" and pitch.source == "given":
+        # A strip's pitch is the same all around, so its camera is not rotated.
+        camera, tilt = replace(camera, elevation=pitch.value), 0.0
+        small = camera.scaled(columns, rows)
     return View(
         projection=lens.projection,
         projection_source=lens.projection_source,
         hfov=Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source),
         pitch=pitch,
         roll=roll,
-        azimuths=_seen_azimuths(small, pitch.value, roll.value),
-        patches=cut_patches(picture, small, pitch=pitch.value, roll=roll.value, size=size),
+        azimuths=_seen_azimuths(small, tilt, roll.value),
+        patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
         camera=camera,
         warnings=warnings,
     )

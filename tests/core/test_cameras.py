@@ -29,6 +29,7 @@ CAMERAS: list[Camera] = [
     FISHEYE,
     Fisheye.of_hfov(640, 480, math.radians(150.0)),
     Around(width=900, height=300, hfov=math.radians(200.0)),
+    Around(width=900, height=300, hfov=math.radians(200.0), elevation=0.1),
     Around(width=1024, height=512, hfov=2.0 * math.pi, spherical=True),
 ]
 

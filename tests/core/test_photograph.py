@@ -12,6 +12,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.view_encoder import ViewEncoderConfig
 from lalaloc_core.panorama.levelling import level
 from lalaloc_core.panorama.pictures import PanoramaLimits
 from lalaloc_core.photograph import Intrinsics, PatchSize, StatedView, View, open_view
@@ -273,9 +275,22 @@ class TestPatches:
         assert patch_error(view, "living_room") < 6.0
         assert view.azimuths == pytest.approx((-0.5 * camera.hfov, 0.5 * camera.hfov), abs=0.02)
 
+    def test_pitch_of_a_strip_moves_its_horizon(self) -> None:
+        strip = view_of(Around(width=1400, height=400, hfov=math.radians(250.0), elevation=math.radians(8.0)))
+        view = opened(jpeg(strip), projection="cylindrical", hfov_deg=250.0, pitch_deg=8.0, roll_deg=0.0)
+        assert patch_error(view, "living_room") < 6.0
+        assert view.pitch.source == "given"
+
+    def test_patch_agrees_with_the_encoder_of_views(self) -> None:
+        size, config = PatchSize(), ViewEncoderConfig()
+        ring = RingConfig(sectors=64)
+        assert (size.height, size.width, size.top_deg) == (config.image_height, config.image_width, config.top_deg)
+        assert size.hfov == pytest.approx(config.width_rad(ring))
+
     def test_unseen_pixels_are_grey(self) -> None:
         (patch,) = opened(jpeg(view_of(MAIN), PHONE), pitch_deg=0.0, roll_deg=0.0).patches
         assert (patch.pixels[~patch.seen] == UNSEEN).all()
+        np.testing.assert_array_equal(patch.rgba[..., 3] == 255, patch.seen)
         seen_columns = np.flatnonzero(patch.seen.any(axis=0))
         resolution = PatchSize().width / PatchSize().hfov_deg
         assert len(seen_columns) / resolution == pytest.approx(67.3, abs=1.0)
@@ -287,7 +302,7 @@ class TestPatches:
         centres = np.degrees(patch_azimuths(math.radians(hfov_deg), size))
         azimuth = np.linspace(-0.5, 0.5, 721) * hfov_deg
         offset = np.abs((azimuth[:, None] - centres + 180.0) % 360.0 - 180.0)
-        assert offset.min(axis=1).max() <= 0.5 * size.hfov_deg + 1e-6
+        assert offset.min(axis=1).max() <= 0.5 * (size.hfov_deg + size.step_deg)
         assert len(centres) <= 1 + hfov_deg / 80.0
 
     def test_fine_stripes_become_grey(self) -> None:
