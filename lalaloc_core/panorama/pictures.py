@@ -177,8 +177,10 @@ def _named_errors(content: bytes, limits: PanoramaLimits) -> Iterator[None]:
 def _unreadable(content: bytes) -> str:
     formats = f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
     kind = describe_file(content)
-    if kind == HEIC and find_spec("pillow_heif") is None:
-        return f"the photograph is {kind}, which needs the extra `heic` on the server; save or export it as {formats}"
+    if kind == HEIC:
+        missing = find_spec("pillow_heif") is None
+        fault = "which needs the extra `heic` on the server" if missing else "which is damaged"
+        return f"the photograph is {kind}, {fault}; save or export it as {formats}"
     if kind is None or any(name in kind.upper() for name in FORMATS):
         return f"the photograph is not a readable {formats} picture"
     return f"the photograph is {kind}, which is not supported; save or export it as {formats}"

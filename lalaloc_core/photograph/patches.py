@@ -17,7 +17,7 @@ from lalaloc_core.photograph.cameras import Camera
 # Colour of pixels that the photograph does not show.
 UNSEEN = 127
 # Resolution of the photograph that patches are sampled from, relative to theirs: less blurs, more aliases.
-_FINER = 1.4
+FINER = 1.4
 # A field of view that is wider than a patch by less than this factor gets one patch.
 _SLACK = 1.03
 # Least overlap of neighbouring patches, as a share of their width.
@@ -91,7 +91,7 @@ def cut_patches(
         roll: clockwise rotation of the camera about it, radians.
         size: size of the patches.
     """
-    picture, camera = _reduced(picture, camera, _FINER * size.resolution)
+    picture, camera = _reduced(picture, camera, FINER * size.resolution)
     axes = camera_axes(pitch=pitch, roll=roll).astype(np.float32)
     return tuple(_patch(picture, camera, axes, azimuth, size) for azimuth in patch_azimuths(camera.hfov, size))
 

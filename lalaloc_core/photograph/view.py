@@ -22,11 +22,11 @@ from lalaloc_core.photograph.levelling import (
     estimate_calibration,
 )
 from lalaloc_core.photograph.lines import find_segments, lines_of
-from lalaloc_core.photograph.patches import Patch, PatchSize, cut_patches
+from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.projection import NO_FIELD_OF_VIEW, Lens, Projection, Source, find_lens, is_sphere
 from lalaloc_core.photograph.stated import StatedView
 
-# Longer side (pixels) that a photograph is decoded at; JPEGs decode at an eighth of their size fastest.
+# Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
 # Larger relative standard deviations of an estimated focal length are no answer.
@@ -97,6 +97,7 @@ def open_view(
             picture shows.
     """
     stated, limits = stated or StatedView(), limits or PanoramaLimits()
+    size = patch_size or PatchSize()
     stated.check()
 
     @cache
@@ -123,8 +124,8 @@ def open_view(
         )
         if lens.is_sphere:
             return _sphere_view(panorama(), lens, stated, sphere)
-        picture = np.asarray(scaled(image, orientation, _decoded_size(width, height), oversampling=1))
-    return _view(picture, (width, height), lens, stated, patch_size or PatchSize())
+        picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
+    return _view(picture, (width, height), lens, stated, size)
 
 
 def _sphere_view(panorama: Panorama, lens: Lens, stated: StatedView, sphere: PhotoSphere) -> View:
@@ -195,11 +196,13 @@ def _tilt(stated_deg: float | None, angle: float, sd: float) -> Assumed:
     return Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
 
 
-def _decoded_size(width: int, height: int) -> tuple[int, int]:
-    """Return a size at which a JPEG decodes fast, with a longer side of at least `_LONG_SIDE` if the picture has it."""
-    long = max(width, height)
-    eighth = next((factor for factor in _JPEG_FACTORS if long >= factor * _LONG_SIDE), 1)
-    factor = eighth * max(1, long // eighth // _LONG_SIDE)
+def _decoded_size(width: int, height: int, lens: Lens, size: PatchSize) -> tuple[int, int]:
+    """Return a size at which a JPEG decodes fast, fine enough for lines and patches if the picture is."""
+    most = max(width, height) / _LONG_SIDE
+    if lens.camera is not None:
+        most = min(most, lens.camera.resolution / (FINER * size.resolution))
+    eighth = next((factor for factor in _JPEG_FACTORS if most >= factor), 1)
+    factor = eighth * max(1, int(most / eighth))
     return -(-width // factor), -(-height // factor)
 
 

@@ -275,6 +275,13 @@ class TestPatches:
         assert patch_error(view, "living_room") < 6.0
         assert view.azimuths == pytest.approx((-0.5 * camera.hfov, 0.5 * camera.hfov), abs=0.02)
 
+    def test_strip_is_decoded_as_fine_as_its_patches(self) -> None:
+        """Stripes of 1° stay sharp in a strip that is many times as wide as photographs are decoded."""
+        strip = np.zeros((1000, 6000, 3), np.uint8)
+        strip[:, (np.arange(6000) // 17) % 2 == 0] = 255
+        view = opened(jpeg(strip), hfov_deg=359.0, pitch_deg=0.0, roll_deg=0.0)
+        assert all(patch.pixels[96, 20:-20].std() > 93.0 for patch in view.patches)
+
     def test_pitch_of_a_strip_moves_its_horizon(self) -> None:
         strip = view_of(Around(width=1400, height=400, hfov=math.radians(250.0), elevation=math.radians(8.0)))
         view = opened(jpeg(strip), projection="cylindrical", hfov_deg=250.0, pitch_deg=8.0, roll_deg=0.0)
@@ -326,6 +333,13 @@ class TestPatches:
         expected = 127.5 + (594.0 / 1024.0 - 0.5) * 360.0 * 256.0 / 112.5
         assert len(rows) > 100
         np.testing.assert_allclose(centres, expected, atol=1.0)
+
+
+def test_unreadable_heic_file_names_the_remedy() -> None:
+    with pytest.raises(
+        InvalidPanoramaError, match=r"is a HEIC picture, which .*; save or export it as JPEG, PNG or WEBP"
+    ):
+        opened(b"\0\0\0\x18ftypheic" + bytes(100))
 
 
 def test_heic_photograph_is_read() -> None:
