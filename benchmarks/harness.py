@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import http.client
 import json
 import math
 import os
@@ -15,18 +16,22 @@ import threading
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import psutil
 
 from examples.launch import ROOT, running_service
-from examples.truth import PLAN_PATH, TruePose
+from examples.truth import PLAN_PATH, TruePose, read_poses
 
+_JSON = "application/json"
+_REQUEST_TIMEOUT_S = 120.0
 _START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
 # Settings under which no request of a throughput test is refused.
 UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
@@ -111,6 +116,66 @@ def query_of(pose: TruePose, **target: str) -> dict[str, Any]:
     """Return the form of a query with an example panorama and its heading, as arguments of `httpx.post`."""
     fields = {**target, "heading_deg": f"{pose.heading_deg}", "camera_height_m": f"{pose.camera_height_m}"}
     return {"data": fields, "files": {"panorama": (pose.file, pose.picture.read_bytes())}}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answer to a request; status 0 is a broken connection."""
+
+    status: int
+    content: bytes = b""
+    etag: str = ""
+
+    def json(self) -> Any:
+        """Return the parsed content."""
+        return json.loads(self.content)
+
+
+class Caller:
+    """One persistent connection of a tenant.
+
+    Args:
+        url: address of the service.
+        key: API key; None without keys.
+        count: called with the status of every answer.
+    """
+
+    def __init__(self, url: str, key: str | None = None, count: Callable[[int], None] = lambda _status: None) -> None:
+        self._connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=_REQUEST_TIMEOUT_S)
+        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._count = count
+
+    def send(self, method: str, path: str, content: bytes = b"", media: str = _JSON, etag: str = "") -> Answer:
+        """Send a request and read its answer; `etag` makes it conditional."""
+        headers = (
+            self._headers | ({"Content-Type": media} if content else {}) | ({"If-None-Match": etag} if etag else {})
+        )
+        try:
+            self._connection.request(method, path, content, headers)
+            response = self._connection.getresponse()
+            answer = Answer(response.status, response.read(), response.headers.get("ETag", ""))
+        except (http.client.HTTPException, OSError):
+            # The service answers and closes while a refused body is still sent.
+            self._connection.close()
+            answer = Answer(0)
+        self._count(answer.status)
+        return answer
+
+
+@cache
+def form(fields: tuple[tuple[str, str], ...], files: tuple[tuple[str, bytes], ...]) -> tuple[bytes, str]:
+    """Return a multipart body and its media type."""
+    parts = [(name, (name, content)) for name, content in files]
+    request = httpx.Request("POST", "http://localhost", data=dict(fields), files=parts)
+    return request.read(), request.headers["Content-Type"]
+
+
+def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
+    """Return the query with an example panorama, its heading and its camera height, as body and media type."""
+    poses = read_poses()
+    pose = poses[number % len(poses)]
+    fields = {"floorplan_id": plan_id, "heading_deg": pose.heading_deg, "camera_height_m": pose.camera_height_m}
+    return form(tuple((name, str(value)) for name, value in fields.items()), (("panorama", pose.picture.read_bytes()),))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,361 @@
+"""Heaviest accepted input of every route, for `neighbours.py` and the tests of growth.
+
+`LOADS` has at least one entry for every operation in `openapi.yaml`; `missing_routes` names those without. The work of
+an entry scales with a size, so that the benchmark sends the largest one and the tests count operations of small ones.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import json
+import math
+import random
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+from urllib.parse import urlencode
+
+import yaml
+from PIL import Image
+
+from benchmarks.harness import Answer, Caller, form
+from examples.launch import ROOT
+from examples.truth import read_poses
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import export_plan
+
+# Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
+VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
+# Panoramas of a sequence.
+_PANORAMAS = 10
+_ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Resources of a tenant that the work of a route needs."""
+
+    plan_id: str
+    plan_etag: str
+    venue_id: str
+    venue_etag: str
+    member_ids: Sequence[str]
+
+
+Work = Callable[[Caller, Stored, int], None]
+
+
+@dataclass(frozen=True)
+class Load:
+    """Work of one tenant on a route.
+
+    Attributes:
+        route: method and path as in `openapi.yaml`.
+        title: the input, for the table.
+        work: sends the requests of one round.
+        size: size of the largest input that is accepted.
+        plan: the stored plan in the benchmark.
+        connections: connections that repeat the work.
+        refusals: statuses of a refusal of the input itself, besides those for too many requests.
+    """
+
+    route: str
+    title: str
+    work: Work
+    size: int = 0
+    plan: str = VERTICES_PLAN
+    connections: int = 8
+    refusals: frozenset[int] = frozenset()
+
+
+def documented_routes() -> set[str]:
+    """Return method and path of every operation in `openapi.yaml`."""
+    paths = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))["paths"]
+    return {f"{method.upper()} {path}" for path, operations in paths.items() for method in operations}
+
+
+def missing_routes() -> list[str]:
+    """Return the documented routes without an entry in `LOADS`."""
+    return sorted(documented_routes() - {load.route for load in LOADS})
+
+
+def building(rooms: int, corners: int = 4, openings_per_room: int = 0) -> dict[str, Any]:
+    """Return a plan of equal rooms in rows, squares of 1 m or round with a diameter of 2 m."""
+    columns = math.ceil(math.sqrt(rooms))
+    pitch = 1.0 if corners == 4 else 2.2
+    places = [(pitch * (number % columns), pitch * (number // columns)) for number in range(rooms)]
+    turns = [2.0 * math.pi * number / corners for number in range(corners)]
+    ring = [(0, 0), (1, 0), (1, 1), (0, 1)] if corners == 4 else [(math.cos(t), math.sin(t)) for t in turns]
+    lines = [((0.1, 0.0), (0.9, 0.0)), ((0.0, 0.1), (0.0, 0.9))][:openings_per_room]
+    return {
+        "name": "building",
+        "ceiling_height_m": 2.5,
+        "camera_height_m": 1.5,
+        "anchor": _ANCHOR,
+        "rooms": [{"polygon": [[round(x + a, 9), round(y + b, 9)] for a, b in ring]} for x, y in places],
+        "openings": [
+            {"kind": "door", "line": [[round(x + a, 9), round(y + b, 9)] for a, b in line]}
+            for x, y in places
+            for line in lines
+        ],
+    }
+
+
+def home(number: int) -> dict[str, Any]:
+    """Return a plan of one room of random size; the same for the same number."""
+    rng = random.Random(number)
+    width, depth = rng.uniform(3.0, 6.0), rng.uniform(2.2, 4.5)
+    room = {"polygon": [[0.0, 0.0], [width, 0.0], [width, depth], [0.0, depth]]}
+    return {"name": f"home {number:05d}", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [room]}
+
+
+def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
+    """Store homes and a venue of them; return its id and entity tag, and the ids of the homes."""
+    ids = [_created(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
+    answer = caller.send("POST", "/venues", _venue(ids))
+    return _created(answer), answer.etag, ids
+
+
+def _body(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def _created(answer: Answer) -> str:
+    if answer.status != 201:
+        raise RuntimeError(f"status {answer.status}: {answer.content[:200]!r}; the benchmark needs 201")
+    return answer.json()["id"]
+
+
+def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:
+    return _body({"name": name, "plans": [{"floorplan_id": plan_id, "level": 0} for plan_id in plan_ids]})
+
+
+@cache
+def _panorama() -> bytes:
+    return read_poses()[0].picture.read_bytes()
+
+
+@cache
+def _building_body(rooms: int, corners: int, openings_per_room: int = 0) -> bytes:
+    return _body(building(rooms, corners, openings_per_room))
+
+
+@cache
+def _diagonals_body(rooms: int) -> bytes:
+    """Return a plan with openings whose bounding boxes contain all walls."""
+    plan = building(rooms)
+    side = math.ceil(math.sqrt(rooms))
+    lines = [[[0.001 * number, 0.0], [side, side]] for number in range(5 * rooms)]
+    return _body(plan | {"openings": [{"kind": "passage", "line": line} for line in lines]})
+
+
+@cache
+def _svg(kibibytes: int) -> bytes:
+    """Return a drawing of one room with comments."""
+    drawing = export_plan(FloorPlan.from_dict(home(0)), "svg")
+    end = drawing.rindex(b"</svg>")
+    return drawing[:end] + kibibytes * (b"<!--" + 1017 * b"x" + b"-->") + drawing[end:]
+
+
+@cache
+def _large_jpeg(side: int) -> bytes:
+    """Return a grey progressive JPEG."""
+    buffer = io.BytesIO()
+    Image.new("L", (2 * side, side), 90).save(buffer, "JPEG", progressive=True)
+    return buffer.getvalue()
+
+
+@cache
+def _padded_picture(size: int) -> bytes:
+    """Return the example panorama with comments of some bytes in total."""
+    comment = b"\xff\xfe\xff\xff" + bytes(2**16 - 3)
+    picture = _panorama()
+    return picture[:2] + comment * max(size // len(comment), 0) + picture[2:]
+
+
+_names = itertools.count()
+
+
+def _get(path: str, *, conditional: bool = False, **query: object) -> Work:
+    """Return the work of one GET; values of the query that are None are the size."""
+
+    def work(caller: Caller, stored: Stored, size: int) -> None:
+        address = path.format(floorplan_id=stored.plan_id, venue_id=stored.venue_id)
+        text = urlencode({name: size if value is None else value for name, value in query.items()})
+        etag = "" if not conditional else stored.venue_etag if "venue_id" in path else stored.plan_etag
+        caller.send("GET", f"{address}?{text}" if text else address, etag=etag)
+
+    return work
+
+
+def _post_and_delete(content: Callable[[int], bytes], media: str = "application/json") -> Work:
+    """Return the work of storing a plan and deleting it."""
+
+    def work(caller: Caller, _stored: Stored, size: int) -> None:
+        answer = caller.send("POST", "/floorplans", content(size), media)
+        if answer.status == 201:
+            caller.send("DELETE", f"/floorplans/{answer.json()['id']}")
+
+    return work
+
+
+def _put_plan(caller: Caller, stored: Stored, size: int) -> None:
+    caller.send("PUT", f"/floorplans/{stored.plan_id}", _building_body(size, 190))
+
+
+def _prepare_halls(caller: Caller, _stored: Stored, size: int) -> None:
+    caller.send("POST", "/floorplans", _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": _square(size)}]}))
+
+
+def _square(side_m: float) -> list[list[float]]:
+    return [[0.0, 0.0], [side_m, 0.0], [side_m, side_m], [0.0, side_m]]
+
+
+def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
+    answer = caller.send("POST", "/floorplans", _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": _square(size)}]}))
+    if answer.status == 201:
+        caller.send("GET", f"/floorplans/{answer.json()['id']}/events")
+
+
+def _localise(picture: Callable[[int], bytes] = lambda _size: _panorama(), **fields: str) -> Work:
+    """Return the work of a query; without a heading, so that all are searched."""
+
+    def work(caller: Caller, stored: Stored, size: int) -> None:
+        values = {name: value.format(plan=stored.plan_id, venue=stored.venue_id) for name, value in fields.items()}
+        caller.send("POST", "/localise", *form(tuple(values.items()), (("panorama", picture(size)),)))
+
+    return work
+
+
+def _sequence(*, padded: bool) -> Work:
+    """Return the work of a sequence, `padded` to `size` MB in total."""
+
+    def work(caller: Caller, stored: Stored, size: int) -> None:
+        files = _PANORAMAS * (("panorama", _padded_picture(size * 10**6 // _PANORAMAS if padded else 0)),)
+        caller.send("POST", "/localise/sequence", *form((("floorplan_id", stored.plan_id),), files))
+
+    return work
+
+
+def _geopose(caller: Caller, stored: Stored, _size: int) -> None:
+    privacy = {f"data{name}": [] for name in ("Retention", "AcceptableUse", "SanitizationApplied")}
+    privacy["dataSanitizationRequested"] = []
+    reading = {"timestamp": 0, "sensorId": "camera", "privacy": privacy, "sequenceNumber": 0, "imageFormat": "JPG"}
+    orientation = {"mirrored": False, "rotation": 0}
+    picture = base64.b64encode(_panorama()).decode()
+    reading |= {"size": [512, 256], "imageBytes": picture, "imageOrientation": orientation}
+    document = {"id": "request", "timestamp": 0, "type": "geopose", "sensors": [{"type": "camera", "id": "camera"}]}
+    body = _body(document | {"sensorReadings": {"cameraReadings": [reading]}})
+    caller.send("POST", f"/geopose?floorplan_id={stored.plan_id}", body)
+
+
+def _post_venue(caller: Caller, stored: Stored, _size: int) -> None:
+    answer = caller.send("POST", "/venues", _venue(stored.member_ids))
+    if answer.status == 201:
+        caller.send("DELETE", f"/venues/{answer.json()['id']}")
+
+
+def _put_venue(caller: Caller, stored: Stored, _size: int) -> None:
+    caller.send("PUT", f"/venues/{stored.venue_id}", _venue(stored.member_ids, f"venue {next(_names)}"))
+
+
+def _change_and_search_venue(caller: Caller, stored: Stored, size: int) -> None:
+    caller.send("PATCH", f"/venues/{stored.venue_id}", _body({"name": f"venue {next(_names)}"}))
+    _localise(venue_id="{venue}")(caller, stored, size)
+
+
+def _keep_answer(method: str) -> Work:
+    def work(caller: Caller, stored: Stored, _size: int) -> None:
+        content, media = form(
+            (("floorplan_id", stored.plan_id), ("include", "posterior")), (("panorama", _panorama()),)
+        )
+        answer = caller.send("POST", "/localise", content, media)
+        if answer.status == 200:
+            caller.send(method, f"/answers/{answer.json()['answer_id']}")
+
+    return work
+
+
+_TOO_LONG = frozenset({422})
+LOADS = (
+    Load("GET /floorplans", "pages of 500", _get("/floorplans", limit=None), 500),
+    Load("GET /floorplans/{floorplan_id}", VERTICES_PLAN, _get("/floorplans/{floorplan_id}")),
+    Load(
+        "GET /floorplans/{floorplan_id}",
+        f"{VERTICES_PLAN}, conditional",
+        _get("/floorplans/{floorplan_id}", conditional=True),
+    ),
+    Load("GET /floorplans/{floorplan_id}/original", VERTICES_PLAN, _get("/floorplans/{floorplan_id}/original")),
+    *(
+        Load(
+            "GET /floorplans/{floorplan_id}/export",
+            f"{kind}, {VERTICES_PLAN}",
+            _get("/floorplans/{floorplan_id}/export", format=kind),
+        )
+        for kind in ("native", "geojson", "imdf", "dxf", "svg")
+    ),
+    Load("GET /floorplans/{floorplan_id}/preview.svg", VERTICES_PLAN, _get("/floorplans/{floorplan_id}/preview.svg")),
+    Load(
+        "GET /floorplans/{floorplan_id}/mesh.glb",
+        ROOMS_PLAN,
+        _get("/floorplans/{floorplan_id}/mesh.glb"),
+        plan=ROOMS_PLAN,
+    ),
+    Load(
+        "GET /floorplans/{floorplan_id}/layout", ROOMS_PLAN, _get("/floorplans/{floorplan_id}/layout"), plan=ROOMS_PLAN
+    ),
+    Load(
+        "GET /floorplans/{floorplan_id}/events",
+        "64 streams of plans in preparation",
+        _follow_events,
+        98,
+        connections=64,
+    ),
+    Load("POST /floorplans", "homes of one room", _post_and_delete(lambda size: _body(home(size)))),
+    Load("POST /floorplans", VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
+    Load("POST /floorplans", ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
+    Load(
+        "POST /floorplans",
+        "2,000 rooms × 10,000 diagonal openings",
+        _post_and_delete(_diagonals_body),
+        2_000,
+        refusals=_TOO_LONG,
+    ),
+    Load("POST /floorplans", "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
+    Load("POST /floorplans", "halls of 1,600 m², whose pose grids are prepared", _prepare_halls, 40),
+    Load("PUT /floorplans/{floorplan_id}", VERTICES_PLAN, _put_plan, 500),
+    Load(
+        "DELETE /floorplans/{floorplan_id}",
+        VERTICES_PLAN,
+        _post_and_delete(lambda size: _building_body(size, 190)),
+        500,
+    ),
+    Load("POST /venues", "{homes} homes", _post_venue),
+    Load("GET /venues", "pages of 500", _get("/venues", limit=None), 500),
+    Load("GET /venues/{venue_id}", "{homes} homes", _get("/venues/{venue_id}")),
+    Load("GET /venues/{venue_id}", "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),
+    Load("PUT /venues/{venue_id}", "{homes} homes", _put_venue),
+    Load("PATCH /venues/{venue_id}", "{homes} homes, then a query in the venue", _change_and_search_venue),
+    Load("DELETE /venues/{venue_id}", "{homes} homes", _post_venue),
+    Load(
+        "GET /venues/{venue_id}/plans", "{homes} homes, pages of 500", _get("/venues/{venue_id}/plans", limit=None), 500
+    ),
+    Load("POST /localise", VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
+    Load("POST /localise", "{homes} homes", _localise(venue_id="{venue}"), connections=16),
+    Load("POST /localise", "JPEG of 98 megapixels", _localise(_large_jpeg, floorplan_id="{plan}"), 7_000),
+    Load("POST /localise/sequence", f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
+    Load(
+        "POST /localise/sequence",
+        "10 panoramas of {sequence_mb} MB in total",
+        _sequence(padded=True),
+        100,
+        connections=44,
+    ),
+    Load("POST /geopose", VERTICES_PLAN, _geopose),
+    Load("GET /answers/{answer_id}", f"{VERTICES_PLAN}, posterior", _keep_answer("GET")),
+    Load("DELETE /answers/{answer_id}", f"{VERTICES_PLAN}, posterior", _keep_answer("DELETE")),
+    *(Load(f"GET /{name}", "–", _get(f"/{name}")) for name in ("healthz", "readyz", "metrics", "limits", "usage")),
+)

@@ -1,0 +1,354 @@
+"""Latency of one tenant beside another that sends the heaviest accepted input to one route.
+
+    python -m benchmarks.neighbours --json docs/neighbours.json
+
+Every row of the table is measured on a service of its own, with default settings, API keys and no rate limits. One
+tenant asks `/localise` on a small plan: alone, beside the other tenant, and alone again. The other tenant repeats its
+request on several connections; its process has a low CPU priority, as if it ran on another machine. The exit status is
+1 when a ratio exceeds 3, a query of the first tenant fails, or the service refuses an input that it should accept.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from benchmarks.harness import Answer, Caller, argument_parser, example_query
+from benchmarks.heaviest import LOADS, ROOMS_PLAN, VERTICES_PLAN, Load, Stored, building, missing_routes, store_venue
+from examples.launch import running_service
+from examples.truth import PLAN_PATH
+from service.security import Permission
+from service.security.keys import hash_of, key_text, new_secret
+from service.settings import Settings
+from service.storage import open_store
+
+MAX_RATIO = 3.0
+_SETTINGS = {
+    "LALALOC_API_KEYS": "on",
+    "LALALOC_RATE_PER_MINUTE": "0",
+    "LALALOC_RATE_BURST": "0",
+    "LALALOC_KEEP_ANSWERS_S": "3600",
+    "LALALOC_LOG_LEVEL": "error",
+}
+_TOO_MANY = frozenset({0, 429, 503, 507})
+_ACCEPTED = frozenset({200, 201, 204, 304})
+_PAUSE_S, _LEAD_S, _WARM_QUERIES = 0.05, 1.0, 5
+# Processes that use less of a core than this are idle.
+_IDLE_SHARE, _IDLE_WINDOW_S, _IDLE_TIMEOUT_S = 0.1, 0.25, 10.0
+_READY_TIMEOUT_S = 600.0
+_NICE = 10
+
+
+@dataclass(frozen=True)
+class Template:
+    """Data folder with the resources and keys of both tenants, copied for every row."""
+
+    data: Path
+    heavy_key: str
+    light_key: str
+    light_plan_id: str
+    stored: Mapping[str, Stored]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Queries of the light tenant."""
+
+    count: int
+    failed: int
+    p50_ms: float
+    p99_ms: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measurement of one load.
+
+    Attributes:
+        answers: number of the heavy tenant's answers by status; 0 is a broken connection.
+        busy_s: time for which the service computed on after the heavy tenant was gone, 10 s at most.
+    """
+
+    route: str
+    title: str
+    connections: int
+    alone: Latency
+    beside: Latency
+    p50_ratio: float
+    p99_ratio: float
+    answers: Mapping[str, int]
+    busy_s: float
+
+
+def main() -> int:
+    """Measure and print the table; return 1 when a limit is exceeded."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--routes", default="", help="measure the routes that contain this text, such as 'GET /venues'")
+    parser.add_argument("--seconds", type=float, default=5.0, help="time beside the other tenant, and alone")
+    parser.add_argument("--homes", type=int, default=100, help="homes of the venue; 10000 are accepted")
+    parser.add_argument("--sequence-mb", type=int, default=100, help="size of a padded sequence; 100 are accepted")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    if missing := missing_routes():
+        parser.exit(1, f"no entry in benchmarks/heaviest.py for: {', '.join(missing)}\n")
+    loads = [
+        replace(
+            load,
+            title=load.title.format(homes=options.homes, sequence_mb=options.sequence_mb),
+            size=options.sequence_mb if "{sequence_mb}" in load.title else load.size,
+        )
+        for load in LOADS
+        if options.routes in load.route
+    ]
+    rows = []
+    with _template(options.homes, {load.plan for load in loads}) as template:
+        print("\n".join(_HEAD))
+        for load in loads:
+            rows.append(_measure(load, template, options.seconds))
+            print(_line(asdict(rows[-1])), flush=True)
+    if options.json:
+        report = {
+            "command": f"python -m benchmarks.neighbours --seconds {options.seconds:g} --homes {options.homes}",
+            "cores": len(os.sched_getaffinity(0)),
+            "rows": [asdict(row) for row in rows],
+        }
+        options.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    failed = [row for row, load in zip(rows, loads, strict=True) if not _holds(row, load.refusals)]
+    for row in failed:
+        print(f"exceeded: {row.route}, {row.title}", file=sys.stderr)
+    return int(bool(failed))
+
+
+_HEAD = (
+    "| route | input | connections | alone: p50, p99 | beside: p50, p99 | ratios | failed | answers by status "
+    "| busy after |",
+    "|---|---|---|---|---|---|---|---|---|",
+)
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """Return the table of a report that `--json` wrote."""
+    return "\n".join([*_HEAD, *map(_line, report["rows"])])
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    times = [f"{row[part]['p50_ms']:.0f}, {row[part]['p99_ms']:.0f} ms" for part in ("alone", "beside")]
+    answers = ", ".join(f"{count} × {status}" for status, count in sorted(row["answers"].items())) or "none"
+    ratios = f"{row['p50_ratio']:.1f}, {row['p99_ratio']:.1f}"
+    cells = (f"`{row['route']}`", row["title"], row["connections"], *times, ratios, row["beside"]["failed"], answers)
+    return f"| {' | '.join(map(str, cells))} | {row['busy_s']:.1f} s |"
+
+
+def _holds(row: Row, refusals: frozenset[int]) -> bool:
+    """Return True if the light tenant was served, and the heavy one's input was treated as expected."""
+    expected = {str(status) for status in _TOO_MANY | _ACCEPTED | refusals}
+    served = row.p50_ratio <= MAX_RATIO and row.p99_ratio <= MAX_RATIO and not row.beside.failed
+    return served and row.answers.keys() <= expected
+
+
+@contextmanager
+def _template(homes: int, plans: set[str]) -> Iterator[Template]:
+    """Store the plans, the venue and the keys, and wait until all pose grids are ready."""
+    documents = {VERTICES_PLAN: lambda: building(500, 190), ROOMS_PLAN: lambda: building(10_000, 4, 2)}
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / "data"
+        data.mkdir()
+        keys = {tenant: _new_key(data, tenant) for tenant in ("heavy", "light")}
+        with running_service(0, _SETTINGS | {"LALALOC_DATA_DIR": str(data)}) as service:
+            light, heavy = Caller(service.url, keys["light"]), Caller(service.url, keys["heavy"])
+            light_plan_id = _upload(light, PLAN_PATH.read_bytes())
+            venue_id, _, member_ids = store_venue(heavy, homes)
+            plan_ids = {name: _upload(heavy, json.dumps(documents[name]()).encode()) for name in plans}
+            _wait_until_ready(service.url)
+            # The service has closed the idle connections meanwhile.
+            heavy = Caller(service.url, keys["heavy"])
+            venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
+            stored = {
+                name: Stored(
+                    plan_id, heavy.send("GET", f"/floorplans/{plan_id}").etag, venue_id, venue_etag, member_ids
+                )
+                for name, plan_id in plan_ids.items()
+            }
+        yield Template(data, keys["heavy"], keys["light"], light_plan_id, stored)
+
+
+def _new_key(data: Path, tenant: str) -> str:
+    secret = new_secret()
+    store = open_store(Settings(data_dir=data))
+    try:
+        key = store.keys.create(tenant, tenant, hash_of(secret), [str(scope) for scope in Permission])
+    finally:
+        store.close()
+    return key_text(key.id, secret)
+
+
+def _upload(caller: Caller, content: bytes) -> str:
+    answer = caller.send("POST", "/floorplans", content)
+    if answer.status != 201:
+        raise RuntimeError(f"upload: status {answer.status}: {answer.content[:300]!r}")
+    return answer.json()["id"]
+
+
+def _wait_until_ready(url: str) -> None:
+    caller, deadline = Caller(url), time.monotonic() + _READY_TIMEOUT_S
+    while preparing := caller.send("GET", "/readyz").json()["plans_preparing"]:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{preparing} plans are not ready after {_READY_TIMEOUT_S:g} s")
+        time.sleep(0.2)
+
+
+def _measure(load: Load, template: Template, seconds: float) -> Row:
+    """Measure one load on a fresh service with a copy of the data folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / "data"
+        shutil.copytree(template.data, data)
+        with running_service(0, _SETTINGS | {"LALALOC_DATA_DIR": str(data)}) as service:
+            process = psutil.Process(service.process.pid)
+            probe = _Probe(service.url, template)
+            for _ in range(_WARM_QUERIES):
+                probe.ask()
+            _idle_after(process)
+            first = probe.run(seconds / 2.0)
+            with _flood(service.url, template, load) as answers:
+                time.sleep(_LEAD_S)
+                beside = probe.run(seconds)
+            busy_s = _idle_after(process)
+            alone = first + probe.run(seconds / 2.0)
+            # Work that is still in progress belongs to no other row.
+            for child in process.children(recursive=True):
+                child.kill()
+            process.kill()
+    quiet, loaded = _latency(alone), _latency(beside)
+    p50_ratio, p99_ratio = loaded.p50_ms / quiet.p50_ms, loaded.p99_ms / quiet.p99_ms
+    return Row(load.route, load.title, load.connections, quiet, loaded, p50_ratio, p99_ratio, answers, busy_s)
+
+
+class _Probe:
+    """Queries of the light tenant, one after the other."""
+
+    def __init__(self, url: str, template: Template) -> None:
+        self._caller = Caller(url, template.light_key)
+        self._plan_id = template.light_plan_id
+        self._numbers = itertools.count()
+
+    def ask(self) -> float:
+        """Return the duration (s) of one query; infinite if it failed."""
+        query = example_query(next(self._numbers), self._plan_id)
+        begin = time.perf_counter()
+        status = self._caller.send("POST", "/localise", *query).status
+        if status != 200:
+            time.sleep(_PAUSE_S)
+            return math.inf
+        return time.perf_counter() - begin
+
+    def run(self, seconds: float) -> list[float]:
+        """Return the durations of queries for a time."""
+        end, durations_s = time.monotonic() + seconds, []
+        while time.monotonic() < end:
+            durations_s.append(self.ask())
+        return durations_s
+
+
+def _latency(durations_s: Sequence[float]) -> Latency:
+    ordered = sorted(durations_s)
+    p99_s = ordered[math.ceil(0.99 * len(ordered)) - 1]
+    return Latency(len(ordered), ordered.count(math.inf), 1e3 * statistics.median(ordered), 1e3 * p99_s)
+
+
+@contextmanager
+def _flood(url: str, template: Template, load: Load) -> Iterator[dict[str, int]]:
+    """Repeat a load in another process; the yielded counts of answers are filled when the block ends."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    # The work itself cannot be sent to a process, so its place in the table is.
+    number = [known.work for known in LOADS].index(load.work)
+    arguments = (url, template.heavy_key, number, load.size, template.stored[load.plan], theirs)
+    process = context.Process(target=_send_flood, args=arguments, daemon=True)
+    process.start()
+    answers: dict[str, int] = {}
+    try:
+        ours.recv()
+        yield answers
+        ours.send("end")
+        answers |= ours.recv()
+    finally:
+        process.kill()
+        process.join()
+
+
+def _send_flood(url: str, key: str, number: int, size: int, stored: Stored, pipe: Connection) -> None:
+    os.nice(_NICE)
+    load = LOADS[number]
+    counts: Counter[str] = Counter()
+    lock = threading.Lock()
+
+    def count(status: int) -> None:
+        with lock:
+            counts[str(status)] += 1
+        if status in _TOO_MANY:
+            time.sleep(_PAUSE_S)
+
+    def repeat() -> None:
+        caller = Caller(url, key, count)
+        while True:
+            load.work(caller, stored, size)
+
+    # The bodies are made before they are needed.
+    load.work(_Rehearsal(url), stored, size)
+    for _ in range(load.connections):
+        threading.Thread(target=repeat, daemon=True).start()
+    pipe.send("begun")
+    pipe.recv()
+    with lock:
+        pipe.send(dict(counts))
+
+
+class _Rehearsal(Caller):
+    """Caller that sends nothing."""
+
+    def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
+        """Return a broken connection."""
+        return Answer(0)
+
+
+def _idle_after(process: psutil.Process) -> float:
+    """Wait until the service computes nothing, for 10 s at most; return the time (s)."""
+    begin = time.monotonic()
+    while (waited_s := time.monotonic() - begin) < _IDLE_TIMEOUT_S:
+        before_s = _cpu_s(process)
+        time.sleep(_IDLE_WINDOW_S)
+        if _cpu_s(process) - before_s < _IDLE_SHARE * _IDLE_WINDOW_S:
+            break
+    return waited_s
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    """Return the CPU time of a service and its workers."""
+    total_s = 0.0
+    for part in (process, *process.children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):
+            times = part.cpu_times()
+            total_s += times.user + times.system
+    return total_s
+
+
+if __name__ == "__main__":
+    sys.exit(main())
