@@ -56,7 +56,7 @@ class Load:
         route: method and path as in `openapi.yaml`.
         title: the input, for the table.
         work: sends the requests of one round.
-        size: size of the largest input that is accepted.
+        size: size of the largest input that is accepted; the work is proportional to it.
         plan: the stored plan in the benchmark.
         connections: connections that repeat the work.
         refusals: statuses of a refusal of the input itself, besides those for too many requests.
@@ -206,16 +206,18 @@ def _put_plan(caller: Caller, stored: Stored, size: int) -> None:
     caller.send("PUT", f"/floorplans/{stored.plan_id}", _building_body(size, 190))
 
 
-def _prepare_halls(caller: Caller, _stored: Stored, size: int) -> None:
-    caller.send("POST", "/floorplans", _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": _square(size)}]}))
+def _hall(area_m2: int) -> bytes:
+    side_m = math.sqrt(area_m2)
+    polygon = [[0.0, 0.0], [side_m, 0.0], [side_m, side_m], [0.0, side_m]]
+    return _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": polygon}]})
 
 
-def _square(side_m: float) -> list[list[float]]:
-    return [[0.0, 0.0], [side_m, 0.0], [side_m, side_m], [0.0, side_m]]
+def _prepare_hall(caller: Caller, _stored: Stored, size: int) -> None:
+    caller.send("POST", "/floorplans", _hall(size))
 
 
 def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
-    answer = caller.send("POST", "/floorplans", _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": _square(size)}]}))
+    answer = caller.send("POST", "/floorplans", _hall(size))
     if answer.status == 201:
         caller.send("GET", f"/floorplans/{answer.json()['id']}/events")
 
@@ -311,10 +313,10 @@ LOADS = (
         "GET /floorplans/{floorplan_id}/events",
         "64 streams of plans in preparation",
         _follow_events,
-        98,
+        9_600,
         connections=64,
     ),
-    Load("POST /floorplans", "homes of one room", _post_and_delete(lambda size: _body(home(size)))),
+    Load("POST /floorplans", "homes of one room", _post_and_delete(lambda _size: _body(home(0)))),
     Load("POST /floorplans", VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
     Load("POST /floorplans", ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
     Load(
@@ -325,7 +327,7 @@ LOADS = (
         refusals=_TOO_LONG,
     ),
     Load("POST /floorplans", "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
-    Load("POST /floorplans", "halls of 1,600 m², whose pose grids are prepared", _prepare_halls, 40),
+    Load("POST /floorplans", "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
     Load("PUT /floorplans/{floorplan_id}", VERTICES_PLAN, _put_plan, 500),
     Load(
         "DELETE /floorplans/{floorplan_id}",
