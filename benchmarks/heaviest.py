@@ -53,7 +53,7 @@ class Load:
     """Work of one tenant on a route.
 
     Attributes:
-        route: method and path as in `openapi.yaml`.
+        routes: method and path as in `openapi.yaml` of the requests.
         title: the input, for the table.
         work: sends the requests of one round.
         size: size of the largest input that is accepted; the work is proportional to it.
@@ -62,7 +62,7 @@ class Load:
         refusals: statuses of a refusal of the input itself, besides those for too many requests.
     """
 
-    route: str
+    routes: tuple[str, ...]
     title: str
     work: Work
     size: int = 0
@@ -79,7 +79,7 @@ def documented_routes() -> set[str]:
 
 def missing_routes() -> list[str]:
     """Return the documented routes without an entry in `LOADS`."""
-    return sorted(documented_routes() - {load.route for load in LOADS})
+    return sorted(documented_routes() - {route for load in LOADS for route in load.routes})
 
 
 def building(rooms: int, corners: int = 4, openings_per_room: int = 0) -> dict[str, Any]:
@@ -161,10 +161,10 @@ def _svg(kibibytes: int) -> bytes:
 
 
 @cache
-def _large_jpeg(side: int) -> bytes:
+def _jpeg(kilopixels: int) -> bytes:
     """Return a grey progressive JPEG."""
-    buffer = io.BytesIO()
-    Image.new("L", (2 * side, side), 90).save(buffer, "JPEG", progressive=True)
+    height, buffer = math.isqrt(500 * kilopixels), io.BytesIO()
+    Image.new("L", (2 * height, height), 90).save(buffer, "JPEG", progressive=True)
     return buffer.getvalue()
 
 
@@ -203,7 +203,7 @@ def _post_and_delete(content: Callable[[int], bytes], media: str = "application/
 
 
 def _put_plan(caller: Caller, stored: Stored, size: int) -> None:
-    caller.send("PUT", f"/floorplans/{stored.plan_id}", _building_body(size, 190))
+    caller.send("PUT", f"/floorplans/{stored.plan_id}", _building_body(size, 4, 2))
 
 
 def _hall(area_m2: int) -> bytes:
@@ -233,10 +233,10 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _panorama(), **fie
 
 
 def _sequence(*, padded: bool) -> Work:
-    """Return the work of a sequence, `padded` to `size` MB in total."""
+    """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
-        files = _PANORAMAS * (("panorama", _padded_picture(size * 10**6 // _PANORAMAS if padded else 0)),)
+        files = _PANORAMAS * (("panorama", _padded_picture(size * 10**5 // _PANORAMAS if padded else 0)),)
         caller.send("POST", "/localise/sequence", *form((("floorplan_id", stored.plan_id),), files))
 
     return work
@@ -269,95 +269,100 @@ def _change_and_search_venue(caller: Caller, stored: Stored, size: int) -> None:
     _localise(venue_id="{venue}")(caller, stored, size)
 
 
-def _keep_answer(method: str) -> Work:
-    def work(caller: Caller, stored: Stored, _size: int) -> None:
-        content, media = form(
-            (("floorplan_id", stored.plan_id), ("include", "posterior")), (("panorama", _panorama()),)
-        )
-        answer = caller.send("POST", "/localise", content, media)
-        if answer.status == 200:
-            caller.send(method, f"/answers/{answer.json()['answer_id']}")
-
-    return work
+def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
+    fields = (("floorplan_id", stored.plan_id), ("include", "posterior"))
+    answer = caller.send("POST", "/localise", *form(fields, (("panorama", _panorama()),)))
+    if answer.status == 200:
+        path = f"/answers/{answer.json()['answer_id']}"
+        caller.send("GET", path)
+        caller.send("DELETE", path)
 
 
 _TOO_LONG = frozenset({422})
 LOADS = (
-    Load("GET /floorplans", "pages of 500", _get("/floorplans", limit=None), 500),
-    Load("GET /floorplans/{floorplan_id}", VERTICES_PLAN, _get("/floorplans/{floorplan_id}")),
+    Load(("GET /floorplans",), "pages of 500", _get("/floorplans", limit=None), 500),
+    Load(("GET /floorplans/{floorplan_id}",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}")),
     Load(
-        "GET /floorplans/{floorplan_id}",
+        ("GET /floorplans/{floorplan_id}",),
         f"{VERTICES_PLAN}, conditional",
         _get("/floorplans/{floorplan_id}", conditional=True),
     ),
-    Load("GET /floorplans/{floorplan_id}/original", VERTICES_PLAN, _get("/floorplans/{floorplan_id}/original")),
+    Load(("GET /floorplans/{floorplan_id}/original",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}/original")),
     *(
         Load(
-            "GET /floorplans/{floorplan_id}/export",
+            ("GET /floorplans/{floorplan_id}/export",),
             f"{kind}, {VERTICES_PLAN}",
             _get("/floorplans/{floorplan_id}/export", format=kind),
         )
         for kind in ("native", "geojson", "imdf", "dxf", "svg")
     ),
-    Load("GET /floorplans/{floorplan_id}/preview.svg", VERTICES_PLAN, _get("/floorplans/{floorplan_id}/preview.svg")),
     Load(
-        "GET /floorplans/{floorplan_id}/mesh.glb",
+        ("GET /floorplans/{floorplan_id}/preview.svg",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}/preview.svg")
+    ),
+    Load(
+        ("GET /floorplans/{floorplan_id}/mesh.glb",),
         ROOMS_PLAN,
         _get("/floorplans/{floorplan_id}/mesh.glb"),
         plan=ROOMS_PLAN,
     ),
     Load(
-        "GET /floorplans/{floorplan_id}/layout", ROOMS_PLAN, _get("/floorplans/{floorplan_id}/layout"), plan=ROOMS_PLAN
+        ("GET /floorplans/{floorplan_id}/layout",),
+        ROOMS_PLAN,
+        _get("/floorplans/{floorplan_id}/layout"),
+        plan=ROOMS_PLAN,
     ),
     Load(
-        "GET /floorplans/{floorplan_id}/events",
+        ("GET /floorplans/{floorplan_id}/events",),
         "64 streams of plans in preparation",
         _follow_events,
         9_600,
         connections=64,
     ),
-    Load("POST /floorplans", "homes of one room", _post_and_delete(lambda _size: _body(home(0)))),
-    Load("POST /floorplans", VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
-    Load("POST /floorplans", ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
     Load(
-        "POST /floorplans",
+        ("POST /floorplans", "DELETE /floorplans/{floorplan_id}"),
+        "homes of one room",
+        _post_and_delete(lambda _size: _body(home(0))),
+    ),
+    Load(("POST /floorplans",), VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
+    Load(("POST /floorplans",), ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
+    Load(
+        ("POST /floorplans",),
         "2,000 rooms × 10,000 diagonal openings",
         _post_and_delete(_diagonals_body),
         2_000,
         refusals=_TOO_LONG,
     ),
-    Load("POST /floorplans", "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
-    Load("POST /floorplans", "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
-    Load("PUT /floorplans/{floorplan_id}", VERTICES_PLAN, _put_plan, 500),
+    Load(("POST /floorplans",), "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
+    Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
+    Load(("PUT /floorplans/{floorplan_id}",), ROOMS_PLAN, _put_plan, 10_000),
+    Load(("POST /venues", "DELETE /venues/{venue_id}"), "{homes} homes", _post_venue),
+    Load(("GET /venues",), "pages of 500", _get("/venues", limit=None), 500),
+    Load(("GET /venues/{venue_id}",), "{homes} homes", _get("/venues/{venue_id}")),
+    Load(("GET /venues/{venue_id}",), "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),
+    Load(("PUT /venues/{venue_id}",), "{homes} homes", _put_venue),
+    Load(("PATCH /venues/{venue_id}",), "{homes} homes, then a query in the venue", _change_and_search_venue),
     Load(
-        "DELETE /floorplans/{floorplan_id}",
-        VERTICES_PLAN,
-        _post_and_delete(lambda size: _building_body(size, 190)),
+        ("GET /venues/{venue_id}/plans",),
+        "{homes} homes, pages of 500",
+        _get("/venues/{venue_id}/plans", limit=None),
         500,
     ),
-    Load("POST /venues", "{homes} homes", _post_venue),
-    Load("GET /venues", "pages of 500", _get("/venues", limit=None), 500),
-    Load("GET /venues/{venue_id}", "{homes} homes", _get("/venues/{venue_id}")),
-    Load("GET /venues/{venue_id}", "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),
-    Load("PUT /venues/{venue_id}", "{homes} homes", _put_venue),
-    Load("PATCH /venues/{venue_id}", "{homes} homes, then a query in the venue", _change_and_search_venue),
-    Load("DELETE /venues/{venue_id}", "{homes} homes", _post_venue),
+    Load(("POST /localise",), VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
+    Load(("POST /localise",), "{homes} homes", _localise(venue_id="{venue}"), connections=16),
+    Load(("POST /localise",), "JPEG of 98 megapixels", _localise(_jpeg, floorplan_id="{plan}"), 98_000),
+    Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(
-        "GET /venues/{venue_id}/plans", "{homes} homes, pages of 500", _get("/venues/{venue_id}/plans", limit=None), 500
-    ),
-    Load("POST /localise", VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
-    Load("POST /localise", "{homes} homes", _localise(venue_id="{venue}"), connections=16),
-    Load("POST /localise", "JPEG of 98 megapixels", _localise(_large_jpeg, floorplan_id="{plan}"), 7_000),
-    Load("POST /localise/sequence", f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
-    Load(
-        "POST /localise/sequence",
+        ("POST /localise/sequence",),
         "10 panoramas of {sequence_mb} MB in total",
         _sequence(padded=True),
-        100,
+        1_000,
         connections=44,
     ),
-    Load("POST /geopose", VERTICES_PLAN, _geopose),
-    Load("GET /answers/{answer_id}", f"{VERTICES_PLAN}, posterior", _keep_answer("GET")),
-    Load("DELETE /answers/{answer_id}", f"{VERTICES_PLAN}, posterior", _keep_answer("DELETE")),
-    *(Load(f"GET /{name}", "–", _get(f"/{name}")) for name in ("healthz", "readyz", "metrics", "limits", "usage")),
+    Load(("POST /geopose",), VERTICES_PLAN, _geopose),
+    Load(
+        ("GET /answers/{answer_id}", "DELETE /answers/{answer_id}"),
+        f"{VERTICES_PLAN}, posterior",
+        _read_and_delete_answer,
+    ),
+    *(Load((f"GET /{name}",), "–", _get(f"/{name}")) for name in ("healthz", "readyz", "metrics", "limits", "usage")),
 )

@@ -87,7 +87,7 @@ class Row:
         busy_s: time for which the service computed on after the heavy tenant was gone, 10 s at most.
     """
 
-    route: str
+    routes: Sequence[str]
     title: str
     connections: int
     alone: Latency
@@ -113,10 +113,10 @@ def main() -> int:
         replace(
             load,
             title=load.title.format(homes=options.homes, sequence_mb=options.sequence_mb),
-            size=options.sequence_mb if "{sequence_mb}" in load.title else load.size,
+            size=10 * options.sequence_mb if "{sequence_mb}" in load.title else load.size,
         )
         for load in LOADS
-        if options.routes in load.route
+        if any(options.routes in route for route in load.routes)
     ]
     rows = []
     with _template(options.homes, {load.plan for load in loads}) as template:
@@ -133,7 +133,7 @@ def main() -> int:
         options.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     failed = [row for row, load in zip(rows, loads, strict=True) if not _holds(row, load.refusals)]
     for row in failed:
-        print(f"exceeded: {row.route}, {row.title}", file=sys.stderr)
+        print(f"exceeded: {row.routes[0]}, {row.title}", file=sys.stderr)
     return int(bool(failed))
 
 
@@ -153,7 +153,8 @@ def _line(row: Mapping[str, Any]) -> str:
     times = [f"{row[part]['p50_ms']:.0f}, {row[part]['p99_ms']:.0f} ms" for part in ("alone", "beside")]
     answers = ", ".join(f"{count} × {status}" for status, count in sorted(row["answers"].items())) or "none"
     ratios = f"{row['p50_ratio']:.1f}, {row['p99_ratio']:.1f}"
-    cells = (f"`{row['route']}`", row["title"], row["connections"], *times, ratios, row["beside"]["failed"], answers)
+    routes = ", ".join(f"`{route}`" for route in row["routes"])
+    cells = (routes, row["title"], row["connections"], *times, ratios, row["beside"]["failed"], answers)
     return f"| {' | '.join(map(str, cells))} | {row['busy_s']:.1f} s |"
 
 
@@ -238,7 +239,7 @@ def _measure(load: Load, template: Template, seconds: float) -> Row:
             process.kill()
     quiet, loaded = _latency(alone), _latency(beside)
     p50_ratio, p99_ratio = loaded.p50_ms / quiet.p50_ms, loaded.p99_ms / quiet.p99_ms
-    return Row(load.route, load.title, load.connections, quiet, loaded, p50_ratio, p99_ratio, answers, busy_s)
+    return Row(load.routes, load.title, load.connections, quiet, loaded, p50_ratio, p99_ratio, answers, busy_s)
 
 
 class _Probe:
