@@ -7,10 +7,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test ray lint openapi docs site client web clean
+.PHONY: help setup demo serve test ray lint openapi docs neighbours site client web clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(STAMP) ## create .venv and install everything
 
@@ -47,6 +47,10 @@ openapi: $(STAMP) ## write openapi.yaml from the application
 	$(BIN)/python -m service.openapi openapi.yaml
 
 docs: $(STAMP) ## write the generated parts of docs/
+	$(BIN)/python -m scripts.write_docs
+
+neighbours: $(STAMP) ## measure every route beside another tenant, write the table in docs/results.md (about 10 minutes)
+	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
 
 site: $(STAMP) ## build the documentation site into build/site; warnings are errors

@@ -31,7 +31,7 @@ from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 
 _JSON = "application/json"
-_REQUEST_TIMEOUT_S = 120.0
+_REQUEST_TIMEOUT_S = 600.0
 _START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
 # Settings under which no request of a throughput test is refused.
 UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}

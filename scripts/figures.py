@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks.neighbours import markdown as markdown_of_neighbours
 from lalaloc_core.evaluate.reproduce.result import TableResult, markdown
 from lalaloc_core.evaluate.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"
+NEIGHBOURS = ROOT / "docs" / "neighbours.json"
 PAPER_TABLES = ROOT / "docs" / "tables"
 MANIFEST = ROOT / "models" / "default" / "manifest.json"
 
@@ -62,6 +64,14 @@ def speed_table() -> str:
         _row("model bundle", f"{_bundle_mb():.1f} MB"),
     ]
     return "\n".join(rows)
+
+
+def neighbours_table() -> str:
+    """Return the latency of one tenant beside another as a Markdown table, with the command that measured it."""
+    if not NEIGHBOURS.exists():
+        return "Not measured with this version."
+    report = json.loads(NEIGHBOURS.read_text(encoding="utf-8"))
+    return f"`{report['command']}` on {report['cores']} cores:\n\n{markdown_of_neighbours(report)}"
 
 
 def paper_tables() -> str:

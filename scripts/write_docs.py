@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 
 from lalaloc_core.cli import entry_point
-from scripts.figures import accuracy_table, paper_tables, speed_table
+from scripts.figures import accuracy_table, neighbours_table, paper_tables, speed_table
 from service import cli as service_cli
 from service.openapi import openapi_text
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
@@ -147,6 +147,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "cli": commands,
     "accuracy": accuracy_table,
     "speed": speed_table,
+    "neighbours": neighbours_table,
     "paper": paper_tables,
 }
 
