@@ -164,6 +164,7 @@ def start_runtime(
     converter = _closing(cleanup, Converter(settings, telemetry))
     # A file can take its worker longer than the service may take to stop.
     components.admission.at_stop(converter.close)
+    store.plans.parse_with(converter.parse)
     grids, localiser = components.grids, _closing(cleanup, components.localiser())
     sweep_s, keep_answers_s = settings.grids.sweep_s, settings.storage.keep_answers_s
     sweeper = Sweeper(store, grids, telemetry, sweep_s=sweep_s, keep_answers_s=keep_answers_s)

@@ -19,17 +19,18 @@ _MAX_DIGITS = 1000
 _DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MAX_DIGITS + 1},}}")
 
 
-def read_json(text: str | bytes, max_depth: int) -> Any:
-    """Parse a JSON text.
+def read_json(text: str | bytes, max_depth: int, max_values: int | None = None) -> Any:
+    """Parse a JSON text with at most `max_values` lists, objects and further items (commas).
 
     Raises:
-        InvalidFloorPlanError: not JSON, nested too deep, a repeated key in one object, or a number of too many digits.
+        InvalidFloorPlanError: not JSON, nested too deep, too many values, a repeated key in one object, or a number of
+            too many digits.
     """
     try:
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text), "surrogatepass")
         structure = _JSON_STRING.sub("", text)
-        _check_depth(structure, max_depth)
+        _check_size(structure, max_depth, max_values)
         _check_digits(structure)
         return json.loads(text, object_pairs_hook=_object)
     except InvalidFloorPlanError:
@@ -38,13 +39,18 @@ def read_json(text: str | bytes, max_depth: int) -> Any:
         raise InvalidFloorPlanError(f"not valid JSON: {error}") from error
 
 
-def _check_depth(structure: str, max_depth: int) -> None:
-    """Refuse deep nesting before it is parsed; `structure` is the text without its strings."""
+def _check_size(structure: str, max_depth: int, max_values: int | None) -> None:
+    """Refuse deep nesting and many values before they are parsed; `structure` is the text without its strings."""
     characters = np.frombuffer(structure.encode("utf-8", "surrogatepass"), np.uint8)
-    steps = np.isin(characters, _OPENING).astype(np.int64) - np.isin(characters, _CLOSING)
-    depth = int(np.cumsum(steps).max(initial=0))
+    steps = np.isin(characters, _OPENING).astype(np.int8) - np.isin(characters, _CLOSING)
+    depth = int(np.cumsum(steps, dtype=np.int32).max(initial=0))
     if depth > max_depth:
         raise InvalidFloorPlanError(f"the JSON is nested {depth} levels deep; the limit is {max_depth}")
+    values = sum(structure.count(mark) for mark in "[{,")
+    if max_values is not None and values > max_values:
+        raise InvalidFloorPlanError(
+            f"the JSON has {values} lists, objects and further items; the limit is {max_values}; send less at a time"
+        )
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def import_if_native(
     """
     if not is_json(content):
         return None
-    document = read_json(content, limits.max_depth)
+    document = read_json(content, limits.max_depth, limits.max_json_values)
     format = _json_format(document)
     if format.name != "native":
         return None
@@ -116,7 +116,7 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
         InvalidFloorPlanError: the format is unknown or not supported.
     """
     if is_json(content):
-        return _json_format(read_json(content, limits.max_depth)).name
+        return _json_format(read_json(content, limits.max_depth, limits.max_json_values)).name
     return _format_by_magic(content).name
 
 
@@ -139,7 +139,7 @@ def detect_media_type(content: bytes, format: str) -> str:
 def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
     """Return the format of a file and the source that its `read` expects."""
     if is_json(content):
-        document = read_json(content, limits.max_depth)
+        document = read_json(content, limits.max_depth, limits.max_json_values)
         return _json_format(document), document
     format = _format_by_magic(content)
     if format.name != "imdf":

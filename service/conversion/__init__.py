@@ -1,6 +1,6 @@
 """Import of plan files, and files made from stored plans, in worker processes.
 
-Begin with `converter.py`, the pool of workers. `files.py` imports native plans in the service itself;
+Begin with `converter.py`, the pool of workers. `files.py` imports small native plans in the service itself;
 `rendition_cache.py` keeps files made from stored plans.
 """
 

@@ -12,16 +12,25 @@ from concurrent.futures import Future, wait
 from typing import NoReturn
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
-from service.stored_plan import Rendition
+from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition
 from service.telemetry import Telemetry
-from service.workers.convert import ConversionRefusal, Imported, ImportJob, RenditionJob, run_converter
+from service.workers.convert import (
+    ConversionJob,
+    ConversionRefusal,
+    ConversionResult,
+    Imported,
+    ImportJob,
+    ParseJob,
+    RenditionJob,
+    run_converter,
+)
 
-_Result = Imported | Rendition | ConversionRefusal
-_Pool = WorkerPool[ImportJob | RenditionJob, _Result]
+_Pool = WorkerPool[ConversionJob, ConversionResult]
 
 # Largest number of waiting files.
 _QUEUE = 16
@@ -29,6 +38,8 @@ _QUEUE = 16
 _STALL_MARGIN_S = 10.0
 # Beside busy cores, a worker gets a tenth of the time of a query.
 _NICE = 10
+# Time (s) that a stored plan waits for a worker that parses it.
+_PARSE_S = 10.0
 
 
 class Converter:
@@ -71,7 +82,9 @@ class Converter:
         """
         limit_s = self._settings.plans.import_deadline_s
         try:
-            future = self._running_pool().submit(ImportJob(content, options), limit_s, client)
+            future = self._running_pool().submit(
+                ImportJob(content, options, self._settings.grids.grid_step_m), limit_s, client
+            )
             done, _ = wait([future], limit_s)
             if not done:
                 future.cancel()
@@ -84,7 +97,22 @@ class Converter:
         assert isinstance(result, Imported)
         return result
 
-    def begin_rendition(self, job: RenditionJob, client: str) -> Future[_Result]:
+    def parse(self, document: PlanDocument) -> FloorPlan | None:
+        """Return a stored plan, None if it is damaged. A worker parses a large one, unless none is free. Blocks."""
+        if len(document.document) <= LARGE:
+            return document.plan()
+        try:
+            future = self._running_pool().submit(ParseJob(document), _PARSE_S)
+            done, _ = wait([future], _PARSE_S)
+            if not done:
+                future.cancel()
+                raise JobLostError("deadline")
+            result = future.result()
+        except JobLostError:
+            return document.plan()
+        return result.plan() if isinstance(result, PackedPlan) else None
+
+    def begin_rendition(self, job: RenditionJob, client: str) -> Future[ConversionResult]:
         """Queue a file that is made from a stored plan. Blocks while the plan is copied.
 
         Raises:
@@ -95,7 +123,7 @@ class Converter:
         except JobLostError as error:
             self._raise_lost(error)
 
-    async def rendition(self, begun: Future[_Result]) -> Rendition:
+    async def rendition(self, begun: Future[ConversionResult]) -> Rendition:
         """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
 
         Raises:

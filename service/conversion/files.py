@@ -1,13 +1,12 @@
 """Conversion of an uploaded plan file.
 
-The service parses small native plans itself, because JSON of bounded depth and size is harmless. Worker processes read
-all other files, which can be slow or crash their reader.
+The service parses native plans of up to 256 KiB itself, in milliseconds. Worker processes read, validate and describe
+all others: large plans would take the interpreter from other requests, and other formats can crash their reader.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import describe_file
@@ -15,11 +14,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, detect_format, detect_media_type, import_if_native, is_json
 from service.conversion.converter import Converter
 from service.settings import Settings
+from service.stored_plan import LARGE, PlanDocument, Rendition
 from service.tenancy.fair_share import FairSemaphore
 from service.uploaded_file import UploadedFile
 from service.workers.convert import report_of
-
-_MAX_IN_PROCESS_BYTES = 2 * 2**20
 
 
 @dataclass(frozen=True)
@@ -28,22 +26,26 @@ class PlanFile:
 
     Attributes:
         plan: plan, validated under the service's limits.
-        report: report of the import as JSON data.
+        report: report of the import as JSON text.
         media_type: media type of the file, detected from its content.
+        document: stored form of the plan; None if it is to be made.
+        description: result of `describe_content`; None if it is to be made.
     """
 
     plan: FloorPlan
-    report: dict[str, Any]
+    report: str
     media_type: str
+    document: PlanDocument | None = None
+    description: Rendition | None = None
 
 
 def seems_native(file: UploadedFile) -> bool:
     """Return whether a file looks like a small native plan, which needs no worker."""
-    return len(file) <= _MAX_IN_PROCESS_BYTES and _seems_native(file.read())
+    return len(file) <= LARGE and _seems_native(file.read())
 
 
 def _seems_native(content: bytes) -> bool:
-    return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and describe_file(content) is None
+    return len(content) <= LARGE and is_json(content) and describe_file(content) is None
 
 
 def convert(
@@ -86,4 +88,5 @@ def convert(
         detect_format(content, limits)
     result = converter.read(content, options, client)
     with permits.hold(client):
-        return PlanFile(FloorPlan.from_dict(result.document, limits.plan), result.report, result.media_type)
+        plan = result.plan.plan()
+    return PlanFile(plan, result.report, result.media_type, result.document, result.description)

@@ -68,14 +68,15 @@ _MAX_DEPTH = 8
 _MAX_FAULTS = 20
 
 
-def parse_document(model: type[Model], content: bytes) -> Model:
-    """Parse a JSON text as a model.
+def parse_document(model: type[Model], content: bytes, max_values: int) -> Model:
+    """Parse a JSON text as a model; `max_values` as for `read_json`.
 
     Raises:
-        InvalidRequestError: not JSON, a duplicate key, or faulty fields; the error names the first twenty.
+        InvalidRequestError: not JSON, a duplicate key, too many values, or faulty fields, of which the error names
+            the first twenty.
     """
     try:
-        value = read_json(content, _MAX_DEPTH)
+        value = read_json(content, _MAX_DEPTH, max_values)
     except InvalidFloorPlanError as error:
         # `read_json` is the reader of plans; only its error type is specific to them.
         raise InvalidRequestError([("body", str(error))]) from error

@@ -4,7 +4,7 @@ Begin with `making.py`. The functions are pure; `service.conversion.rendition_ca
 large plans in a worker process.
 """
 
-from service.renditions.description import describe, state_of_description
+from service.renditions.description import describe, describe_content, state_of_description, with_head
 from service.renditions.making import make_rendition
 
-__all__ = ["describe", "make_rendition", "state_of_description"]
+__all__ = ["describe", "describe_content", "make_rendition", "state_of_description", "with_head"]

@@ -5,6 +5,7 @@ The rest depends on the revision only and can have megabytes; the state is short
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from lalaloc_core.floorplan import FloorPlan
@@ -14,21 +15,34 @@ from service.schemas.stored_plans import PlanStatus
 from service.stored_plan import PlanHead, Rendition
 
 _STATE = {"status", "progress", "reason", "grid"}
+_HEAD = {"id", "revision", "revision_number", "created_at", "updated_at"}
 
 
 def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:
     """Return a plan's description without its state and its first brace; see `state_of_description`."""
-    report = None if head.report is None else ImportReport.model_validate_json(head.report)
-    x_min, y_min, x_max, y_max = plan.bounds_m
-    poses = grid_size(plan, step_m)
-    answer = FloorPlanAnswer(
+    return with_head(describe_content(plan, head.report, step_m), head)
+
+
+def with_head(content: Rendition, head: PlanHead) -> Rendition:
+    """Return the description of a plan from the result of `describe_content`."""
+    answer = FloorPlanAnswer.model_construct(
         id=head.id,
         revision=head.revision_id,
         revision_number=head.revision,
+        created_at=head.created_at,
+        updated_at=head.updated_at,
+    )
+    start = answer.model_dump_json(include=_HEAD).encode()[1:-1]
+    return replace(content, content=b"%b,%b" % (start, content.content))
+
+
+def describe_content(plan: FloorPlan, report_text: str | None, step_m: float) -> Rendition:
+    """Return the part of a description that does not depend on how the plan is stored; `report_text` is JSON."""
+    report = None if report_text is None else ImportReport.model_validate_json(report_text)
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    poses = grid_size(plan, step_m)
+    answer = FloorPlanAnswer.model_construct(
         name=plan.name,
-        status="preparing",
-        progress=0.0,
-        reason=None,
         rooms=[
             RoomAnswer(
                 id=room.id,
@@ -43,15 +57,12 @@ def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:
         area_m2=plan.area_m2,
         bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
         camera_height_m=plan.camera_height_m,
-        grid=GridAnswer(step_m=step_m, poses=poses),
         # Warnings of the import come first.
         warnings=list(dict.fromkeys([*(() if report is None else report.warnings), *plan.warnings])),
         import_report=report,
         plan=plan.to_dict(),
-        created_at=head.created_at,
-        updated_at=head.updated_at,
     )
-    return Rendition(answer.model_dump_json(exclude=_STATE).encode()[1:], plan.bounds_m, poses)
+    return Rendition(answer.model_dump_json(exclude=_STATE | _HEAD).encode()[1:], plan.bounds_m, poses)
 
 
 def state_of_description(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response, status
 from starlette.concurrency import run_in_threadpool
 
-from lalaloc_core.floorplan import FloorPlan
-from service.conversion import convert
+from service.conversion import PlanFile, convert
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -26,7 +24,7 @@ from service.http.conditional import expected_revision, not_modified, tagged_ans
 from service.http.cursors import cursor_text, parse_cursor
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.renditions import describe
+from service.renditions import describe, with_head
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
@@ -73,13 +71,20 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
     uploaded = await read_upload(request, runtime)
 
     def store(token: str) -> Response:
-        plan, original, grid = _prepared(uploaded, runtime, client)
+        file, original, grid = _prepared(uploaded, runtime, client)
         limit = runtime.settings.plans.max_floorplans
-        later_bytes = runtime.grids.expected_bytes(plan) if grid is None else 0
+        later_bytes = runtime.grids.expected_bytes(file.plan) if grid is None else 0
         record = runtime.store.plans.add(
-            tenant, token, plan, original=original, limit=limit, grid=grid, later_bytes=later_bytes
+            tenant,
+            token,
+            file.plan,
+            original=original,
+            limit=limit,
+            document=file.document,
+            grid=grid,
+            later_bytes=later_bytes,
         )
-        if record.plan is plan:
+        if record.plan is file.plan:
             runtime.grids.on_plan_stored(record, grid)
             # Not read back, so that a stored plan is confirmed even if the database fails now.
             state = GridState.after_upload(grid)
@@ -87,7 +92,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
             # Stored by an earlier attempt, and possibly replaced since.
             runtime.grids.on_plan_stored(record, None)
             state = runtime.grids.states([plan_summary(tenant, record.id, runtime.store.plans)])[0]
-        return _written(request, record, state, runtime, status.HTTP_201_CREATED)
+        return _written(request, record, file, state, runtime, status.HTTP_201_CREATED)
 
     # One call from claim to answer, so that a disconnect does not interrupt it.
     return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
@@ -168,23 +173,24 @@ async def replace_floorplan(
     uploaded = await read_upload(request, runtime)
 
     def store() -> Response:
-        plan, original, grid = _prepared(uploaded, runtime, client)
+        file, original, grid = _prepared(uploaded, runtime, client)
         keep = runtime.settings.plans.max_revisions
-        later_bytes = runtime.grids.expected_bytes(plan) if grid is None else 0
+        later_bytes = runtime.grids.expected_bytes(file.plan) if grid is None else 0
         record = runtime.store.plans.add_revision(
             tenant,
             current.id,
-            plan,
+            file.plan,
             original=original,
             keep=keep,
             expected=expected,
+            document=file.document,
             grid=grid,
             later_bytes=later_bytes,
         )
         # Before the new grid starts. The old grid stays in memory for queries in progress.
         runtime.grids.cancel(current.revision_id)
         runtime.grids.on_plan_stored(record, grid)
-        return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
+        return _written(request, record, file, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
     return await uploaded.threads(runtime).run(client, store)
 
@@ -211,19 +217,24 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     runtime.grids.forget({current.revision_id})
 
 
-def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
+def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[PlanFile, Original, ComputedGrid | None]:
     """Return the plan in an uploaded file, the file as stored, and the pose grid if it is computed at once."""
     content = uploaded.file.read()
     file = convert(content, uploaded.options, runtime.converter, runtime.settings, client, runtime.permits)
     runtime.grids.check_size(file.plan)
-    original = Original(content, file.media_type, json.dumps(file.report))
-    return file.plan, original, runtime.grids.prepare(file.plan, client)
+    original = Original(content, file.media_type, file.report)
+    return file, original, runtime.grids.prepare(file.plan, client)
 
 
-def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:
+def _written(
+    request: Request, record: PlanRecord, file: PlanFile, state: GridState, runtime: Runtime, code: int
+) -> Response:
     add_log_fields(request, plan=record.id, revision=record.revision_id)
     step_m = runtime.settings.grids.grid_step_m
-    description = describe(record.plan, record, step_m)
+    if file.description is None or record.plan is not file.plan:
+        description = describe(record.plan, record, step_m)
+    else:
+        description = with_head(file.description, record)
     runtime.renditions.put(record.revision_id, "description", description)
     content = b"".join(description_parts(description, state, step_m))
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))

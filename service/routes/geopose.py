@@ -43,6 +43,8 @@ from service.uploaded_file import UploadedFile
 router = APIRouter(tags=["localisation"])
 # Size of a request without its picture.
 _ENVELOPE_BYTES = 64 * 1024
+# Lists, objects and further items of a request: thousands of sensor readings.
+_MAX_VALUES = 100_000
 
 
 @router.post(
@@ -93,7 +95,7 @@ async def geopose(
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
 
     def read() -> tuple[OscpRequest, UploadedFile]:
-        parsed = parse_document(OscpRequest, body.read())
+        parsed = parse_document(OscpRequest, body.read(), _MAX_VALUES)
         content = UploadedFile.of(decode_picture(parsed), limits.memory_bytes)
         on_request_end(request.scope, content.close)
         if len(content) > max_bytes:

@@ -29,7 +29,7 @@ from service.errors import (
 from service.http import IdempotentRequest
 from service.http.conditional import expected_revision, not_modified, tagged_answer
 from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
-from service.http.fields import parse_document
+from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.routes.dependencies import (
@@ -61,6 +61,8 @@ from service.uploaded_file import UploadedFile
 router = APIRouter(prefix="/venues", tags=["venues"])
 
 _MAX_LISTED = 500
+# Lists, objects and further items of a venue document, besides those of its plans.
+_FURTHER_VALUES = 1000
 _REFUSED_BODIES = (
     InvalidRequestError,
     MalformedRequestError,
@@ -98,7 +100,7 @@ async def create_venue(request: Request, runtime: Running, tenant: Tenant, clien
     content = await _read(request, runtime)
 
     def store(token: str) -> Response:
-        document = parse_document(VenueDocument, content.read())
+        document = _document(VenueDocument, content.read(), runtime)
         members = _members(document.plans, runtime)
         limit = runtime.settings.plans.max_venues
         record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
@@ -181,7 +183,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
     def store() -> Response:
         current = _stored(tenant, venue_id, runtime)
         expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = parse_document(VenueDocument, content.read())
+        document = _document(VenueDocument, content.read(), runtime)
         record = runtime.store.venues.change(
             tenant,
             current.id,
@@ -212,7 +214,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
     def store() -> Response:
         current = _stored(tenant, venue_id, runtime)
         expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = parse_document(VenueChangeDocument, content.read())
+        document = _document(VenueChangeDocument, content.read(), runtime)
         given = document.model_fields_set
         if not given:
             raise InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
@@ -257,6 +259,11 @@ def _stored(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
 async def _read(request: Request, runtime: Runtime) -> UploadedFile:
     media_type(request, (JSON,))
     return await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
+
+
+def _document(model: type[Model], content: bytes, runtime: Runtime) -> Model:
+    # A plan has four values, and one more to remove it.
+    return parse_document(model, content, 5 * runtime.settings.plans.max_venue_plans + _FURTHER_VALUES)
 
 
 def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import uuid
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -39,9 +39,12 @@ class _Content:
     grid: tuple[GridKey, PackedGrid] | None
 
     @classmethod
-    def prepare(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
+    def prepare(
+        cls, record: PlanRecord, original: Original, document: PlanDocument | None, grid: ComputedGrid | None
+    ) -> _Content:
         packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
-        return cls(PlanDocument.from_plan(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
+        document = document or PlanDocument.from_plan(record.plan)
+        return cls(document, original, hashlib.sha256(original.content).hexdigest(), packed)
 
     @property
     def stored(self) -> StoredBytes:
@@ -73,6 +76,11 @@ class Plans:
         self._database = database
         self._cache = cache
         self._quota = quota
+        self._parse: Callable[[PlanDocument], FloorPlan | None] = PlanDocument.plan
+
+    def parse_with(self, parse: Callable[[PlanDocument], FloorPlan | None]) -> None:
+        """Set the function that parses documents; it returns None for a damaged one."""
+        self._parse = parse
 
     def add(
         self,
@@ -82,6 +90,7 @@ class Plans:
         *,
         original: Original,
         limit: int,
+        document: PlanDocument | None = None,
         grid: ComputedGrid | None = None,
         later_bytes: int = 0,
     ) -> PlanRecord:
@@ -95,6 +104,7 @@ class Plans:
             plan: the plan.
             original: the uploaded file.
             limit: maximum number of the tenant's plans.
+            document: the plan's stored form, if it is made already.
             grid: the plan's own grid.
             later_bytes: expected size of the own grid if it is computed later; there must be room for it.
 
@@ -104,7 +114,7 @@ class Plans:
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
-        content = _Content.prepare(record, original, grid)
+        content = _Content.prepare(record, original, document, grid)
         with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
@@ -136,6 +146,7 @@ class Plans:
         original: Original,
         keep: int,
         expected: str | None = None,
+        document: PlanDocument | None = None,
         grid: ComputedGrid | None = None,
         later_bytes: int = 0,
     ) -> PlanRecord:
@@ -150,6 +161,7 @@ class Plans:
             original: the uploaded file.
             keep: maximum number of revisions.
             expected: id of the revision that the plan must have; None for any.
+            document: the plan's stored form, if it is made already.
             grid: the plan's own grid.
             later_bytes: as for `add`.
 
@@ -160,7 +172,7 @@ class Plans:
         """
         now = datetime.now(UTC)
         record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
-        content = _Content.prepare(record, original, grid)
+        content = _Content.prepare(record, original, document, grid)
         with self._database.writing(grows_by=content.stored.total) as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -353,7 +365,7 @@ class Plans:
         """
         row, plan = found.row, found.plan
         if isinstance(plan, PlanDocument):
-            plan = plan.plan()
+            plan = self._parse(plan)
             if plan is None:
                 raise _damaged("document", row.id, row.revision_id)
         return PlanRecord(**row._mapping, plan=plan)

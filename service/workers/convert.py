@@ -1,17 +1,18 @@
 """Program of a conversion worker process, the only part of the service that reads drawings and models.
 
-It turns an `ImportJob` into an `Imported`, a `RenditionJob` into a `Rendition`, and either into a `ConversionRefusal`
-if the file cannot be read or written. The libraries of a format are loaded with its first file.
+It turns an `ImportJob` into an `Imported`, a `RenditionJob` into a `Rendition`, a `ParseJob` into a `PackedPlan`, and
+each into a `ConversionRefusal` if the file cannot be read or written. The libraries of a format are loaded with its
+first file.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any, Literal
+from typing import Literal
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
 from lalaloc_core.importers import (
@@ -22,7 +23,7 @@ from lalaloc_core.importers import (
     import_plan,
 )
 from service.errors import DamagedDataError
-from service.stored_plan import Rendition, RenditionKind, StoredPlan
+from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionKind, StoredPlan
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs
 
 # A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the
@@ -36,6 +37,14 @@ class ImportJob:
 
     content: bytes
     options: ImportOptions
+    step_m: float
+
+
+@dataclass(frozen=True)
+class ParseJob:
+    """Stored plan that the service is about to use."""
+
+    document: PlanDocument
 
 
 @dataclass(frozen=True)
@@ -52,15 +61,18 @@ class Imported:
     """Result of an import.
 
     Attributes:
-        document: the plan in the native format. The service must validate it, because it comes from a process that read
-            an untrusted file.
-        report: the import report as JSON values.
+        plan: the plan, validated under the service's limits.
+        document: its stored form.
+        report: the import report as JSON text.
         media_type: media type of the file.
+        description: result of `describe_content` for a large plan; None for others.
     """
 
-    document: dict[str, Any]
-    report: dict[str, Any]
+    plan: PackedPlan
+    document: PlanDocument
+    report: str
     media_type: str
+    description: Rendition | None
 
 
 @dataclass(frozen=True)
@@ -101,13 +113,17 @@ class ConversionRefusal:
         return InvalidFloorPlanError(self.reason, room=self.room)
 
 
-def report_of(imported: ImportedPlan) -> dict[str, Any]:
-    """Return the report of an import, with the storey of the plan, as JSON values."""
+ConversionJob = ImportJob | RenditionJob | ParseJob
+ConversionResult = Imported | Rendition | PackedPlan | ConversionRefusal
+
+
+def report_of(imported: ImportedPlan) -> str:
+    """Return the report of an import, with the storey of the plan, as JSON text."""
     level = imported.level
     storey = None
     if level is not None:
         storey = {"name": level.name, "number": level.number, "elevation_m": level.elevation_m}
-    return imported.report.to_dict() | {"level": storey}
+    return json.dumps(imported.report.to_dict() | {"level": storey})
 
 
 def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: int) -> None:
@@ -129,10 +145,16 @@ def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: in
     serve_jobs(connection, lambda: _converting(limits), is_fit)
 
 
-def _converting(limits: ImportLimits) -> Callable[[ImportJob | RenditionJob], Imported | Rendition | ConversionRefusal]:
-    def convert(job: ImportJob | RenditionJob) -> Imported | Rendition | ConversionRefusal:
+def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionResult]:
+    def convert(job: ConversionJob) -> ConversionResult:
         try:
-            return _render(job) if isinstance(job, RenditionJob) else _import(job, limits)
+            match job:
+                case ImportJob():
+                    return _import(job, limits)
+                case RenditionJob():
+                    return _render(job)
+                case ParseJob():
+                    return _parse(job)
         except (InvalidFloorPlanError, MissingExtraError, DamagedDataError) as error:
             return ConversionRefusal.of(error)
         except MemoryError:
@@ -146,17 +168,27 @@ def _converting(limits: ImportLimits) -> Callable[[ImportJob | RenditionJob], Im
 
 def _import(job: ImportJob, limits: ImportLimits) -> Imported:
     imported = import_plan(job.content, job.options, limits)
+    plan = imported.plan(limits.plan)
+    document, report = PlanDocument.from_plan(plan), report_of(imported)
+    description = None
+    if len(document.document) > LARGE:
+        # Imported late: its libraries take memory that imports do not need.
+        from service.renditions import describe_content
+
+        description = describe_content(plan, report, job.step_m)
     media_type = detect_media_type(job.content, imported.report.format)
-    return Imported(_plain(imported.document), report_of(imported), media_type)
+    return Imported(PackedPlan.of(plan), document, report, media_type, description)
+
+
+def _parse(job: ParseJob) -> PackedPlan:
+    plan = job.document.plan()
+    if plan is None:
+        raise DamagedDataError("the stored document of a floor plan is damaged")
+    return PackedPlan.of(plan)
 
 
 def _render(job: RenditionJob) -> Rendition:
-    # Imported late: its libraries take memory that imports do not need.
+    # Imported late for the same reason.
     from service.renditions import make_rendition
 
     return make_rendition(job.stored, job.kind, job.step_m)
-
-
-def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document as plain JSON values, without types of any library."""
-    return json.loads(json.dumps(document))

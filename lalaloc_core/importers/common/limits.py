@@ -11,6 +11,9 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS, PlanLimits
 
 _REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
 
+# Enough for the largest plan in the native format.
+_MIN_JSON_VALUES = 1_000_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportLimits:
@@ -32,6 +35,11 @@ class ImportLimits:
     max_plan_pixels: int = 40_000_000
     max_import_s: float = 30.0
     plan: PlanLimits = DEFAULT_LIMITS
+
+    @property
+    def max_json_values(self) -> int:
+        """Lists, objects and further items of a JSON text, for `read_json`."""
+        return max(_MIN_JSON_VALUES, 10 * self.max_entities)
 
 
 DEFAULT_IMPORT_LIMITS = ImportLimits()

@@ -151,7 +151,7 @@ def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tupl
 
 def _read_member(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
     try:
-        return read_json(files[name], budget.limits.max_depth)
+        return read_json(files[name], budget.limits.max_depth, budget.limits.max_json_values)
     except InvalidFloorPlanError as error:
         raise InvalidFloorPlanError(f"'{name[:100]}': {error.reason}") from error
 
