@@ -31,7 +31,7 @@ from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 
 _JSON = "application/json"
-_REQUEST_TIMEOUT_S = 600.0
+_REQUEST_TIMEOUT_S, _IDLE_S = 600.0, 5.0
 _START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
 # Settings under which no request of a throughput test is refused.
 UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
@@ -144,12 +144,16 @@ class Caller:
         self._connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=_REQUEST_TIMEOUT_S)
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._count = count
+        self._used_at = time.monotonic()
 
     def send(self, method: str, path: str, content: bytes = b"", media: str = _JSON, etag: str = "") -> Answer:
         """Send a request and read its answer; `etag` makes it conditional."""
         headers = (
             self._headers | ({"Content-Type": media} if content else {}) | ({"If-None-Match": etag} if etag else {})
         )
+        if time.monotonic() - self._used_at > _IDLE_S:
+            # The service may have closed the idle connection; this opens a new one.
+            self._connection.close()
         try:
             self._connection.request(method, path, content, headers)
             response = self._connection.getresponse()
@@ -158,8 +162,17 @@ class Caller:
             # The service answers and closes while a refused body is still sent.
             self._connection.close()
             answer = Answer(0)
+        self._used_at = time.monotonic()
         self._count(answer.status)
         return answer
+
+
+class Rehearsal(Caller):
+    """Caller that sends nothing."""
+
+    def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
+        """Return a broken connection."""
+        return Answer(0)
 
 
 @cache

@@ -112,21 +112,26 @@ def home(number: int) -> dict[str, Any]:
     return {"name": f"home {number:05d}", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [room]}
 
 
+def created(answer: Answer) -> str:
+    """Return the id in an answer.
+
+    Raises:
+        RuntimeError: nothing was created.
+    """
+    if answer.status != 201:
+        raise RuntimeError(f"status {answer.status}: {answer.content[:300]!r}; the benchmark needs 201")
+    return answer.json()["id"]
+
+
 def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     """Store homes and a venue of them; return its id and entity tag, and the ids of the homes."""
-    ids = [_created(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
+    ids = [created(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
     answer = caller.send("POST", "/venues", _venue(ids))
-    return _created(answer), answer.etag, ids
+    return created(answer), answer.etag, ids
 
 
 def _body(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, separators=(",", ":")).encode()
-
-
-def _created(answer: Answer) -> str:
-    if answer.status != 201:
-        raise RuntimeError(f"status {answer.status}: {answer.content[:200]!r}; the benchmark needs 201")
-    return answer.json()["id"]
 
 
 def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:

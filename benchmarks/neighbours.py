@@ -31,8 +31,18 @@ from typing import Any
 
 import psutil
 
-from benchmarks.harness import Answer, Caller, argument_parser, example_query
-from benchmarks.heaviest import LOADS, ROOMS_PLAN, VERTICES_PLAN, Load, Stored, building, missing_routes, store_venue
+from benchmarks.harness import Caller, Rehearsal, argument_parser, example_query
+from benchmarks.heaviest import (
+    LOADS,
+    ROOMS_PLAN,
+    VERTICES_PLAN,
+    Load,
+    Stored,
+    building,
+    created,
+    missing_routes,
+    store_venue,
+)
 from examples.launch import running_service
 from examples.truth import PLAN_PATH
 from service.security import Permission
@@ -51,7 +61,6 @@ _SETTINGS = {
 _TOO_MANY = frozenset({0, 429, 503, 507})
 _ACCEPTED = frozenset({200, 201, 204, 304})
 _PAUSE_S, _LEAD_S, _WARM_QUERIES = 0.05, 1.0, 5
-# Processes that use less of a core than this are idle.
 _IDLE_SHARE, _IDLE_WINDOW_S, _IDLE_TIMEOUT_S = 0.1, 0.25, 10.0
 _READY_TIMEOUT_S = 600.0
 _NICE = 10
@@ -177,12 +186,11 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
         settings = _SETTINGS | {"LALALOC_DATA_DIR": str(data), "LALALOC_MAX_IMPORT_S": "600"}
         with running_service(0, settings) as service:
             light, heavy = Caller(service.url, keys["light"]), Caller(service.url, keys["heavy"])
-            light_plan_id = _upload(light, PLAN_PATH.read_bytes())
+            light_plan_id = created(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
             venue_id, _, member_ids = store_venue(heavy, homes)
-            plan_ids = {name: _upload(heavy, json.dumps(documents[name]()).encode()) for name in plans}
+            bodies = {name: json.dumps(documents[name]()).encode() for name in plans}
+            plan_ids = {name: created(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
             _wait_until_ready(service.url)
-            # The service has closed the idle connections meanwhile.
-            heavy = Caller(service.url, keys["heavy"])
             venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
             stored = {
                 name: Stored(
@@ -201,13 +209,6 @@ def _new_key(data: Path, tenant: str) -> str:
     finally:
         store.close()
     return key_text(key.id, secret)
-
-
-def _upload(caller: Caller, content: bytes) -> str:
-    answer = caller.send("POST", "/floorplans", content)
-    if answer.status != 201:
-        raise RuntimeError(f"upload: status {answer.status}: {answer.content[:300]!r}")
-    return answer.json()["id"]
 
 
 def _wait_until_ready(url: str) -> None:
@@ -315,21 +316,13 @@ def _send_flood(url: str, key: str, number: int, size: int, stored: Stored, pipe
             load.work(caller, stored, size)
 
     # The bodies are made before they are needed.
-    load.work(_Rehearsal(url), stored, size)
+    load.work(Rehearsal(url), stored, size)
     for _ in range(load.connections):
         threading.Thread(target=repeat, daemon=True).start()
     pipe.send("begun")
     pipe.recv()
     with lock:
         pipe.send(dict(counts))
-
-
-class _Rehearsal(Caller):
-    """Caller that sends nothing."""
-
-    def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
-        """Return a broken connection."""
-        return Answer(0)
 
 
 def _idle_after(process: psutil.Process) -> float:
