@@ -23,7 +23,7 @@ import lalaloc_core
 import service
 from benchmarks.harness import Caller
 from benchmarks.heaviest import LOADS, Load, Stored, building, missing_routes, store_venue
-from service.conversion import rendition_cache
+from service.conversion import converter, files, rendition_cache
 from tests.service.conftest import StartApp, upload, wait_for
 
 pytestmark = pytest.mark.skipif(
@@ -92,8 +92,9 @@ def client(counter: Counter, start_app: StartApp, tmp_path_factory: pytest.TempP
     # No regular work meanwhile, and the coarsest pose grids.
     quiet = {"sweep_s": 3600.0, "grid_step_m": 5.0}
     with pytest.MonkeyPatch.context() as patch:
-        # Files of large plans are made by worker processes, which are not counted.
-        patch.setattr(rendition_cache, "_SMALL", 10**9)
+        # Worker processes, which are not counted, read large plans and make their files.
+        for module, name in ((rendition_cache, "_SMALL"), (converter, "LARGE"), (files, "LARGE")):
+            patch.setattr(module, name, 10**9)
         with start_app(tmp_path_factory.mktemp("data"), **unlimited, **quiet) as started:
             yield started
 
