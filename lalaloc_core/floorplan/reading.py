@@ -142,9 +142,10 @@ def _read_holes(
     holes = read_list([] if raw is None else raw, "holes", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES", room)
     rings = tuple(_read_ring(hole, f"hole {i}", room, limits, is_hole=True) for i, hole in enumerate(holes))
     outline = shapely.Polygon(outline_m)
-    for index, ring in enumerate(rings):
-        if not outline.covers(shapely.Polygon(ring)):
-            raise InvalidFloorPlanError(f"hole {index} does not lie inside the polygon", room=room)
+    shapely.prepare(outline)
+    inside = shapely.covers(outline, [shapely.Polygon(ring) for ring in rings])
+    if not inside.all():
+        raise InvalidFloorPlanError(f"hole {np.argmin(inside)} does not lie inside the polygon", room=room)
     if rings and not (floor := shapely.Polygon(outline_m, rings)).is_valid:
         reason = shapely.is_valid_reason(floor)
         raise InvalidFloorPlanError(f"the holes cross or cut off parts of the floor ({reason})", room=room)
@@ -157,11 +158,13 @@ def _read_walls(raw: Any, shape: shapely.Polygon, room: str, limits: PlanLimits)
         return frozen(np.empty((0, 4)))
     points = np.stack([read_segment(wall, f"wall {index}", limits, room) for index, wall in enumerate(walls)])
     floor = shape.buffer(_WALL_OVERSHOOT_M, join_style="mitre")
-    for index, wall in enumerate(points):
-        if not floor.covers(shapely.LineString(wall)):
-            raise InvalidFloorPlanError(
-                f"wall {index} leaves the room's floor; it can reach {_WALL_OVERSHOOT_M:g} m beyond it", room=room
-            )
+    shapely.prepare(floor)
+    inside = shapely.covers(floor, shapely.linestrings(points))
+    if not inside.all():
+        raise InvalidFloorPlanError(
+            f"wall {np.argmin(inside)} leaves the room's floor; it can reach {_WALL_OVERSHOOT_M:g} m beyond it",
+            room=room,
+        )
     return frozen(points.reshape(-1, 4))
 
 

@@ -14,11 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
+from lalaloc_core.importers.common.assemble import assemble
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
+from lalaloc_core.importers.drawing import walls
+from lalaloc_core.importers.drawing.walls import enclose
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import (
     EXTERNAL_ENTITY,
@@ -238,3 +244,62 @@ def test_plans_and_options_can_be_pickled():
     (plan,) = import_plans(json.dumps(FLAT).encode())
     assert pickle.loads(pickle.dumps(plan)).document == plan.document
     assert pickle.loads(pickle.dumps(ImportOptions(scale=100.0))) == ImportOptions(scale=100.0)
+
+
+def lined_up_rooms(count: int) -> Sketch:
+    """Return rooms in a row, each with a column in it."""
+    rooms = [SketchedRoom(shapely.box(5.0 * k, 0.0, 5.0 * k + 4.0, 4.0)) for k in range(count)]
+    return Sketch(rooms=rooms, obstacles=[shapely.box(5.0 * k + 1.0, 1.0, 5.0 * k + 2.0, 2.0) for k in range(count)])
+
+
+def test_obstacles_are_compared_with_the_rooms_near_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+    intersects = shapely.Polygon.intersects
+
+    def counted(first: shapely.Polygon, second: shapely.Geometry) -> bool:
+        compared.append(second)
+        return intersects(first, second)
+
+    monkeypatch.setattr(shapely.Polygon, "intersects", counted)
+    options = ImportOptions(ceiling_height_m=2.5)
+    plan = assemble(lined_up_rooms(40), ReportBuilder(), options, format="dxf", metres_per_unit=1.0, scale_source="m")
+    assert all(len(room["holes"]) == 1 for room in plan.document["rooms"])
+    assert len(compared) == 40
+
+
+def test_gaps_and_rooms_are_compared_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+    intersection = shapely.intersection
+
+    def counted(first: shapely.Geometry, second: shapely.Geometry) -> shapely.Geometry:
+        compared.append(second)
+        return intersection(first, second)
+
+    monkeypatch.setattr(shapely, "intersection", counted)
+    # Square rooms with a gap of 1 m in one wall.
+    bodies = [
+        shapely.box(x, 0, x + 4, 4)
+        .difference(shapely.box(x + 0.2, 0.2, x + 3.8, 3.8))
+        .difference(shapely.box(x + 1.5, -1, x + 2.5, 1))
+        for x in np.arange(30) * 6.0
+    ]
+    found = enclose(bodies, [])
+    assert (len(found.rooms), len(found.gaps)) == (30, 30)
+    # Each gap is found from both sides.
+    assert len(compared) == 30
+
+
+def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+    norm = np.linalg.norm
+
+    def counted(vectors: np.ndarray, axis: int | None = None) -> Any:
+        compared.append(vectors.size // 2)
+        return norm(vectors, axis=axis)
+
+    monkeypatch.setattr(np.linalg, "norm", counted)
+    lines = [shapely.LineString([(0, y), (3, y)]) for k in range(50) for y in (2.0 * k, 2.0 * k + 0.2)]
+    joints = walls._joints(lines, walls.DEFAULT_WALLS)
+    # A jamb at both ends of each wall, found from both of its faces.
+    assert [joint.length for joint in joints] == pytest.approx([0.2] * 200)
+    assert sum(compared) < 5 * 200

@@ -76,7 +76,8 @@ def assemble(
     Raises:
         InvalidFloorPlanError: the sketch has no rooms, or the plan is invalid.
     """
-    rooms = [room for drawn in sketch.rooms for room in _clean(drawn, sketch.obstacles, builder)]
+    obstacles = shapely.STRtree(sketch.obstacles)
+    rooms = [room for drawn in sketch.rooms for room in _clean(drawn, obstacles, builder)]
     if not rooms:
         raise InvalidFloorPlanError(
             f"no room was found in the {format} file, which has {_contents(builder)}; check layers, level and the scale"
@@ -119,9 +120,9 @@ def clean_name(name: str | None) -> str | None:
     return " ".join(spaced.split())[: DEFAULT_LIMITS.max_name_length] or None
 
 
-def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: ReportBuilder) -> list[SketchedRoom]:
+def _clean(room: SketchedRoom, obstacles: shapely.STRtree, builder: ReportBuilder) -> list[SketchedRoom]:
     shape = room.shape
-    for obstacle in obstacles:
+    for obstacle in obstacles.geometries[np.sort(obstacles.query(shape))]:
         if obstacle.intersects(shape):
             shape = shapely.difference(shape, obstacle)
     floors = [simple for floor in polygons_from_geometry(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
@@ -133,12 +133,15 @@ def find_gaps(
                 gap = _gap_before(wall, parts, tree, config)
                 if gap is not None:
                     found.append(gap)
-    kept: list[Gap] = []
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
-    for _, _, gap in sorted(ranked, key=lambda item: item[:2]):
-        if all(shapely.intersection(gap.shape, better.shape).area < 0.25 * gap.shape.area for better in kept):
-            kept.append(gap)
-    return kept
+    gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
+    tree, is_kept = shapely.STRtree([gap.shape for gap in gaps]), np.zeros(len(gaps), bool)
+    for index, gap in enumerate(gaps):
+        check_time()
+        near = tree.query(gap.shape)
+        shared = (shapely.intersection(gap.shape, gaps[k].shape).area for k in near[is_kept[near]])
+        is_kept[index] = all(area < 0.25 * gap.shape.area for area in shared)
+    return [gap for gap, keep in zip(gaps, is_kept, strict=True) if keep]
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +242,7 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
         return []
     tree = shapely.STRtree(list(segments))
     points = [shapely.Point(end) for end in ends]
+    ends_tree = shapely.STRtree(points)
     joints = []
     for index, point in enumerate(points):
         near = [
@@ -250,15 +254,21 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
             nearest = min(near, key=lambda line: shapely.distance(line, point))
             joints.append(shapely.shortest_line(point, nearest))
             continue
-        steps = ends - ends[index]
+        beside = _near(ends_tree, point, config.thickest)
+        steps = ends[beside] - ends[index]
         apart = np.linalg.norm(steps, axis=1)
         across = np.abs(steps @ directions[index]) < 0.25 * np.maximum(apart, 1e-12)
-        parallel = np.abs(_cross(directions, directions[index][None])) < 0.1
+        parallel = np.abs(_cross(directions[beside], directions[index][None])) < 0.1
         partners = np.flatnonzero((apart > config.thinnest) & (apart <= config.thickest) & across & parallel)
         if len(partners):
-            partner = partners[np.argmin(apart[partners])]
+            partner = beside[partners[np.argmin(apart[partners])]]
             joints.append(shapely.LineString([ends[index], ends[partner]]))
     return joints
+
+
+def _near(tree: shapely.STRtree, point: shapely.Point, distance_m: float) -> Int[np.ndarray, "n"]:
+    """Return the points of a tree in a square that contains the circle around a point, in order."""
+    return np.sort(tree.query(point.buffer(1.01 * distance_m, cap_style="square")))
 
 
 def _loose_ends(
@@ -291,7 +301,7 @@ def _from_single_lines(
     network = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
     segments = [part for part in shapely.get_parts(network) if part.length > 0.0]
     ends, outward = _loose_ends(segments)
-    tree = shapely.STRtree(segments)
+    tree, ends_tree = shapely.STRtree(segments), shapely.STRtree(np.asarray(shapely.points(ends)))
     gaps: list[Gap] = []
     for end, direction in zip(ends, outward, strict=True):
         check_time()
@@ -300,7 +310,7 @@ def _from_single_lines(
         reached = [shapely.distance(shapely.Point(end), hit) for hit in hits if not hit.is_empty]
         facing = [
             float(np.linalg.norm(opposite - end))
-            for opposite in ends
+            for opposite in ends[_near(ends_tree, shapely.Point(end), config.widest_gap)]
             if 1e-6 < np.linalg.norm(opposite - end) <= config.widest_gap
             and float((opposite - end) @ direction) > 0.99 * float(np.linalg.norm(opposite - end))
         ]
@@ -331,11 +341,13 @@ def _insides(pieces: Sequence[BaseGeometry], config: WallConfig) -> list[shapely
 
 def _distinct(rooms: list[shapely.Polygon]) -> list[shapely.Polygon]:
     """Drop duplicates: rooms inside an island of walls are found twice."""
-    kept: list[shapely.Polygon] = []
-    for room in sorted(rooms, key=lambda room: -room.area):
-        if all(shapely.intersection(room, larger).area < 0.5 * room.area for larger in kept):
-            kept.append(room)
-    return kept
+    ordered = sorted(rooms, key=lambda room: -room.area)
+    tree, is_kept = shapely.STRtree(ordered), np.zeros(len(ordered), bool)
+    for index, room in enumerate(ordered):
+        near = tree.query(room)
+        larger = [ordered[k] for k in near[is_kept[near]]]
+        is_kept[index] = all(shapely.intersection(room, other).area < 0.5 * room.area for other in larger)
+    return [room for room, keep in zip(ordered, is_kept, strict=True) if keep]
 
 
 def _is_thin(face: shapely.Polygon, config: WallConfig) -> bool:
