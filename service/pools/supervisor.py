@@ -187,7 +187,7 @@ class Supervisor:
 
     def _await_ready(self, connection: Connection, process: BaseProcess) -> str | None:
         """Wait for the worker; return the error of a failed start, None after a successful one."""
-        with _Watchdog(process, self._spec.max_start_s) as watchdog:
+        with Watchdog(process, self._spec.max_start_s) as watchdog:
             message = _receive(connection)
         if isinstance(message, Ready):
             return None
@@ -206,7 +206,7 @@ class Supervisor:
                 continue
             self._held = pending
             begin = monotonic()
-            with _Watchdog(process, self._spec.stall_s) as watchdog:
+            with Watchdog(process, self._spec.stall_s) as watchdog:
                 # A worker that died before it had the whole job was not crashed by it.
                 sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
@@ -239,23 +239,27 @@ class Supervisor:
         pending.fail("fault")
 
 
-class _Watchdog:
+class Watchdog:
     """Timer that kills a process unless the block ends in time; reads and writes of its pipe then end as well."""
 
     def __init__(self, process: BaseProcess, limit_s: float) -> None:
+        """Prepare the timer of a process, in seconds."""
         self.expired = False
         self._process = process
-        self._timer = threading.Timer(limit_s, self._expire)
+        self._timer = threading.Timer(limit_s, self.expire)
         self._timer.daemon = True
 
-    def __enter__(self) -> _Watchdog:
+    def __enter__(self) -> Watchdog:
+        """Start the timer."""
         self._timer.start()
         return self
 
     def __exit__(self, *_error: object) -> None:
+        """Cancel the timer."""
         self._timer.cancel()
 
-    def _expire(self) -> None:
+    def expire(self) -> None:
+        """Kill the process."""
         self.expired = True
         self._process.kill()
 

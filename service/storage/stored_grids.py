@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, select, update
+from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
 from lalaloc_core.localise.poses import PoseGrid
@@ -79,7 +79,7 @@ class StoredGrids:
         return found
 
     def put_prototypes(self, grid_id: int, prototypes: SortedPrototypes) -> None:
-        """Store the prototypes of a grid that an earlier version of the service stored without."""
+        """Store the prototypes of a grid that an earlier version of the service stored without, or in its format."""
         packed = pack_prototypes(prototypes)
         revisions = LATENT_GRIDS.join(REVISIONS, REVISIONS.c.id == LATENT_GRIDS.c.revision_id)
         owner = (
@@ -87,13 +87,18 @@ class StoredGrids:
             .select_from(revisions.join(FLOORPLANS, FLOORPLANS.c.id == REVISIONS.c.plan_id))
             .where(LATENT_GRIDS.c.id == grid_id)
         )
-        statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id, LATENT_GRIDS.c.prototypes.is_(None))
-        values = {"prototypes": packed, "stored_bytes": LATENT_GRIDS.c.stored_bytes + len(packed)}
+        column = LATENT_GRIDS.c.prototypes
+        bytes_before = func.coalesce(func.length(column), 0)
+        # Another replica can have stored the same meanwhile.
+        is_new = or_(column.is_(None), column != packed)
+        statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id, is_new)
+        values = {"prototypes": packed, "stored_bytes": LATENT_GRIDS.c.stored_bytes + len(packed) - bytes_before}
         with self._database.writing(grows_by=len(packed)) as connection:
             tenant = connection.scalar(owner)
+            before = connection.scalar(select(bytes_before).where(LATENT_GRIDS.c.id == grid_id))
             if tenant is not None and connection.execute(statement.values(values)).rowcount == 1:
                 # Small beside the grid, and needed by queries of venues, so never refused.
-                self._quota.settle(connection, tenant, StoredBytes(grids=len(packed)), refuse=False)
+                self._quota.settle(connection, tenant, StoredBytes(grids=len(packed) - (before or 0)), refuse=False)
 
     def poses(
         self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, settings
 
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.localise.bundle import Bundle
@@ -15,17 +14,6 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from tests.core.questions import PaintedSession
-
-# Derandomised: results depend on the commit only.
-settings.register_profile(
-    "core",
-    deadline=None,
-    derandomize=True,
-    max_examples=50,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-)
-settings.load_profile("core")
 
 
 @pytest.fixture(autouse=True)

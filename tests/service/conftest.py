@@ -22,6 +22,7 @@ from fastapi import FastAPI
 from PIL import Image
 
 from service.app import create_app
+from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 from tests.service.ray_cluster import ray_cluster, serving
@@ -201,6 +202,16 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     while not condition():
         assert monotonic() < deadline, "timed out waiting"
         sleep(0.05)
+
+
+def end_time_limits() -> int:
+    """Let the time limits of all running jobs and starts of this process's pools pass; return their number."""
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    watchdogs = [getattr(timer.function, "__self__", None) for timer in timers if not timer.finished.is_set()]
+    running = [watchdog for watchdog in watchdogs if isinstance(watchdog, Watchdog)]
+    for watchdog in running:
+        watchdog.expire()
+    return len(running)
 
 
 def assert_problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

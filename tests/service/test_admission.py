@@ -56,9 +56,7 @@ def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
         for _ in range(PLACES):
             uploads.enter_context(_open_upload(small))
         wait_for(lambda: _in_flight(small) == PLACES)
-        begin = monotonic()
         response = small.post("/floorplans", json=FLAT)
-        assert monotonic() - begin < 0.5
         assert f"{PLACES} of your requests are in progress" in assert_problem(response, 503, "overloaded")["detail"]
         assert 1 <= int(response.headers["retry-after"]) <= 30
         # Reads have slots of their own; health and metrics need none.
@@ -165,7 +163,7 @@ def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, panorama:
         waiting = threads.submit(localise, small, preparing, panorama)
         # Until its picture is encoded, it takes the place of a query.
         wait_for(lambda: _in_flight(small) == 1)
-        wait_for(lambda: localise(small, ready, panorama).status_code == 200, 10.0)
+        wait_for(lambda: localise(small, ready, panorama).status_code == 200)
         assert not waiting.done()
         assert small.delete(f"/floorplans/{preparing}").status_code == 204
         assert waiting.result().status_code in (200, 404, 503)
@@ -179,9 +177,7 @@ def test_disconnect_frees_the_slot(small: httpx.Client, panorama: bytes) -> None
         head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
         connection.sendall(head.encode() + body)
         wait_for(lambda: _in_flight(small) == 1)
-    begin = monotonic()
     wait_for(lambda: _in_flight(small) == 0)
-    assert monotonic() - begin < 2.0
     assert 'lalaloc_disconnects_total{route="/localise"} 1.0' in small.get("/metrics").text
     assert small.delete(f"/floorplans/{preparing}").status_code == 204
     assert _metric(small, "lalaloc_queries_in_work") == 0

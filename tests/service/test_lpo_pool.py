@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from time import monotonic, sleep
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,17 @@ import pytest
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceResult
+from service.query import lpo_pool
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.tenancy.cpu_accounts import CpuAccounts
 from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import warm_up_job
-from tests.service.conftest import wait_for
+from tests.service.conftest import end_time_limits, wait_for
+
+# Time limit of jobs that must not end by it, also on a busy machine.
+_LONG_S = 120.0
 
 
 @contextmanager
@@ -48,7 +52,7 @@ def bundle(tiny_bundle: Path) -> Bundle:
 @pytest.fixture(scope="module")
 def pool(bundle: Bundle) -> Iterator[LpoPool]:
     """Two workers; every test leaves both of them warm, or waits until they are."""
-    with _pool(bundle, workers=2, lpo_queue=6, lpo_stall_s=5.0) as started:
+    with _pool(bundle, workers=2, lpo_queue=6, lpo_stall_s=600.0) as started:
         yield started
 
 
@@ -71,6 +75,11 @@ def _refine(pool: LpoPool, job: RefinementJob, timeout_s: float) -> RefinementRe
     return result
 
 
+def _missed(pool: LpoPool, reason: str) -> float:
+    """Return the number of jobs that were lost for a reason."""
+    return pool._telemetry.lpo_missed.labels(reason)._value.get()
+
+
 def _workers() -> list[int]:
     return [child.pid for child in multiprocessing.active_children() if child.pid and "lpo" in child.name]
 
@@ -81,7 +90,7 @@ def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_prof
 
     job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
     expected = PoseRefiner.from_bundle(bundle).refine(job)
-    result = _refine(pool, job, 20.0)
+    result = _refine(pool, job, _LONG_S)
     assert result is not None
     np.testing.assert_allclose(result.position_m, expected.position_m, atol=1e-4)
     assert (result.latent_distance is None) == (expected.latent_distance is None) == by_profile
@@ -93,9 +102,9 @@ def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_prof
 
 def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: RefinementJob) -> None:
     jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
-    alone = [_refine(pool, job, 20.0) for job in jobs]
+    alone = [_refine(pool, job, _LONG_S) for job in jobs]
     with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda job: _refine(pool, job, 20.0), jobs))
+        together = list(threads.map(lambda job: _refine(pool, job, _LONG_S), jobs))
     for first, second in zip(alone, together, strict=True):
         assert first is not None
         assert second is not None
@@ -104,8 +113,8 @@ def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: Refinement
 
 def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) -> None:
     workers = set(_workers())
-    assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), 20.0) is None
-    assert _refine(pool, job, 20.0) is not None
+    assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), _LONG_S) is None
+    assert _refine(pool, job, _LONG_S) is not None
     assert set(_workers()) == workers
 
 
@@ -118,7 +127,7 @@ def test_idle_killed_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> No
     killed, other = _workers()
     os.kill(killed, signal.SIGKILL)
     # The kill is not noticed yet, but the other worker runs the job.
-    assert _refine(pool, job, 20.0) is not None
+    assert _refine(pool, job, _LONG_S) is not None
     wait_for(lambda: killed not in _workers() and pool.state.ready == len(_workers()) == 2, 120.0)
     assert other in _workers()
 
@@ -129,26 +138,29 @@ def test_second_worker_takes_over_from_a_killed_one(pool: LpoPool, job: Refineme
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(1) as threads:
         # Either of the two holds the job when the first one dies.
-        waiting = threads.submit(_refine, pool, job, 20.0)
+        waiting = threads.submit(_refine, pool, job, _LONG_S)
         wait_for(lambda: pool._workers.waiting == 0 and waiting.running())
         sleep(0.3)
         os.kill(first, signal.SIGKILL)
         os.kill(second, signal.SIGCONT)
         assert waiting.result() is not None
+    # A process that dies still counts as a worker for a moment.
+    wait_for(lambda: first not in _workers())
 
 
 def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     stopped = set(_workers())
     for pid in stopped:
         os.kill(pid, signal.SIGSTOP)
-    begin = monotonic()
-    assert _refine(pool, job, 0.5) is None
-    assert monotonic() - begin < 3.0
+    with ThreadPoolExecutor(1) as threads:
+        refined = threads.submit(_refine, pool, job, _LONG_S)
+        wait_for(lambda: end_time_limits() > 0)
+        assert refined.result() is None
     # The worker with the job is killed; the other one is idle.
     wait_for(lambda: len(stopped & set(_workers())) == 1)
     for pid in stopped & set(_workers()):
         os.kill(pid, signal.SIGCONT)
-    assert _refine(pool, job, 20.0) is not None
+    assert _refine(pool, job, _LONG_S) is not None
 
 
 def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
@@ -156,30 +168,30 @@ def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> N
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
         # Two jobs run, and four fill one client's share of the queue.
-        waiting = [threads.submit(_refine, pool, job, 60.0) for _ in range(6)]
-        wait_for(lambda: pool._workers.waiting == 4, 30.0)
-        begin = monotonic()
-        assert _refine(pool, job, 20.0) is None
-        assert monotonic() - begin < 0.5
+        waiting = [threads.submit(_refine, pool, job, _LONG_S) for _ in range(6)]
+        wait_for(lambda: pool._workers.waiting == 4)
+        refused = _missed(pool, "queue-full")
+        assert _refine(pool, job, _LONG_S) is None
+        assert _missed(pool, "queue-full") == refused + 1
         for pid in _workers():
             os.kill(pid, signal.SIGCONT)
         assert len([future.result() for future in waiting]) == 6
 
 
-def test_cold_pool_returns_none_and_closes(bundle: Bundle, job: RefinementJob) -> None:
+def test_cold_pool_returns_none_and_closes(bundle: Bundle, job: RefinementJob, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lpo_pool, "_START_S", 10.0 * _LONG_S)
     others = set(_workers())
     with _pool(bundle, workers=1) as cold:
-        wait_for(lambda: bool(set(_workers()) - others))
-        begin = monotonic()
-        assert _refine(cold, job, 2.0) is None
-        assert monotonic() - begin < 0.5
+        assert _refine(cold, job, _LONG_S) is None
+        assert _missed(cold, "not-ready") == 1
         assert not cold.state.warmed_up
+        wait_for(lambda: bool(set(_workers()) - others))
     assert not set(_workers()) - others
 
 
 def test_pool_without_workers_returns_none(bundle: Bundle, job: RefinementJob) -> None:
     with _pool(bundle, workers=0) as none:
-        assert _refine(none, job, 20.0) is None
+        assert _refine(none, job, _LONG_S) is None
         assert none.state.warmed_up
 
 

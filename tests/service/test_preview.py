@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lalaloc_core.draw.plan import Marker, plan_svg
@@ -43,7 +43,6 @@ def test_drawing_has_every_room_with_y_up() -> None:
 @given(st.text(min_size=1, max_size=200))
 @example("<b>&\"'")
 @example("\ufffe \uffff")
-@settings(deadline=None)
 def test_valid_name_gives_well_formed_svg(name: str) -> None:
     document = {"name": name, "ceiling_height_m": 2.5, "rooms": [{"name": name, "polygon": [[0, 0], [3, 0], [0, 3]]}]}
     try:

@@ -148,7 +148,7 @@ def test_invalid_panorama_is_rejected(client: httpx.Client, plan_id: str, panora
 
 def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     problem = assert_problem(ask(client, plan_id, [panorama, bytes(210_000)]), 413, "upload-too-large")
-    assert "max_sequence_bytes" in problem["detail"]
+    assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
     assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (4, 200_000)
 

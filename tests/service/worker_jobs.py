@@ -19,12 +19,12 @@ def run(connection: Connection, log: str) -> None:
     serve_jobs(connection, lambda: lambda job: _work(log, *job))
 
 
-def run_slow_start(connection: Connection, log: str, start_s: float) -> None:
-    """Run jobs after a slow start."""
+def run_after_gate(connection: Connection, log: str, gate: str) -> None:
+    """Run jobs as soon as the file `gate` exists."""
     _note(log, "start")
 
     def load() -> Callable[[Any], Any]:
-        time.sleep(start_s)
+        _wait_for_file(gate)
         return lambda job: _work(log, *job)
 
     serve_jobs(connection, load)
@@ -40,8 +40,8 @@ def _work(log: str, kind: str, argument: Any) -> Any:
     match kind:
         case "echo":
             return argument
-        case "sleep":
-            time.sleep(argument)
+        case "wait":
+            _wait_for_file(argument)
         case "raise":
             raise ValueError(argument)
         case "die":
@@ -49,6 +49,11 @@ def _work(log: str, kind: str, argument: Any) -> Any:
         case "bytes":
             return bytes(argument)
     return os.getpid()
+
+
+def _wait_for_file(path: str) -> None:
+    while not Path(path).exists():
+        time.sleep(0.01)
 
 
 def _note(log: str, line: str) -> None:
