@@ -172,8 +172,9 @@ def test_deferred_batches_equal_rendered_ones(uses: int, neighbours: bool, worke
 
 
 def test_scenes_are_rendered_once_and_evicted() -> None:
-    source = GeneratedSource(config_of(3), deferred=True)
-    renderer, shown, seen = DeferredRenderer(source.renderer(CPU)), set(), 0
+    config = config_of(3)
+    source = GeneratedSource(config, deferred=True)
+    renderer, shown, seen = DeferredRenderer(source.renderer(CPU, *config.image_size)), set(), 0
     deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
     for batch, _ in zip(deferred, renderer.render_batches(deferred), strict=True):
         assert not shown & batch.scenes.keys()

@@ -277,12 +277,12 @@ def test_gaps_and_rooms_are_compared_with_their_neighbours(monkeypatch: pytest.M
 
     monkeypatch.setattr(shapely, "intersection", counted)
     # Square rooms with a gap of 1 m in one wall.
-    bodies = [
-        shapely.box(x, 0, x + 4, 4)
-        .difference(shapely.box(x + 0.2, 0.2, x + 3.8, 3.8))
-        .difference(shapely.box(x + 1.5, -1, x + 2.5, 1))
-        for x in np.arange(30) * 6.0
-    ]
+    bodies = []
+    for x in np.arange(30) * 6.0:
+        walls = shapely.box(x, 0, x + 4, 4).difference(shapely.box(x + 0.2, 0.2, x + 3.8, 3.8))
+        body = walls.difference(shapely.box(x + 1.5, -1, x + 2.5, 1))
+        assert isinstance(body, shapely.Polygon)
+        bodies.append(body)
     found = enclose(bodies, [])
     assert (len(found.rooms), len(found.gaps)) == (30, 30)
     # Each gap is found from both sides.

@@ -55,9 +55,9 @@ def test_idle_tenant_gets_a_slot(limit: int, steps: list[tuple[str, bool]]) -> N
 
 @given(st.integers(8, 200), st.integers(2, 4))
 def test_greedy_clients_get_equal_shares(limit: int, clients: int) -> None:
-    shares, names = Shares(limit), range(clients)
-    while shares.may_take(0):
-        shares.take(0)
+    shares, names = Shares(limit), "abcd"[:clients]
+    while shares.may_take("a"):
+        shares.take("a")
     # The busiest client gives back a unit, and the permitted clients with the fewest units take units.
     for _ in range(20 * limit):
         busiest = max(names, key=shares.held_by)

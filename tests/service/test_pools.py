@@ -34,8 +34,9 @@ def _pool(
 ) -> Iterator[Pool]:
     log.touch()
     arguments = spec.pop("arguments", (str(log),))
+    settings: dict[str, Any] = {"stall_s": 600.0, "start_s": 1.0, **spec}
     pool: Pool = WorkerPool(
-        WorkerSpec("test", target or worker_jobs.run, arguments, **({"stall_s": 600.0, "start_s": 1.0} | spec)),
+        WorkerSpec("test", target or worker_jobs.run, arguments, **settings),
         workers=workers,
         queue_limit=queue_limit,
         keep_spare=keep_spare,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from ezdxf import options as dxf_options
+from ezdxf import options as dxf_options  # pyright: ignore[reportPrivateImportUsage]
 from ezdxf import path as dxf_path
 from ezdxf import recover
 from ezdxf.document import Drawing as DxfDocument
