@@ -99,9 +99,9 @@ def test_adversarial_plans_are_refused(client: httpx.Client, body: str) -> None:
     assert_problem(response, 422, "invalid-floorplan")
 
 
-def test_plan_of_a_million_vertices_is_refused(start_app: StartApp, tmp_path: Path) -> None:
-    body = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 10**6) + "]}]}"
+def test_plan_of_very_many_vertices_is_refused(start_app: StartApp, tmp_path: Path) -> None:
+    body = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 900_000) + "]}]}"
     with start_app(tmp_path, max_plan_bytes=10**7) as client:
         response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
         problem = assert_problem(response, 422, "invalid-floorplan")
-        assert "1000000 vertices" in problem["detail"]
+        assert "900000 vertices" in problem["detail"]

@@ -49,7 +49,9 @@ def test_import_without_package_names_the_extra(bare: httpx.Client, content: byt
 
 
 def test_export_without_package_names_the_extra(bare: httpx.Client) -> None:
-    plan_id = upload(bare)
+    # Large enough to be exported by a worker; the packages are hidden from workers only.
+    rooms = [{"polygon": [[x, 0], [x + 4, 0], [x + 4, 3], [x, 3]]} for x in range(0, 1000, 5)]
+    plan_id = upload(bare, {"ceiling_height_m": 2.5, "rooms": rooms})
     problem = assert_problem(bare.get(f"/floorplans/{plan_id}/export?format=dxf"), 501, "missing-extra")
     assert "the extra `plans`" in problem["detail"]
     assert bare.get(f"/floorplans/{plan_id}/export?format=native").status_code == 200
