@@ -49,7 +49,7 @@ def _check_size(structure: str, max_depth: int, max_values: int | None) -> None:
     values = sum(structure.count(mark) for mark in "[{,")
     if max_values is not None and values > max_values:
         raise InvalidFloorPlanError(
-            f"the JSON has {values} lists, objects and further items; the limit is {max_values}: leave out or simplify parts"
+            f"the JSON has {values} lists, objects and further items; the limit is {max_values}: simplify it"
         )
 
 

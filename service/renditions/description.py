@@ -10,12 +10,9 @@ from typing import Literal
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.sampling import grid_size
-from service.schemas import BoundsAnswer, FloorPlanAnswer, GridAnswer, ImportReport, RoomAnswer
-from service.schemas.stored_plans import PlanStatus
+from service.schemas import BoundsAnswer, GridAnswer, ImportReport, RoomAnswer
+from service.schemas.stored_plans import PlanContentAnswer, PlanHeadAnswer, PlanStateAnswer, PlanStatus
 from service.stored_plan import PlanHead, Rendition
-
-_STATE = {"status", "progress", "reason", "grid"}
-_HEAD = {"id", "revision", "revision_number", "created_at", "updated_at"}
 
 
 def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:
@@ -25,14 +22,14 @@ def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:
 
 def with_head(content: Rendition, head: PlanHead) -> Rendition:
     """Return the description of a plan from the result of `describe_content`."""
-    answer = FloorPlanAnswer.model_construct(
+    answer = PlanHeadAnswer(
         id=head.id,
         revision=head.revision_id,
         revision_number=head.revision,
         created_at=head.created_at,
         updated_at=head.updated_at,
     )
-    start = answer.model_dump_json(include=_HEAD).encode()[1:-1]
+    start = answer.model_dump_json().encode()[1:-1]
     return replace(content, content=b"%b,%b" % (start, content.content))
 
 
@@ -41,7 +38,7 @@ def describe_content(plan: FloorPlan, report_text: str | None, step_m: float) ->
     report = None if report_text is None else ImportReport.model_validate_json(report_text)
     x_min, y_min, x_max, y_max = plan.bounds_m
     poses = grid_size(plan, step_m)
-    answer = FloorPlanAnswer.model_construct(
+    answer = PlanContentAnswer(
         name=plan.name,
         rooms=[
             RoomAnswer(
@@ -62,7 +59,7 @@ def describe_content(plan: FloorPlan, report_text: str | None, step_m: float) ->
         import_report=report,
         plan=plan.to_dict(),
     )
-    return Rendition(answer.model_dump_json(exclude=_STATE | _HEAD).encode()[1:], plan.bounds_m, poses)
+    return Rendition(answer.model_dump_json().encode()[1:], plan.bounds_m, poses)
 
 
 def state_of_description(
@@ -70,5 +67,5 @@ def state_of_description(
 ) -> bytes:
     """Return the part of a description that precedes the content of `describe`."""
     grid = GridAnswer(step_m=step_m, poses=poses)
-    state = FloorPlanAnswer.model_construct(status=status, progress=progress, reason=reason, grid=grid)
-    return state.model_dump_json(include=_STATE).encode()[:-1] + b","
+    state = PlanStateAnswer(status=status, progress=progress, reason=reason, grid=grid)
+    return state.model_dump_json().encode()[:-1] + b","

@@ -41,24 +41,36 @@ class BoundsAnswer(ResponseModel):
     y_max_m: Metres
 
 
-class FloorPlanAnswer(ResponseModel):
-    """Stored floor plan."""
+class PlanHeadAnswer(ResponseModel):
+    """Part of a stored plan's description: how it is stored."""
 
     id: str = Field(description="Id of the plan.")
     revision: str = Field(description="Id of the revision; it changes when the plan is replaced.")
     revision_number: int = Field(ge=1, description="Number of the revision, from 1.")
-    name: str
+    created_at: datetime = Field(description="Time of the first upload, UTC.")
+    updated_at: datetime = Field(description="Time of this revision's upload, UTC.")
+
+
+class PlanStateAnswer(ResponseModel):
+    """Part of a stored plan's description: the state of its pose grid."""
+
     status: PlanStatus | Literal["superseded"] = Field(
         description="`preparing` while the pose grid is computed, then `ready` or `failed`; `superseded` for an old "
         "revision."
     )
     progress: Share = Field(description="Fraction of the pose grid that is computed.")
     reason: str | None = Field(description="Reason of a failure; null if there is none.")
+    grid: GridAnswer
+
+
+class PlanContentAnswer(ResponseModel):
+    """Part of a stored plan's description: what the plan says."""
+
+    name: str
     rooms: list[RoomAnswer]
     area_m2: SquareMetres = Field(description="Sum of the rooms' floor areas.")
     bounds: BoundsAnswer
     camera_height_m: float = Field(description="Camera height of panoramas of this plan.")
-    grid: GridAnswer
     warnings: list[str] = Field(
         description="Likely mistakes in the plan, such as overlapping rooms, rooms without a door or improbable "
         "ceilings."
@@ -69,8 +81,10 @@ class FloorPlanAnswer(ResponseModel):
     plan: Annotated[dict[str, Any], WithJsonSchema({"allOf": [{"$ref": "#/components/schemas/FloorPlanDocument"}]})] = (
         Field(description="Plan in the native format.")
     )
-    created_at: datetime = Field(description="Time of the first upload, UTC.")
-    updated_at: datetime = Field(description="Time of this revision's upload, UTC.")
+
+
+class FloorPlanAnswer(PlanContentAnswer, PlanStateAnswer, PlanHeadAnswer):
+    """Stored floor plan."""
 
 
 class FloorPlanSummary(ResponseModel):
