@@ -191,7 +191,7 @@ def test_repeated_reads_convert_a_plan_once(start_app: StartApp, tmp_path: Path,
             converted.clear()
             assert client.get(f"/floorplans/{plan_id}{path}").content == first.content
             # The state of the pose grid is four short fields.
-            assert converted == ["FloorPlanAnswer"] * (path == "")
+            assert converted == ["PlanStateAnswer"] * (path == "")
 
 
 @pytest.mark.one_replica
@@ -203,7 +203,7 @@ def test_large_plans_are_converted_by_workers(start_app: StartApp, tmp_path: Pat
         # After the start, no file is in memory; pose grids are in the database.
         converted.clear()
         bodies = {path: client.get(f"/floorplans/{plan_id}{path}") for path in READS}
-        assert converted == ["FloorPlanAnswer"]
+        assert converted == ["PlanStateAnswer"]
         assert [body.status_code for body in bodies.values()] == [200] * len(READS)
     plan = FloorPlan.from_dict(document)
     assert bodies["/mesh.glb"].content == plan_glb(plan)
