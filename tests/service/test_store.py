@@ -266,21 +266,23 @@ def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) 
     assert second.plans.get("default", "p") is None
 
 
-def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore) -> None:
     _add(open_store(), "p")
-    store, in_use = open_store(), []
-    read = PlanDocument.plan
+    in_use = []
 
-    def watched(document: PlanDocument) -> FloorPlan | None:
-        in_use.append(store._database._engine.pool.checkedout())  # pyright: ignore[reportAttributeAccessIssue]
-        return read(document)
+    def watching() -> Store:
+        store = open_store()
 
-    monkeypatch.setattr(PlanDocument, "plan", watched)
-    assert store.plans.get("default", "p") is not None
-    assert in_use == [0]
-    # A repeated upload does not read the stored plan.
-    open_store().plans.add("default", "p", PLAN, original=Original(b"{}"), limit=10)
-    assert in_use == [0]
+        def watched(document: PlanDocument) -> FloorPlan | None:
+            in_use.append(store._database._engine.pool.checkedout())  # pyright: ignore[reportAttributeAccessIssue]
+            return document.plan()
+
+        store.plans.parse_with(watched)
+        return store
+
+    assert watching().plans.get("default", "p") is not None
+    watching().plans.add("default", "p", PLAN, original=Original(b"{}"), limit=10)
+    assert in_use == [0, 0]
 
 
 def test_warnings_are_stored_and_not_recomputed(open_store: OpenStore) -> None:
