@@ -190,6 +190,7 @@ def test_second_signal_ends_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
         wait_for(lambda: not any(alive(worker) for worker in workers))
 
 
+@pytest.mark.slow  # 40 s: waits for the service's own time limits
 def test_slow_clients_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     limits = {"KEEP_ALIVE_S": "1", "MAX_PENDING_REQUESTS": "1"}
     with _service(tiny_bundle, tmp_path / "data", **limits) as service:
