@@ -17,6 +17,7 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import httpx
+import pytest
 from ezdxf.filemanagement import new as new_dxf
 
 from tests.importers.conftest import dxf_file
