@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.errors import BundleError
+from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.export.run import export_views
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
@@ -146,6 +147,11 @@ class TestTraining:
         expected[middle(TINY)] = True
         assert np.array_equal(query.profile.seen[0], expected)
         assert np.array_equal(query.profile.seen[3], np.roll(expected, 3))
+
+    def test_a_data_set_is_refused(self, tmp_path: Path) -> None:
+        data = TrainingData(dataset=GeneratedScenes(homes=1))
+        with pytest.raises(ConfigError, match="without a data set"):
+            train_views(SHORT, tmp_path, device=CPU, data=data)
 
     def test_only_seen_azimuths_count(self) -> None:
         target = torch.zeros(1, 4)

@@ -16,12 +16,11 @@ from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, panorama_batches
+from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, panorama_batches, sample_styles
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
-from lalaloc_core.nets.trunk import StyleMixing
 
 
 class ImageStage(TrainingStage):
@@ -112,7 +111,10 @@ class ImageStage(TrainingStage):
         images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
         # The camera height of photographs is unknown, so their unit of length is the camera height.
         heights = torch.cat([height, height.new_ones(count)])
-        features = self.encoder(images, heights, self._styles(len(image), count, image.device))
+        styles = sample_styles(
+            settings.style_mixing, len(image), count, self._generator(torch.device("cpu")), image.device
+        )
+        features = self.encoder(images, heights, styles)
         assert features.structure is not None
         openings, log_distance = (
             target.to(image.device) for target in (photographs.openings, photographs.log_distance)
@@ -125,19 +127,6 @@ class ImageStage(TrainingStage):
         )
         total = settings.photograph_weight * openings_loss + settings.photograph_profile_weight * walls_loss
         return first_rows(features, len(image)), {"photographs": total}
-
-    def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
-        """Draw style partners, with extra weight on photographs, because queries look like photographs."""
-        if not self.settings.style_mixing:
-            return None
-        generator = self._generator(torch.device("cpu"))
-        count = rendered + photographs
-        partner = torch.randint(count, (count,), generator=generator)
-        photograph = rendered + torch.randint(photographs, (count,), generator=generator)
-        partner = torch.where(torch.rand(count, generator=generator) < 0.5, photograph, partner)
-        share = torch.rand(count, generator=generator)
-        share[torch.rand(count, generator=generator) >= self.settings.style_mixing] = 0.0
-        return StyleMixing(partner.to(device), share.to(device))
 
     def _structure_losses(self, features: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
         """Return the losses on openings, ceiling height and room type."""

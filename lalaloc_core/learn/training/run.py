@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.training.checkpoint import Checkpoint, Validate
 from lalaloc_core.learn.training.config import TrainConfig
@@ -124,13 +125,18 @@ def train_views(
     `init_from` is a bundle or run folder whose image encoder provides the first weights; it excludes `resume`.
 
     Raises:
+        ConfigError: a data set is given; views are rendered from generated homes only.
         CheckpointError: initial weights or the checkpoint are missing, or have other networks.
         DatasetError: a photograph cannot be read.
     """
+    if data.dataset is not None:
+        raise ConfigError("views are rendered from generated homes; train them without a data set (--data)")
     torch.manual_seed(config.seed + 2)
     source = GeneratedSource(config, data.textures, data.deferred, view_window(config))
     stage = ViewStage(config, source, data.load_photographs(config, PHOTOGRAPH_SIZE))
     begun_from = None
+    if init_from is None and not resume and config.image.pretrained:
+        load_pretrained(stage.encoder.trunk)
     if init_from is not None:
         start = load_warm_start(init_from, "image", config)
         sphere = TrunkImageEncoder(config.trunk, config.ring)

@@ -20,7 +20,7 @@ from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.nets.trunk import Trunk
+from lalaloc_core.nets.trunk import StyleMixing, Trunk
 
 
 class TrainingStage(ABC):
@@ -99,6 +99,24 @@ def panorama_batches(
         renderer = source.renderer(device, sizes.image_height, sizes.image_width)
         return DeferredRenderer(renderer).render_batches(batches)
     return batches
+
+
+def sample_styles(
+    mixed_share: float, rendered: int, photographs: int, generator: torch.Generator, device: torch.device
+) -> StyleMixing | None:
+    """Draw style partners for a share of a batch, half of them photographs, because queries look like photographs.
+
+    `generator` is on the CPU. Returns None if the share is 0.
+    """
+    if not mixed_share:
+        return None
+    count = rendered + photographs
+    partner = torch.randint(count, (count,), generator=generator)
+    photograph = rendered + torch.randint(photographs, (count,), generator=generator)
+    partner = torch.where(torch.rand(count, generator=generator) < 0.5, photograph, partner)
+    share = torch.rand(count, generator=generator)
+    share[torch.rand(count, generator=generator) >= mixed_share] = 0.0
+    return StyleMixing(partner.to(device), share.to(device))
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:

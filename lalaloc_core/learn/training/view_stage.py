@@ -20,7 +20,7 @@ from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches
+from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, sample_styles
 from lalaloc_core.localise.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
 
@@ -75,12 +75,13 @@ class ViewStage(TrainingStage):
         """Return the weighted losses of a batch by name; azimuths that are not seen do not count."""
         settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
         count = settings.photographs_per_batch if self.photographs is not None else 0
-        photographs = None
+        photographs, styles = None, None
         if self.photographs is not None:
             photographs = self.photographs.draw(count, self.config.profile_columns, torch.default_generator)
+            styles = sample_styles(settings.style_mixing, len(image), count, torch.default_generator, image.device)
             cut = self._cut(photographs.images).to(image.device)
             image, height = torch.cat([image, cut]), torch.cat([height, height.new_ones(count)])
-        features = self.encoder(self._shown(image), height)
+        features = self.encoder(self._shown(image), height, styles)
         seen = features.seen >= MIN_SEEN
         rendered = slice(0, len(image) - count)
         terms = self._rendered_losses(features, seen, rendered, batch)
