@@ -35,6 +35,8 @@ _SPHERE_TOLERANCE = 0.01
 # `is_sphere`: limits of the product of seam and poles, of the seam, of the more uniform pole, and of the contrast (grey
 # levels). Fitted on photographs and rendered spheres: all photographs pass, with a margin of two.
 _MAX_PRODUCT, _MAX_SEAM, _MAX_POLE, _MIN_CONTRAST = 0.2, 8.0, 0.5, 2.0
+# Smallest height and width (pixels) of pictures that `is_sphere` judges.
+COARSEST = 128, 256
 # Relative standard deviation of a stated focal length.
 _GIVEN_SD = 0.01
 # Advice for photographs without a known field of view.
@@ -42,7 +44,6 @@ _HELP = (
     "send hfov_deg, its horizontal field of view (a phone's main lens has about 67° in landscape and 53° in portrait "
     "format), or intrinsics"
 )
-NO_FIELD_OF_VIEW = f"nothing tells the photograph's field of view, and its lines do not show it; {_HELP}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +138,7 @@ def is_sphere(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
     """Return whether a picture twice as wide as high looks like a full sphere.
 
     Its left and right border continue each other, and its first and last row, around the poles, hardly vary. Pictures
-    of less than 128 rows have too wide rows.
+    less than `COARSEST` have too wide rows.
     """
     values = pixels.astype(np.float32)
     rows = len(values)
@@ -148,7 +149,8 @@ def is_sphere(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
         return False
     step = float(np.abs(np.diff(values[body], axis=1)).mean())
     seam = float(np.abs(values[body, 0] - values[body, -1]).mean()) / (step + 0.5)
-    top, bottom = ((float(spread[row]) + 0.5) / (contrast + 0.5) for row in (0, -1))
+    # A tripod or the edge of a table at one pole must not outweigh the other pole and the borders.
+    top, bottom = (min((float(spread[row]) + 0.5) / (contrast + 0.5), 1.0) for row in (0, -1))
     return seam < _MAX_SEAM and min(top, bottom) < _MAX_POLE and seam * top * bottom < _MAX_PRODUCT
 
 

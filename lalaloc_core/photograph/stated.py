@@ -22,7 +22,7 @@ HFOV_RANGE_DEG = {
     "cylindrical": (10.0, 360.0),
     "fisheye": (10.0, 300.0),
 }
-_MAX_PITCH_DEG, _MAX_ROLL_DEG = 60.0, 180.0
+MAX_PITCH_DEG, MAX_ROLL_DEG = 60.0, 180.0
 _MAX_FOCAL_RATIO = 2.0
 _MAX_COEFFICIENT = 100.0
 # OpenCV counts pixels from the centre of the first one.
@@ -84,8 +84,8 @@ class StatedView:
                 f"projection is '{str(self.projection)[:50]}'; it must be one of {', '.join(HFOV_RANGE_DEG)}"
             )
         _check_range("hfov_deg", self.hfov_deg, *HFOV_RANGE_DEG[self.projection])
-        _check_range("pitch_deg", self.pitch_deg, -_MAX_PITCH_DEG, _MAX_PITCH_DEG)
-        _check_range("roll_deg", self.roll_deg, -_MAX_ROLL_DEG, _MAX_ROLL_DEG)
+        _check_range("pitch_deg", self.pitch_deg, -MAX_PITCH_DEG, MAX_PITCH_DEG)
+        _check_range("roll_deg", self.roll_deg, -MAX_ROLL_DEG, MAX_ROLL_DEG)
         if self.intrinsics is None:
             return
         if self.hfov_deg is not None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama, open_panorama
+from lalaloc_core.panorama.images import warm_up as warm_up_panoramas
 from lalaloc_core.panorama.levelling import camera_axes
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.panorama.pictures import PanoramaLimits, opened_picture, orientation_of, scaled, turned
@@ -23,14 +26,19 @@ from lalaloc_core.photograph.levelling import (
 )
 from lalaloc_core.photograph.lines import find_segments, lines_of
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
-from lalaloc_core.photograph.projection import NO_FIELD_OF_VIEW, Lens, Projection, Source, find_lens, is_sphere
+from lalaloc_core.photograph.projection import (
+    COARSEST,
+    Lens,
+    Projection,
+    Source,
+    find_lens,
+    is_sphere,
+)
 from lalaloc_core.photograph.stated import StatedView
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
-# Larger relative standard deviations of an estimated focal length are no answer.
-_MAX_FOCAL_SD = 0.2
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
 # Seen azimuths: samples of the left and right border, and the largest elevation that counts.
@@ -60,6 +68,7 @@ class View:
         patches: level patches that cover the photograph; empty for a full sphere.
         panorama: the level sphere; None for other photographs.
         camera: camera of the full upright picture; None for a full sphere.
+        axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         warnings: metadata that were ignored, and estimates to be checked.
     """
 
@@ -72,7 +81,52 @@ class View:
     patches: tuple[Patch, ...] = ()
     panorama: Panorama | None = None
     camera: Camera | None = None
+    axes: Float[np.ndarray, "3 3"] | None = None
     warnings: tuple[str, ...] = ()
+
+    def tilt_sd(self, azimuth: float) -> float:
+        """Return the standard deviation (radians) of elevations along an azimuth, from those of pitch and roll."""
+        return math.hypot(self.pitch.sd * math.cos(azimuth), self.roll.sd * math.sin(azimuth))
+
+    @property
+    def compass_heading(self) -> float | None:
+        """Azimuth of the centre, radians clockwise from true north; None if not in the metadata."""
+        return None if self.panorama is None else self.panorama.compass_heading
+
+    def project(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return where the upright picture shows level rays (right, forward, up), and whether it does.
+
+        Places are shares (x, y) of its width and height. For photographs with a camera, which full spheres have not.
+        """
+        assert self.camera is not None
+        assert self.axes is not None
+        pixels, seen = self.camera.pixels(rays @ self.axes.T)
+        return pixels / (self.camera.width, self.camera.height), seen
+
+
+def open_picture(
+    content: bytes, *, max_size: tuple[int, int], limits: PanoramaLimits | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the upright picture of a photograph, no wider and higher than `max_size` (pixels), to be shown.
+
+    Raises:
+        InvalidPanoramaError: the file is not readable or too large.
+    """
+    with opened_picture(content, limits or PanoramaLimits()) as image:
+        orientation = orientation_of(image)
+        width, height = turned(image.size, orientation)
+        share = min(max_size[0] / width, max_size[1] / height)
+        size = max(1, round(share * width)), max(1, round(share * height))
+        return np.asarray(scaled(image, orientation, size))
+
+
+def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
+    """Read small pictures, so that codecs and detectors are loaded before the first request."""
+    warm_up_panoramas(height=sphere_size[0], width=sphere_size[1])
+    buffer = io.BytesIO()
+    Image.new("RGB", (256, 192)).save(buffer, "JPEG")
+    stated = StatedView(projection="perspective", hfov_deg=70.0)
+    open_view(buffer.getvalue(), sphere_size=sphere_size, stated=stated, patch_size=patch_size)
 
 
 def open_view(
@@ -101,11 +155,11 @@ def open_view(
     stated.check()
 
     @cache
-    def panorama() -> Panorama:
+    def panorama(height: int = sphere_size[0], width: int = sphere_size[1]) -> Panorama:
         pitch, roll = (None if angle is None else math.radians(angle) for angle in (stated.pitch_deg, stated.roll_deg))
-        height, width = sphere_size
         return open_panorama(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
 
+    is_fine = sphere_size[0] >= COARSEST[0]
     with opened_picture(content, limits) as image:
         orientation = orientation_of(image)
         width, height = turned(image.size, orientation)
@@ -120,7 +174,7 @@ def open_view(
             stated=stated,
             sphere=sphere,
             exif=read_exif_lens(image.getexif(), width=width, height=height),
-            looks_spherical=lambda: is_sphere(panorama().pixels),
+            looks_spherical=lambda: is_sphere((panorama() if is_fine else panorama(*COARSEST)).pixels),
         )
         if lens.is_sphere:
             return _sphere_view(panorama(), lens, stated, sphere)
@@ -156,14 +210,14 @@ def _view(
     warnings = lens.warnings
     if lens.camera is None:
         found = estimate_calibration(segments, width=columns, height=rows)
-        if found.focal_sd > _MAX_FOCAL_SD:
-            raise InvalidPanoramaError(NO_FIELD_OF_VIEW)
         attitude, focal_sd = found.attitude, found.focal_sd
         camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
+        origin = "was estimated from straight lines" if len(segments) else "is only usual"
         warnings = (
             *warnings,
-            f"the field of view of {math.degrees(found.hfov):.0f}° was estimated from straight lines; send hfov_deg or "
-            "the camera's original file",
+            f"the field of view of {math.degrees(found.hfov):.0f}° ± "
+            f"{math.degrees(2.0 * _hfov_sd(camera, focal_sd)):.0f}° {origin}; "
+            "send hfov_deg or the camera's original file",
         )
         small = camera.scaled(columns, rows)
     else:
@@ -186,6 +240,7 @@ def _view(
         azimuths=_seen_azimuths(small, tilt, roll.value),
         patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
         camera=camera,
+        axes=camera_axes(pitch=tilt, roll=roll.value),
         warnings=warnings,
     )
 

@@ -63,3 +63,19 @@ def log_distance_gradient(
     edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
     turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m
     return ProfileJacobian(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1), wall)
+
+
+def free_travel_m(
+    position_m: Float[Array, "b 2"], direction: Float[Array, "b 2"], walls_m: Float[Array, "b n 4"], margin_m: float
+) -> Float[Array, "b"]:
+    """Return how far poses can move in a direction until they are `margin_m` from the wall ahead; at least 0.
+
+    The margin is at right angles to the wall: along the direction, repeated slanted steps would end on the wall.
+    """
+    xp = array_namespace(position_m, direction, walls_m)
+    azimuth = xp.atan2(direction[:, 0], direction[:, 1])[:, None]
+    ahead = log_distance_gradient(position_m, azimuth, walls_m)
+    distance_m = xp.exp(ahead.log_m[:, 0])
+    # The gradient of the distance is one over the cosine between the direction and the wall's normal.
+    steepness = distance_m * xp.linalg.vector_norm(ahead.by_pose[:, :2, 0], axis=1)
+    return xp.clip(distance_m - margin_m * steepness, 0.0)

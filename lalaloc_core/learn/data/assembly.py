@@ -17,7 +17,7 @@ from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, ROOM_TYPES
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
-from lalaloc_core.learn.data.polygon_rings import largest_simple_part
+from lalaloc_core.learn.data.polygon_rings import floor_without, largest_simple_part
 
 # Minimum area share of the largest simple part of an outline that crosses itself.
 _MIN_SIMPLE_SHARE = 0.9
@@ -25,11 +25,15 @@ _MIN_SIMPLE_SHARE = 0.9
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoomOutline:
-    """Room as drawn by a data set; its name is unique within the scene."""
+    """Room as drawn by a data set; its name is unique within the scene.
+
+    `holes_m` are rings of inner walls, which are no floor; they may repeat their first vertex and touch the outline.
+    """
 
     name: str
     polygon_m: Float[np.ndarray, "n 2"]
     ceiling_height_m: float
+    holes_m: tuple[Float[np.ndarray, "_ 2"], ...] = ()
     warnings: tuple[str, ...] = ()
     type: str = ROOM_TYPES[0]
 
@@ -92,7 +96,13 @@ def _room_entries(
             )
         if share < 1.0:
             warnings.append(f"room '{outline.name}': the outline crosses itself; {1.0 - share:.1%} of it is left out")
-        areas.append(float(shapely.Polygon(polygon_m).area))
+        floor, left_out = floor_without(polygon_m, outline.holes_m)
+        if left_out:
+            warnings.append(
+                f"room '{outline.name}': {left_out} of {len(outline.holes_m)} rings of inner walls are left out; "
+                "they enclose no area inside the room, or divide it"
+            )
+        areas.append(float(floor.area))
         if areas[-1] < DEFAULT_LIMITS.min_room_area_m2:
             warnings.append(
                 f"room '{outline.name}' is left out: it has {areas[-1]:.3g} m²; "
@@ -104,7 +114,8 @@ def _room_entries(
                 "id": f"{len(rooms)}",
                 "name": outline.name,
                 "type": outline.type,
-                "polygon": polygon_m.tolist(),
+                "polygon": _vertices(floor.exterior),
+                "holes": [_vertices(ring) for ring in floor.interiors],
                 "ceiling_height_m": outline.ceiling_height_m,
             }
         )
@@ -117,6 +128,11 @@ def _room_entries(
             path=path,
         )
     return rooms, warnings
+
+
+def _vertices(ring: shapely.LinearRing) -> list[list[float]]:
+    """Return the vertices of a closed ring without the repeated one."""
+    return shapely.get_coordinates(ring)[:-1].tolist()
 
 
 def pose_fault(

@@ -9,6 +9,9 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+# Minimum share of the floor beside a hole that stays connected.
+_MIN_CONNECTED = 0.9
+
 
 class OpenRingError(ValueError):
     """Lines that do not form closed rings; the message names the junction."""
@@ -70,3 +73,23 @@ def largest_simple_part(polygon: Float[np.ndarray, "n 2"]) -> tuple[Float[np.nda
         return polygon, 0.0
     largest = parts[int(np.argmax(areas))]
     return np.array(largest.exterior.coords)[:-1], float(largest.area / sum(areas))
+
+
+def floor_without(
+    polygon: Float[np.ndarray, "n 2"], holes: Sequence[Float[np.ndarray, "_ 2"]]
+) -> tuple[shapely.Polygon, int]:
+    """Return the area inside a simple ring and outside some holes, and the number of holes that are left out.
+
+    Holes may touch or cross the ring. One that encloses nothing inside it, or that cuts off more than a tenth of the
+    floor, is left out.
+    """
+    floor, left_out = shapely.Polygon(polygon), 0
+    for hole in holes:
+        shape = shapely.make_valid(shapely.Polygon(hole)) if len(hole) > 2 else shapely.Point()
+        parts = [part for part in shapely.get_parts(floor.difference(shape)) if isinstance(part, shapely.Polygon)]
+        rest = max(parts, key=lambda part: part.area, default=floor)
+        if rest.area < _MIN_CONNECTED * sum(part.area for part in parts) or not rest.area < floor.area:
+            left_out += 1
+        else:
+            floor = rest
+    return floor, left_out

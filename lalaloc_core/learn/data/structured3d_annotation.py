@@ -125,13 +125,14 @@ class _Reader:
         ceiling_z_m, ceiling_warnings = _level(np.array(ceiling_mm)[:, 2] / _MM_PER_M, "ceiling", room)
         found = []
         for plane in by_kind["floor"]:
-            corners_m, warnings = self._floor_m(plane, room)
+            corners_m, holes_m = self._floor_m(plane, room)
             floor_z_m, floor_warnings = _level(corners_m[:, 2], "floor", room)
             outline = RoomOutline(
                 name=room,
                 polygon_m=corners_m[:, :2],
                 ceiling_height_m=ceiling_z_m - floor_z_m,
-                warnings=(*warnings, *floor_warnings, *ceiling_warnings),
+                holes_m=holes_m,
+                warnings=(*floor_warnings, *ceiling_warnings),
                 type=room_type_from_label(room),
             )
             found.append((outline, floor_z_m))
@@ -171,8 +172,8 @@ class _Reader:
             )
         return found, tuple(faults)
 
-    def _floor_m(self, plane: int, room: str) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
-        """Return the corners of a floor in order, and warnings."""
+    def _floor_m(self, plane: int, room: str) -> tuple[Float[np.ndarray, "n 3"], tuple[Float[np.ndarray, "_ 2"], ...]]:
+        """Return the corners of a floor in order, and its other rings, which are holes."""
         lines = self._lines(plane, "floor", room)
         rings, fault = self._chained(lines, room)
         if len(rings) != 1:
@@ -181,10 +182,8 @@ class _Reader:
         if not rings:
             raise self._error(f"floor plane {plane}: {fault}", room) from fault
         corners_m = [np.array([self._junction_mm(junction, room) for junction in ring]) / _MM_PER_M for ring in rings]
-        warnings = ()
-        if len(rings) > 1:
-            warnings = (f"room '{room}': the floor has {len(rings)} rings; only the largest is used",)
-        return max(corners_m, key=lambda corners: abs(signed_area(corners[:, :2]))), warnings
+        outer = int(np.argmax([abs(signed_area(corners[:, :2])) for corners in corners_m]))
+        return corners_m[outer], tuple(corners[:, :2] for k, corners in enumerate(corners_m) if k != outer)
 
     def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], OpenRingError | None]:
         try:

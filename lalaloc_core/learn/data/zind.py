@@ -6,7 +6,7 @@
 
 A scene is one floor of a home, "0000/floor_01". ZInD's frame is mirrored: a point (x, y) appears at the image azimuth
 atan2(-x, y). Negating x gives the plan frame and reverses rotations, so ZInD's counter-clockwise `rotation` of a
-panorama equals its heading.
+panorama equals its heading. Rings in a layout's `internal` list, inner walls and chimneys, are holes of its room.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class _FloorReader:
                 layout = panorama.data.get("layout_complete")
                 # A small room that was photographed from outside can lack a layout.
                 if layout is not None:
-                    outlines[panorama.complete_room] = self._outline(panorama, layout)
+                    outlines[panorama.complete_room] = self._outline(panorama, layout, faults)
                     openings += self._openings(panorama, layout, faults)
         plan = assemble_plan(
             self._scene,
@@ -154,20 +154,41 @@ class _FloorReader:
                     name = f"{partial_room}_{pano}"
                     yield _Panorama(complete_room=complete_room, name=name, data=self._object(data, name))
 
-    def _outline(self, panorama: _Panorama, layout: Any) -> RoomOutline:
+    def _outline(self, panorama: _Panorama, layout: Any, faults: list[str]) -> RoomOutline:
         vertices = layout.get("vertices") if isinstance(layout, dict) else None
         if not isinstance(vertices, list) or len(vertices) < 3:
             raise self._error("layout_complete has no list 'vertices' of at least three points", panorama.name)
-        polygon = np.array([self._pair(vertex, f"vertex {k}", panorama) for k, vertex in enumerate(vertices)])
+        polygon = self._ring(vertices, "", panorama)
         transform = self._transform(panorama)
         ceiling = self._number(panorama.data, "ceiling_height", panorama)
         label = str(panorama.data.get("label", "")).strip()
         return RoomOutline(
             name=f"{label} {panorama.complete_room}".strip(),
             polygon_m=transform.to_plan_m(polygon),
+            holes_m=tuple(map(transform.to_plan_m, self._holes(panorama, layout, faults))),
             ceiling_height_m=ceiling * transform.unit_m,
             type=room_type_from_label(label),
         )
+
+    def _holes(
+        self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]
+    ) -> Iterator[Float[np.ndarray, "n 2"]]:
+        """Yield the rings of inner walls of a layout."""
+        rings = layout.get("internal", [])
+        if not isinstance(rings, list):
+            faults.append(f"{panorama.name}: 'internal' is left out; it is not a list of rings")
+            return
+        for number, ring in enumerate(rings):
+            if not isinstance(ring, list) or len(ring) < 3:
+                faults.append(f"{panorama.name}: ring {number} of 'internal' is left out; it has no three points")
+                continue
+            try:
+                yield self._ring(ring, f"ring {number} of 'internal', ", panorama)
+            except DatasetError as error:
+                faults.append(f"{panorama.name}: ring {number} of 'internal' is left out; {error.reason}")
+
+    def _ring(self, vertices: list[Any], where: str, panorama: _Panorama) -> Float[np.ndarray, "n 2"]:
+        return np.array([self._pair(vertex, f"{where}vertex {k}", panorama) for k, vertex in enumerate(vertices)])
 
     def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
         """Yield the doors, passages and windows of a layout.

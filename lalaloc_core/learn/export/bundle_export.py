@@ -24,6 +24,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.localise.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
@@ -80,11 +81,11 @@ def export_bundle(
     with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
         work = Path(scratch)
         _save_weights(layout_encoder, work / LAYOUT_WEIGHTS)
-        if image_encoder is not None:
-            _save_weights(image_encoder, work / IMAGE_WEIGHTS)
         if decoder is not None:
             _save_weights(decoder, work / DECODER_WEIGHTS)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
+        if image_encoder is not None:
+            _save_weights(image_encoder, work / IMAGE_WEIGHTS, beside=work / IMAGE_ONNX)
         training = {**(training or {}), "parity_max_abs_difference": parity}
         manifest = _manifest(config, image_encoder, name, version, training)
         folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +115,7 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, 
         path = Path(scratch) / VIEW_ONNX
         _export(path, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
         (bundle.folder / VIEW_ONNX).write_bytes(path.read_bytes())
-    _save_weights(encoder, bundle.folder / VIEW_WEIGHTS)
+    _save_weights(encoder, bundle.folder / VIEW_WEIGHTS, beside=bundle.folder / VIEW_ONNX)
     view = ViewManifest(
         config=dataclasses.asdict(config.view),
         image_height=config.view.image_height,
@@ -250,10 +251,20 @@ def _round_to_half(module: nn.Module) -> None:
             parameter.data = parameter.data.half().float()
 
 
-def _save_weights(module: nn.Module, path: Path) -> None:
+def _save_weights(module: nn.Module, path: Path, beside: Path | None = None) -> None:
+    """Save the weights of a network, without those that the ONNX file `beside` it holds."""
     large = {name for name, parameter in module.named_parameters() if parameter.numel() >= _HALF_FROM_ELEMENTS}
     state = {k: (v.half() if k in large else v).contiguous() for k, v in module.state_dict().items()}
-    path.write_bytes(safetensors.torch.save(state))
+    path.write_bytes(slim_weights(safetensors.torch.save(state), None if beside is None else beside.read_bytes()))
+
+
+def slim_weights(weights: bytes, network: bytes | None) -> bytes:
+    """Return safetensors without the tensors that an ONNX file holds in half precision (`halved_weights`)."""
+    if network is None:
+        return weights
+    held = halved_weights(network)
+    state = {name: value for name, value in safetensors.torch.load(weights).items() if name not in held}
+    return safetensors.torch.save(state)
 
 
 def _drop_traces(model: onnx.ModelProto) -> None:
@@ -289,8 +300,8 @@ def _store_in_half(model: onnx.ModelProto) -> None:
             # A constant of the graph, not a rounded parameter, stays exact.
             continue
         name = tensor.name
-        tensor.CopyFrom(onnx.numpy_helper.from_array(half, name + ".half"))
-        casts.append(onnx.helper.make_node("Cast", [name + ".half"], [name], to=onnx.TensorProto.FLOAT))
+        tensor.CopyFrom(onnx.numpy_helper.from_array(half, name + HALVED))
+        casts.append(onnx.helper.make_node("Cast", [name + HALVED], [name], to=onnx.TensorProto.FLOAT))
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)

@@ -6,7 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.learn.export.bundle_export import add_view_encoder, export_bundle, reexport_networks
+from lalaloc_core.learn.export.bundle_export import (
+    add_view_encoder,
+    export_bundle,
+    reexport_networks,
+    slim_weights,
+)
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.stages import build_image_encoder
 from lalaloc_core.learn.training.warm_start import (
@@ -19,7 +24,7 @@ from lalaloc_core.learn.training.warm_start import (
     panorama_count,
     training_totals,
 )
-from lalaloc_core.localise.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.bundle import IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.view_encoder import ViewEncoder
 
@@ -91,7 +96,9 @@ def export_views(folder: Path, bundle: Path, out: Path, *, version: str, last: b
     encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
     out.mkdir(parents=True, exist_ok=True)
     for name in origin.manifest.files:
-        (out / name).write_bytes(origin.read(name))
+        content = origin.read(name)
+        # Bundles of earlier versions repeat the network's weights.
+        (out / name).write_bytes(slim_weights(content, origin.read(IMAGE_ONNX)) if name == IMAGE_WEIGHTS else content)
     copied = dataclasses.replace(origin, folder=out, manifest=dataclasses.replace(origin.manifest, version=version))
     return add_view_encoder(copied, checkpoint.config, encoder, _summary(checkpoint, folder, last=last))
 

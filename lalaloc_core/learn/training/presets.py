@@ -8,6 +8,7 @@ from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConf
 from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.trunk import TrunkConfig
+from lalaloc_core.nets.view_encoder import ViewEncoderConfig
 from lalaloc_core.render.sampling import TripletSampling
 
 PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
@@ -25,6 +26,7 @@ _RING_LAYOUT = LayoutStageConfig(
 )
 
 # For tests.
+_TINY_TRUNK = TrunkConfig(stem=8, widths=(8, 8, 8, 8, 8, 8, 8), repeats=(1, 1, 1, 1, 1, 1, 1), frozen_stages=1)
 _TINY = TrainConfig(
     name="tiny",
     ring=RingConfig(
@@ -45,7 +47,17 @@ _TINY = TrainConfig(
     trunk=TrunkEncoderConfig(
         image_height=32,
         image_width=64,
-        trunk=TrunkConfig(stem=8, widths=(8, 8, 8, 8, 8, 8, 8), repeats=(1, 1, 1, 1, 1, 1, 1), frozen_stages=1),
+        trunk=_TINY_TRUNK,
+        squeezed=(8, 8, 8, 8),
+        mixer_width=16,
+        mixer_blocks=1,
+        mixer_heads=2,
+    ),
+    view=ViewEncoderConfig(
+        image_height=64,
+        image_width=64,
+        sectors=4,
+        trunk=_TINY_TRUNK,
         squeezed=(8, 8, 8, 8),
         mixer_width=16,
         mixer_blocks=1,

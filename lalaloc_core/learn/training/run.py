@@ -25,6 +25,7 @@ from lalaloc_core.learn.training.view_validation import ViewValidation
 from lalaloc_core.learn.training.warm_start import (
     check_same_networks,
     find_checkpoint,
+    has_views,
     load_trained_layout_encoder,
     load_warm_start,
 )
@@ -122,7 +123,8 @@ def train_views(
 ) -> Checkpoint:
     """Train the encoder of views in `folder`.
 
-    `init_from` is a bundle or run folder whose image encoder provides the first weights; it excludes `resume`.
+    `init_from` is a bundle or run folder whose encoder of views, else its image encoder, provides the first weights; it
+    excludes `resume`.
 
     Raises:
         ConfigError: a data set is given; views are rendered from generated homes only.
@@ -137,7 +139,9 @@ def train_views(
     begun_from = None
     if init_from is None and not resume and config.image.pretrained:
         load_pretrained(stage.encoder.trunk)
-    if init_from is not None:
+    if init_from is not None and has_views(init_from):
+        begun_from = _warm_start(stage, init_from)
+    elif init_from is not None:
         start = load_warm_start(init_from, "image", config)
         sphere = TrunkImageEncoder(config.trunk, config.ring)
         start.load_into({"image_encoder": sphere})

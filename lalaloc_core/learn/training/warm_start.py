@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import onnx
 import safetensors.torch
+import torch
 from torch import Tensor, nn
 
 from lalaloc_core.configuration import build_config
@@ -14,7 +16,16 @@ from lalaloc_core.errors import BundleError, CheckpointError
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.stages import build_layout_encoder
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, MANIFEST_NAME, Bundle
+from lalaloc_core.localise.bundle import (
+    DECODER_WEIGHTS,
+    IMAGE_ONNX,
+    IMAGE_WEIGHTS,
+    LAYOUT_WEIGHTS,
+    MANIFEST_NAME,
+    VIEW_ONNX,
+    VIEW_WEIGHTS,
+    Bundle,
+)
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 
@@ -22,7 +33,12 @@ JOINT = "end-to-end"
 _MODULES = {
     "layout": {"layout_encoder": LAYOUT_WEIGHTS, "decoder": DECODER_WEIGHTS},
     "image": {"image_encoder": IMAGE_WEIGHTS},
+    "view": {"view_encoder": VIEW_WEIGHTS},
 }
+# ONNX files that hold the large weights of a network; bundles of earlier versions repeat them in the weights' file.
+_NETWORKS = {IMAGE_WEIGHTS: IMAGE_ONNX, VIEW_WEIGHTS: VIEW_ONNX}
+# Suffix of large weights in ONNX files, and prefix of the network in the exported module.
+HALVED, _EXPORTED = ".half", "encoder."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +66,15 @@ class WarmStart:
                     raise CheckpointError(f"cannot load the {name} of {self.origin}: {error}") from error
 
 
+def has_views(folder: Path) -> bool:
+    """Return whether a bundle or a run's folder has an encoder of views."""
+    if (folder / MANIFEST_NAME).exists():
+        return Bundle.open(folder).manifest.view is not None
+    return (folder / "view.pt").exists()
+
+
 def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
-    """Load the weights of stage "layout" or "image" from a bundle or a run's folder (its best checkpoint, if any).
+    """Load the weights of a stage from a bundle or a run's folder (its best checkpoint, if any).
 
     Raises:
         CheckpointError: the folder has no such weights, or weights of other networks than `config` has.
@@ -69,7 +92,7 @@ def bundle_weights(bundle: Bundle, stage: str) -> WarmStart:
     Only networks and totals are read from the manifest, because manifests of older versions lack some settings.
     """
     manifest = bundle.manifest
-    weights = {module: _state(bundle.read(file)) for module, file in _MODULES[stage].items() if file in manifest.files}
+    weights = {module: _state(bundle, file) for module, file in _MODULES[stage].items() if file in manifest.files}
     if not weights:
         raise CheckpointError(f"bundle '{bundle.folder}' has no weights of stage '{stage}'")
     config = TrainConfig.from_dict({"name": manifest.name, "architecture": manifest.architecture})
@@ -116,10 +139,22 @@ def _manifest_totals(spent: dict[str, Any]) -> dict[str, float]:
     return totals
 
 
-def _state(weights: bytes) -> dict[str, Tensor]:
-    """Read weights; bundles store half precision, training needs single precision."""
+def halved_weights(network: bytes) -> dict[str, Tensor]:
+    """Return the weights that an exported network holds in half precision, by their names in torch."""
+    return {
+        tensor.name.removeprefix(_EXPORTED).removesuffix(HALVED): torch.from_numpy(
+            onnx.numpy_helper.to_array(tensor).copy()
+        )
+        for tensor in onnx.load_from_string(network).graph.initializer
+        if tensor.name.endswith(HALVED)
+    }
+
+
+def _state(bundle: Bundle, file: str) -> dict[str, Tensor]:
+    """Read the weights of a network; bundles store half precision, training needs single precision."""
+    state = halved_weights(bundle.read(_NETWORKS[file])) if file in _NETWORKS else {}
     try:
-        state = safetensors.torch.load(weights)
+        state |= safetensors.torch.load(bundle.read(file))
     except safetensors.SafetensorError as error:
         raise BundleError(f"weights are not valid safetensors: {error}") from error
     return {key: value.float() if value.is_floating_point() else value for key, value in state.items()}
