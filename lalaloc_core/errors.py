@@ -102,6 +102,10 @@ class InvalidMotionError(InvalidInputError):
     """A motion between two photographs is outside its limits or incomplete."""
 
 
+class InvalidStateError(LaLaLocError):
+    """The state of a tracked camera is damaged, of another version, or of another grid."""
+
+
 class DatasetError(InvalidInputError):
     """A file of a data set is missing, damaged or invalid.
 

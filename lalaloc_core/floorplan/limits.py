@@ -30,7 +30,7 @@ class PlanLimits:
     max_extent_m: float = 1000.0
     max_area_m2: float = 200_000.0
     # Sum of the bounding boxes of the rooms, which the pose grid is computed over.
-    max_bounds_area_m2: float = 2_000_000.0
+    max_bounds_area_m2: float = 500_000.0
     # Up to here a double resolves nanometres; a hundred times farther out areas and distances begin to lose metres.
     max_coordinate_m: float = 1e7
     max_depth: int = 8

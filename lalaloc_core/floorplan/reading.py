@@ -87,7 +87,9 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     height_m = read_ceiling(ceiling, name, limits)
     if (vertices := _count_vertices(raw)) > limits.max_vertices_per_room:
         raise InvalidFloorPlanError(
-            f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (LALALOC_MAX_VERTICES)", room=name
+            f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (LALALOC_MAX_VERTICES); simplify its "
+            "outline",
+            room=name,
         )
     outline_m = _read_ring(raw.get("polygon"), "polygon", name, limits)
     holes_m = _read_holes(raw.get("holes"), outline_m, name, limits)

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES, WALL_CODE
 from lalaloc_core.localise.layouts import Layouts
 
-# Azimuths that are compared.
-_AZIMUTHS = 16
+# Azimuths that are compared: with spheres, and with views, which show a part of them.
+SPHERE_AZIMUTHS, VIEW_AZIMUTHS = 16, 64
 # Width of the bins of log distance: 5 cm at a distance of 1 m.
 _BIN = 0.05
 # Distances (m) are clipped to this range.
@@ -37,10 +37,10 @@ class BinnedLayouts:
     bins: Float[np.ndarray, "b"]
 
     @classmethod
-    def of(cls, layouts: Layouts) -> BinnedLayouts:
-        """Bin layouts."""
+    def of(cls, layouts: Layouts, azimuths: int = SPHERE_AZIMUTHS) -> BinnedLayouts:
+        """Bin layouts at a number of azimuths."""
         width = layouts.log_profile.shape[1]
-        count = min(_AZIMUTHS, width)
+        count = min(azimuths, width)
         columns = np.arange(count) * width // count
         log_m = layouts.log_profile[:, columns].astype(np.float32)
         log_m = np.clip(log_m, math.log(_MIN_DISTANCE_M), math.log(_MAX_DISTANCE_M))

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.configuration import build_config
+from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.files import atomic_write
+from lalaloc_core.localise.prediction_errors import PredictionErrors
 
 MANIFEST_NAME = "manifest.json"
 # The model card, which can be corrected without changing the model's digest.
@@ -95,12 +97,32 @@ class MatchingWeights:
     Attributes:
         openings, ceiling, room_type: weights in units of the walls'.
         temperature: T, the number of independent azimuths: likelihoods are `exp(-T cost)`.
+        appearance: for every opening class of a plan (rows, in the order of `conventions.OPENING_CLASSES`) the
+            probabilities of what it looks like (columns); None if every class looks like itself.
+        usual_cost: cost of the best place at a right heading, below which a given heading is not doubted.
+        usual_gain: share of that cost by which a search over all headings lowers it beside a right heading; only a
+            larger gain overrules a given heading.
     """
 
     openings: float = 0.7
     ceiling: float = 0.05
     room_type: float = 0.05
     temperature: float = 16.0
+    appearance: tuple[tuple[float, ...], ...] | None = None
+    usual_cost: float = 0.0
+    usual_gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the shape and the sums of `appearance`."""
+        if self.appearance is None:
+            return
+        classes = len(OPENING_CLASSES)
+        is_square = len(self.appearance) == classes and all(len(row) == classes for row in self.appearance)
+        if not is_square or any(min(row) < 0.0 or abs(sum(row) - 1.0) > 1e-3 for row in self.appearance):
+            raise ConfigError(
+                f"evidence.appearance must have {classes} rows of {classes} probabilities that sum to 1, "
+                f"not {self.appearance}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +165,8 @@ class ViewManifest:
         image_height, image_width: pixels of a patch.
         sectors: sectors of the ring that a patch covers.
         top_deg: elevation of a patch's upper border.
-        opening_prior, room_type_prior: as those of the manifest.
+        opening_prior, room_type_prior, evidence, confidence, errors: as those of the manifest, for views; without
+            fitted weights or confidence, those of spheres apply.
     """
 
     config: dict[str, Any]
@@ -153,6 +176,9 @@ class ViewManifest:
     top_deg: float
     opening_prior: list[float]
     room_type_prior: list[float]
+    evidence: MatchingWeights | None = None
+    confidence: ConfidenceModel | None = None
+    errors: PredictionErrors | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +199,7 @@ class Manifest:
         view: encoder of views; None if the bundle has none.
         confidence: models of the confidence; None leaves answers without one.
         evidence: weights of the matching cost.
+        errors: measured errors of the predictions; None if they were not measured.
         training: commands, seeds, hardware and counts of the training.
         metrics: validation figures with their n.
     """
@@ -196,10 +223,21 @@ class Manifest:
     view: ViewManifest | None = None
     confidence: ConfidenceModel | None = None
     evidence: MatchingWeights = field(default_factory=MatchingWeights)
+    errors: PredictionErrors | None = None
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     files: dict[str, FileEntry] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
+
+    def evidence_for(self, *, view: bool) -> MatchingWeights:
+        """Return the weights of the matching cost for spheres or for views."""
+        own = None if self.view is None or not view else self.view.evidence
+        return self.evidence if own is None else own
+
+    def confidence_for(self, *, view: bool) -> ConfidenceModel | None:
+        """Return the models of the confidence for spheres or for views."""
+        own = None if self.view is None or not view else self.view.confidence
+        return self.confidence if own is None else own
 
     def to_json(self) -> str:
         """Return the manifest as indented JSON."""

@@ -27,7 +27,8 @@ from lalaloc_core.localise.matching_cost import MatchingCost
 
 # Poses compared at a time, so that the sums stay in the processor's cache.
 _CHUNK = 512
-# The same by rising bounds: few at first, as these limit the number of poses; and for the bounds themselves.
+# The same by rising bounds, in plans of more than the last number of poses: few at first, as these limit the number of
+# poses; and for the bounds themselves.
 _FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
 # Neighbouring hypotheses that share a bound.
 _NEIGHBOURS = 2
@@ -102,7 +103,9 @@ def likeliest(
     """
     table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
     shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
-    bound = _bounds(binned, table.reshape(len(table), *shape[1:])) + room_costs.min(axis=0)[room_index]
+    bound = room_costs.min(axis=0)[room_index]
+    if len(binned) > _LAST_CHUNK:
+        bound = bound + _bounds(binned, table.reshape(len(table), *shape[1:]))
     bound = bound if hint_cost is None else bound + hint_cost
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers sort fastest.
@@ -172,7 +175,7 @@ def _table(binned: BinnedLayouts, matching_cost: MatchingCost) -> Float[np.ndarr
     offsets = matching_cost.offsets.astype(np.float32)
     shape = (len(offsets), matching_cost.hypotheses)
     # Hypotheses are one prediction, turned, so there are few different ones at an azimuth.
-    different, which = np.unique(modes.reshape(-1, modes.shape[2]), axis=0, return_inverse=True)
+    different, which = _different(modes.reshape(-1, modes.shape[2]))
     apart = binned.bins[:, None, None] - offsets[:, None]
     likelihood = sum(
         odds / (1.0 + np.square((apart - centre) * precision))
@@ -189,3 +192,11 @@ def _table(binned: BinnedLayouts, matching_cost: MatchingCost) -> Float[np.ndarr
         walls += loss[:, WALL_CODE, None]
         openings[:] = loss[:, 1:] - loss[:, :1]
     return table.reshape(len(table), -1)
+
+
+def _different(rows: Float[np.ndarray, "n v"]) -> tuple[Float[np.ndarray, "d v"], Int[np.ndarray, "n"]]:
+    """Return the different rows, and which of them each row is; as `np.unique`, which compares column by column."""
+    rows = np.ascontiguousarray(rows)
+    whole = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return rows[first], which

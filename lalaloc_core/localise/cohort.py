@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.binned_layouts import BinnedLayouts
+from lalaloc_core.localise.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.bundle import COHORT, Bundle, MatchingWeights
 from lalaloc_core.localise.coarse_pass import coarse_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
@@ -54,8 +54,13 @@ class Cohort:
 
     @cached_property
     def binned(self) -> BinnedLayouts:
-        """Layouts as the coarse pass compares them."""
-        return BinnedLayouts.of(self.layouts)
+        """Layouts as the coarse pass compares them with spheres."""
+        return BinnedLayouts.of(self.layouts, SPHERE_AZIMUTHS)
+
+    @cached_property
+    def binned_for_views(self) -> BinnedLayouts:
+        """Layouts as the coarse pass compares them with views."""
+        return BinnedLayouts.of(self.layouts, VIEW_AZIMUTHS)
 
     def to_bytes(self) -> bytes:
         """Return the content of the bundle's file."""
@@ -116,7 +121,8 @@ def cost_by_chance(
     # A fit by chance does not depend on what is specific to one room.
     general = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
     matching_cost = MatchingCost(plan, query, reach_m, weights, general)
-    coarse = coarse_costs(cohort.binned, matching_cost, cohort.layouts.room_index)
+    binned = cohort.binned_for_views if query.is_view else cohort.binned
+    coarse = coarse_costs(binned, matching_cost, cohort.layouts.room_index)
     hypothesis = coarse.argmin(axis=1)
     pose = np.argsort(coarse[np.arange(len(coarse)), hypothesis], kind="stable")[:_COMPARED]
     by_chance, _ = matching_cost.pairs(cohort.layouts, pose, hypothesis[pose])

@@ -30,7 +30,7 @@ class Signals:
 
     Attributes:
         log_odds: of the camera being within 1 m of the answer, by the posterior.
-        uncertainty: mean log of the scales that the image encoder predicts; 0 if it predicts none.
+        uncertainty: mean log of the scales that the image encoder predicts; 0 if it predicts none, or saw no wall.
         latent_distance: of the answer. Pictures without a room fit anywhere, as their predictions are uncertain, but
             their latents are far from every layout's.
         cost_to_chance: log of the cost of the plan's best grid pose over the cost of a fit by chance.
@@ -61,6 +61,11 @@ class Confidence:
     heading: float
     candidates: tuple[float, ...]
 
+    @property
+    def elsewhere(self) -> float:
+        """Probability that the photograph is of none of the places of the plans that were searched."""
+        return max(1.0 - self.fit, 0.0)
+
 
 def signals_of(
     query: Query, answer: Candidate, posterior: Posterior, grid_cost: float, by_chance: float | None
@@ -75,11 +80,18 @@ def signals_of(
     return Signals(
         log_odds=max(-_MAX_LOG_ODDS, min(_MAX_LOG_ODDS, log_odds)),
         cost=answer.cost,
-        uncertainty=0.0 if query.profile is None else float(query.profile.log_scale[query.profile.seen].mean()),
+        uncertainty=_uncertainty(query),
         latent_distance=answer.latent_distance,
         cost_to_chance=log_cost_to_chance(grid_cost, by_chance),
         answer_to_chance=log_cost_to_chance(answer.cost, by_chance),
     )
+
+
+def _uncertainty(query: Query) -> float:
+    """Return the mean log of the predicted scales of the walls that are seen."""
+    if query.profile is None or not query.profile.seen.any():
+        return 0.0
+    return float(query.profile.log_scale[query.profile.seen].mean())
 
 
 def confidence_of(

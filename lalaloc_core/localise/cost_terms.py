@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,6 +59,12 @@ def precisions(
     return 1.0 / (tail * np.hypot(scale, reach_m * np.exp(-log_m)))
 
 
+def median_distance_m(centre: Float[np.ndarray, "w"], precision: Float[np.ndarray, "w"]) -> float:
+    """Return the median distance (m) of the walls that are seen, by log distances; infinite if none is."""
+    seen = centre[precision > 0]
+    return float(np.exp(np.median(seen))) if len(seen) else np.inf
+
+
 def ceiling_costs(
     predicted: PredictedCeiling,
     clearance_m: Float[np.ndarray, "*#n"],
@@ -78,27 +84,23 @@ def room_type_losses(predicted: PredictedRoomType, floor: float) -> Float[np.nda
     return np.maximum(loss, 0.0)
 
 
-def merged_into_walls(share: Float[np.ndarray, "*n c"], claimed: Collection[int]) -> Float[np.ndarray, "*n c"]:
-    """Return shares of opening classes with those of classes outside `claimed` added to the walls'."""
-    merged = share.copy()
-    for code in range(len(OPENING_CLASSES)):
-        if code != WALL_CODE and code not in claimed:
-            merged[..., WALL_CODE] += share[..., code]
-    return merged
-
-
 def class_losses(
-    probability: Float[np.ndarray, "*n c"], prior: Float[np.ndarray, "c"], claimed: Collection[int], floor: float
+    probability: Float[np.ndarray, "*n c"],
+    prior: Float[np.ndarray, "c"],
+    claimed: Collection[int],
+    floor: float,
+    appearance: Sequence[Sequence[float]] | None = None,
 ) -> Float[np.ndarray, "*n c"]:
-    """Return `-log q` of every opening class; classes outside `claimed` cost what walls do.
+    """Return `-log q` of every opening class that a plan can show (`matching_cost.py` has the equation).
 
-    `probability` and `prior` are merged (`merged_into_walls`); `claimed` are the codes of the classes that the plan
-    shows completely; `floor` is ε.
+    `probability` and `prior` are those of the classes seen; `claimed` are the codes of the classes that the plan shows
+    completely. All others are drawn as wall, each as often as it occurs. `floor` is ε, and `appearance` is a.
     """
-    loss = -np.log(floor + (1.0 - floor) * probability / prior)
-    unclaimed = [code for code in range(len(OPENING_CLASSES)) if code not in claimed]
-    loss[..., unclaimed] = loss[..., [WALL_CODE]]
-    return loss
+    classes = len(OPENING_CLASSES)
+    drawn_as_wall = np.array([code == WALL_CODE or code not in claimed for code in range(classes)])
+    kind = np.where(drawn_as_wall[:, None], prior * drawn_as_wall / prior[drawn_as_wall].sum(), np.eye(classes))
+    seen = kind if appearance is None else kind @ np.asarray(appearance)
+    return -np.log(floor + (1.0 - floor) * (probability / prior) @ seen.T)
 
 
 def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:

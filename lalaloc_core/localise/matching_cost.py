@@ -14,9 +14,11 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   wall behind and o for the odds that the prediction is of that wall. Likewise for a model that predicts a second mode,
   with r' for that mode and o for its odds. Azimuths that the photograph does not show have an infinite b and cost
   nothing.
-* **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, with `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the predicted
-  probability p of the class c_w that the plan shows, over the frequency π of that class. Kinds that the plan does not
-  claim to show completely count as wall.
+* **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))` for the class c_w that the plan shows, with
+  `q_w(c) = ε + (1 - ε) sum_s a(s | c) p_w(s) / π(s)`: the predicted probability p of seeing the class s, over its
+  frequency π. a is the probability that a class of the plan looks like another (`MatchingWeights.appearance`): an open
+  door looks like a passage, a patio door like a window. Kinds that the plan does not claim to show completely count as
+  wall.
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
 * **Room type.** As openings, once per room.
 
@@ -40,7 +42,7 @@ from lalaloc_core.localise.cost_terms import (
     ceiling_costs,
     class_losses,
     mean_log,
-    merged_into_walls,
+    median_distance_m,
     room_type_losses,
     smoothed,
 )
@@ -219,6 +221,11 @@ class MatchingCost:
         return len(self._first.centre)
 
     @property
+    def is_view(self) -> bool:
+        """True if the encoder of views read the photograph."""
+        return self._query.is_view
+
+    @property
     def offsets(self) -> Float[np.ndarray, "j"]:
         """The δ that are tried."""
         return self._query.camera_height.offsets
@@ -322,11 +329,10 @@ class MatchingCost:
         claimed = [OPENING_CLASSES.index(kind) for kind in sorted(self._plan.opening_kinds)]
         if predicted is None or not claimed or not self._config.use_openings:
             return None
-        probability = merged_into_walls(np.exp(predicted.log_probability), claimed)
         # Openings appear displaced by up to the reach, seen at the median distance.
-        probability = smoothed(probability, float(self._reach_m / np.exp(np.median(self._first.centre[0]))))
-        prior = merged_into_walls(predicted.prior, claimed)
-        loss = class_losses(probability, prior, claimed, self._config.floor)
+        median_m = median_distance_m(self._first.centre[0], self._first.precision[0])
+        probability = smoothed(np.exp(predicted.log_probability), self._reach_m / median_m)
+        loss = class_losses(probability, predicted.prior, claimed, self._config.floor, self._weights.appearance)
         loss -= loss.min(axis=-1, keepdims=True)
         return np.ascontiguousarray(loss[:, :: self._stride], np.float32)
 

@@ -259,8 +259,9 @@ class _Search:
     ) -> None:
         """Retrieve the modes."""
         self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
+        self._weights = encoders.manifest.evidence_for(view=query.is_view)
         self._clock, self._hints, self._top_k = clock, hints, top_k
-        weights, matching = encoders.manifest.evidence, config.matching
+        weights, matching = self._weights, config.matching
         with clock.stage("retrieve"):
             self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
@@ -322,9 +323,9 @@ class _Search:
 
     def lpo_job(self, candidates: list[Candidate]) -> RefinementJob:
         """Return the refinement job of the first candidates."""
-        weights, matching = self._encoders.manifest.evidence, self._config.matching
+        matching = self._config.matching
         starts = candidates[: self._lpo_count]
-        return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, weights, matching)
+        return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, self._weights, matching)
 
     def after_lpo(self, candidates: list[Candidate], result: RefinementResult) -> list[Candidate]:
         """Return the candidates of `lpo_job` after LPO: the refined ones, best first, then the others."""
@@ -352,7 +353,7 @@ class _Search:
             self._record(self._stage, answers[0], found)
         missed = hints.missed(answers[0].position_m, answers[0].room_index)
         if hints.strict:
-            missed = missed_hints(self._plan, self._costs, self._encoders.manifest.evidence, hints)
+            missed = missed_hints(self._plan, self._costs, self._weights, hints)
         return Localisation(
             query=self.query,
             candidates=answers,
@@ -374,7 +375,7 @@ class _Search:
             starts=self._lpo_modes,
             ends=self._lpo_candidates,
             candidates=candidates,
-            temperature=self._encoders.manifest.evidence.temperature,
+            temperature=self._weights.temperature,
             separation_m=self._config.separation_m,
         )
 

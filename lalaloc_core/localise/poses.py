@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.binned_layouts import BinnedLayouts
+from lalaloc_core.localise.binned_layouts import SPHERE_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.render.sampling import PoseSet
@@ -32,7 +32,7 @@ class PoseGrid:
     step_m: float
     camera_height_m: float
     _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
-    _binned: list[BinnedLayouts] = field(default_factory=list, init=False, repr=False)
+    _binned: dict[int, BinnedLayouts] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def with_layouts(
@@ -64,11 +64,11 @@ class PoseGrid:
             self._layouts.append(self._rendered(plan))
         return self._layouts[0]
 
-    def binned(self, plan: FloorPlan) -> BinnedLayouts:
+    def binned(self, plan: FloorPlan, azimuths: int = SPHERE_AZIMUTHS) -> BinnedLayouts:
         """Return the layouts as the coarse pass compares them; made at first use."""
-        if not self._binned:
-            self._binned.append(BinnedLayouts.of(self.layouts(plan)))
-        return self._binned[0]
+        if azimuths not in self._binned:
+            self._binned[azimuths] = BinnedLayouts.of(self.layouts(plan), azimuths)
+        return self._binned[azimuths]
 
     @property
     def known_latents(self) -> Float[np.ndarray, "n d"]:
@@ -90,7 +90,7 @@ class PoseGrid:
         """Bytes of the arrays, with those made at first use."""
         arrays = [self.poses.position_m, self.poses.room_index, self.profile_m]
         arrays += [] if self.latents is None else [self.latents]
-        return sum(part.nbytes for part in (*arrays, *self._layouts, *self._binned))
+        return sum(part.nbytes for part in (*arrays, *self._layouts, *self._binned.values()))
 
     def _rendered(self, plan: FloorPlan) -> Layouts:
         precision = self.profile_m.dtype if self.latents is None else np.float32
@@ -203,6 +203,7 @@ class Query:
         profile: predicted wall profile; None if the image encoder predicts none.
         openings, ceiling, room_type: other predictions; None if the image encoder does not make them.
         searched: the same panorama with an unknown heading, to doubt a given one; None if the heading is unknown.
+        is_view: whether the encoder of views read it, which has matching weights and confidence of its own.
     """
 
     latents: Float[np.ndarray, "k d"]
@@ -215,6 +216,7 @@ class Query:
     ceiling: PredictedCeiling | None = None
     room_type: PredictedRoomType | None = None
     searched: Query | None = None
+    is_view: bool = False
 
     def scaled(self, offset: float) -> Query:
         """Return the query if the camera stood higher by the factor `exp(offset)`."""

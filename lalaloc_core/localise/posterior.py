@@ -188,8 +188,7 @@ def _modes(
     """Return the first candidate near each pair and at about its heading; -1 for none."""
     mode = np.full(len(position), -1)
     for index, start in reversed(list(enumerate(starts))):
-        near = np.linalg.norm(position - start.position_m, axis=1) < separation_m
-        mode[near & _turned_alike(heading, query, start)] = index
+        mode[_near(position, heading, query, start, separation_m)] = index
     return mode
 
 
@@ -201,10 +200,10 @@ def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int
     left = np.ones(len(ends), bool)
     for index in ranking(np.array([end.total_cost for end in ends]), position, heading):
         if left[index]:
-            same = left & (np.linalg.norm(position - position[index], axis=1) < separation_m)
-            same &= _turned_alike(heading, query, ends[index])
+            same = _near(position, heading, query, ends[index], separation_m)
+            same = same[left[same]]
             head[same] = index
-            left &= ~same
+            left[same] = False
     return head
 
 
@@ -257,9 +256,24 @@ def _ties_at_their_ends(
     return position, heading
 
 
-def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Candidate) -> Bool[np.ndarray, "m"]:
-    turned = wrap_angle(heading - query.roll[candidate.hypothesis] - candidate.frame_heading)
-    return np.abs(turned) <= HEADING_SEPARATION
+def _near(
+    position: Float[np.ndarray, "m 2"],
+    heading: Float[np.ndarray, "m"],
+    query: Query,
+    candidate: Candidate,
+    distance_m: float,
+) -> Int[np.ndarray, "n"]:
+    """Return the numbers of the places near a candidate and at about its heading."""
+    near = np.flatnonzero(_within(position, candidate.position_m, distance_m))
+    turned = wrap_angle(heading[near] - query.roll[candidate.hypothesis] - candidate.frame_heading)
+    return near[np.abs(turned) <= HEADING_SEPARATION]
+
+
+def _within(
+    position: Float[np.ndarray, "m 2"], centre: Float[np.ndarray, "2"], distance_m: float
+) -> Bool[np.ndarray, "m"]:
+    x_m, y_m = position[:, 0] - centre[0], position[:, 1] - centre[1]
+    return x_m * x_m + y_m * y_m < distance_m * distance_m
 
 
 def posterior_from_weights(
@@ -280,7 +294,7 @@ def posterior_from_weights(
     `counted` (default: `position` and `heading`).
     """
     counted_position, counted_heading = (position, heading) if counted is None else counted
-    near = np.linalg.norm(counted_position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
+    near = _within(counted_position, candidates[0].position_m, RIGHT_WITHIN_M)
     return Posterior(
         pose=np.bincount(pose, weight, minlength=poses),
         position=min(float(weight[near].sum()), 1.0),
@@ -299,8 +313,7 @@ def _shares(
 ) -> tuple[float, ...]:
     left, shares = weight.copy(), []
     for candidate in candidates:
-        near = np.linalg.norm(position - candidate.position_m, axis=1) < RIGHT_WITHIN_M
-        near &= _turned_alike(heading, query, candidate)
+        near = _near(position, heading, query, candidate, RIGHT_WITHIN_M)
         shares.append(float(left[near].sum()))
         left[near] = 0.0
     return tuple(shares)

@@ -84,7 +84,7 @@ def refined_candidates(
 
     A candidate that left the region of strict hints stays at its start.
     """
-    weights = encoders.manifest.evidence
+    weights = encoders.manifest.evidence_for(view=query.is_view)
     rooms = np.array([start.room_index for start in starts])
     excluded = ~np.isfinite(hints.penalty(plan, result.position_m, rooms))
     result = _put_back(starts, result, excluded)

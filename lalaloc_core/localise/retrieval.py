@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.coarse_pass import PairLimits, likeliest
@@ -131,7 +132,8 @@ def _choose(
     if pairs <= _ALL_COMPARED:
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
     window = _MARGIN + NEGLIGIBLE / temperature
-    binned, room_index = grid.binned(plan), grid.poses.room_index
+    azimuths = VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS
+    binned, room_index = grid.binned(plan, azimuths), grid.poses.room_index
     limits = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
     total, pair = likeliest(binned, matching_cost, room_index, limits, hint_cost)
     probable = int(np.searchsorted(total, total[0] + window))
@@ -224,7 +226,9 @@ def contradicted(
 ) -> bool:
     """Return whether the picture fits another heading so much better that the given one must be wrong.
 
-    A given heading is wrong with the probability `heading_doubt`; then every heading that is searched is as likely.
+    A given heading is wrong with the probability `heading_doubt`; then every heading that is searched is as likely. It
+    is kept where its best place fits as well as right headings do, and where the search fits better by no more than
+    beside right headings (`MatchingWeights.usual_cost`, `usual_gain`).
     """
     searched = query.searched
     if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
@@ -232,12 +236,13 @@ def contradicted(
     doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
     given = grid_costs(plan, grid, query, weights, config)
     best = int(given.cost[: given.compared].argmin())
-    if given.cost[best] <= doubt:
-        # Costs are non-negative, so no heading is better by more.
+    # Costs are non-negative, so no heading is better by more than the given one's cost.
+    if given.cost[best] <= max(doubt, weights.usual_cost):
         return False
     # One camera height, the best at the given heading, is accurate enough to compare headings.
     offset = float(given.offset[best])
     height_m = query.camera_height.height_m * float(np.exp(offset))
     exact = replace(searched.scaled(offset), camera_height=CameraHeight(height_m, 0.0))
     any_heading = grid_costs(plan, grid, exact, weights, config)
-    return bool(given.cost[best] - any_heading.cost[: any_heading.compared].min() > doubt)
+    gain = given.cost[best] - any_heading.cost[: any_heading.compared].min()
+    return bool(gain > max(doubt, weights.usual_gain * given.cost[best]))

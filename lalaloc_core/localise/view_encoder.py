@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
@@ -24,9 +25,27 @@ from lalaloc_core.localise.poses import (
     rolled,
 )
 
+# Standard deviation (radians) of errors of levelling that the network was trained with.
+_TRAINED_TILT_SD = math.radians(0.7)
+# Patches that the network reads at once, to bound memory: a query can have a hundred.
+_BATCH = 4
 # Smallest share of an azimuth column that must be seen to count.
 MIN_SEEN = 0.25
 _OUTPUTS = [*PROFILE_OUTPUTS, "log_share", "seen", *STRUCTURE_OUTPUTS]
+
+
+class LevelPatch(NamedTuple):
+    """Part of a photograph that was levelled, as the encoder of views expects it.
+
+    Attributes:
+        image: of the size that the manifest's `view` states, RGB and opacity.
+        azimuth: of its centre column relative to the photograph's, radians.
+        tilt_sd: standard deviation of the error of levelling along the centre column, radians.
+    """
+
+    image: UInt8[np.ndarray, "h w 4"]
+    azimuth: float
+    tilt_sd: float = 0.0
 
 
 class OnnxViewEncoder:
@@ -46,7 +65,7 @@ class OnnxViewEncoder:
 
     def query(
         self,
-        patches: Sequence[tuple[UInt8[np.ndarray, "h w 4"], float]],
+        patches: Sequence[LevelPatch],
         heading: float | None,
         camera_height: CameraHeight,
         *,
@@ -55,9 +74,7 @@ class OnnxViewEncoder:
         """Return the query of a photograph that shows a part of the horizon.
 
         Args:
-            patches: level patches of the size that the manifest's `view` states, RGB and opacity, each with the azimuth
-                (radians) of its centre column relative to the photograph's; where they overlap, the nearer centre
-                counts.
+            patches: parts of the photograph; where they overlap, the nearer centre counts.
             heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
             camera_height: gives the picture its metric scale.
             heading_tolerance: as in `Encoders.query`.
@@ -75,17 +92,12 @@ class OnnxViewEncoder:
         known = heading is not None and heading_tolerance == 0.0
         return replace(query, frame_heading=frame_heading, heading_known=known, searched=searched)
 
-    def _outputs(
-        self, patches: Sequence[tuple[UInt8[np.ndarray, "h w 4"], float]], camera_height_m: float
-    ) -> dict[str, np.ndarray]:
+    def _outputs(self, patches: Sequence[LevelPatch], camera_height_m: float) -> dict[str, np.ndarray]:
         """Run the encoder of views; return its predictions by azimuth column of the full circle."""
         columns, prior = self._manifest.profile_columns, np.array(self._view.opening_prior)
-        inputs = {
-            "image": np.stack([image for image, _ in patches]),
-            "camera_height_m": np.full(len(patches), camera_height_m, np.float32),
-        }
-        values = [array(value) for value in self._session.run(_OUTPUTS, inputs)]
-        predicted = dict(zip(_OUTPUTS, values, strict=True))
+        predicted = self._predicted(patches, camera_height_m)
+        tilt_sd = np.array([patch.tilt_sd for patch in patches])[:, None, None]
+        predicted["log_scale"] = _widened(predicted["log_profile"], predicted["log_scale"], tilt_sd, camera_height_m)
         modes = predicted["log_profile"].shape[2]
         circle = {
             "log_profile": np.zeros((columns, modes), np.float32),
@@ -96,8 +108,8 @@ class OnnxViewEncoder:
         width = predicted["seen"].shape[1]
         offset = np.arange(width) - width // 2
         distance = np.full(columns, np.inf)
-        for row, (_, azimuth) in enumerate(patches):
-            place = (columns // 2 + round(azimuth / TWO_PI * columns) + offset) % columns
+        for row, patch in enumerate(patches):
+            place = (columns // 2 + round(patch.azimuth / TWO_PI * columns) + offset) % columns
             nearer = (predicted["seen"][row] >= MIN_SEEN) & (np.abs(offset + 0.5) < distance[place])
             distance[place[nearer]] = np.abs(offset + 0.5)[nearer]
             for name, values in circle.items():
@@ -105,6 +117,18 @@ class OnnxViewEncoder:
         for name in STRUCTURE_OUTPUTS[1:]:
             circle[name] = predicted[name].mean(axis=0)
         return circle
+
+    def _predicted(self, patches: Sequence[LevelPatch], camera_height_m: float) -> dict[str, np.ndarray]:
+        """Return the network's outputs by patch."""
+        parts: list[list[np.ndarray]] = []
+        for first in range(0, len(patches), _BATCH):
+            batch = patches[first : first + _BATCH]
+            inputs = {
+                "image": np.stack([patch.image for patch in batch]),
+                "camera_height_m": np.full(len(batch), camera_height_m, np.float32),
+            }
+            parts.append([array(value) for value in self._session.run(_OUTPUTS, inputs)])
+        return {name: np.concatenate(values) for name, values in zip(_OUTPUTS, zip(*parts, strict=True), strict=True)}
 
     def _hypotheses(
         self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight
@@ -131,4 +155,22 @@ class OnnxViewEncoder:
             openings=PredictedOpenings(openings, np.array(self._view.opening_prior)),
             ceiling=PredictedCeiling(float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])),
             room_type=PredictedRoomType(log_softmax(outputs["room_type_logits"]), np.array(self._view.room_type_prior)),
+            is_view=True,
         )
+
+
+def _widened(
+    log_m: Float[np.ndarray, "*n"],
+    log_scale: Float[np.ndarray, "*n"],
+    tilt_sd: Float[np.ndarray, "*#n"],
+    camera_height_m: float,
+) -> Float[np.ndarray, "*n"]:
+    """Return the log scales of walls whose floor edges are seen at an uncertain elevation.
+
+    An edge at the elevation -e is at the distance h / tan e, so an error of e changes the log distance by 1 / (sin e
+    cos e) times as much. The variance of a Laplace distribution is twice its squared scale.
+    """
+    slope = camera_height_m * np.exp(-log_m)
+    untrained = np.sqrt(np.maximum(np.square(tilt_sd) - _TRAINED_TILT_SD**2, 0.0))
+    error = untrained * (1.0 + np.square(slope)) / slope
+    return np.log(np.hypot(np.exp(log_scale), error / math.sqrt(2.0)))

@@ -59,6 +59,7 @@ def resample(
     If the heading is searched, the samples also cover the sector of headings of the candidate's hypothesis.
     """
     matching = matching or MatchingConfig()
+    weights = encoders.manifest.evidence_for(view=query.is_view)
     disc, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
     # The candidate comes first, so that it is kept if others cost the same.
     poses = PoseSet(
@@ -79,12 +80,12 @@ def resample(
     cost = np.zeros(len(poses)) if latents is None else latent_distances(latents, target)[0]
     if by_walls:
         layouts = layouts_at(plan, poses, heading, encoders.manifest.profile_columns)
-        matching_cost = MatchingCost(plan, query, matching.fine_reach_m, encoders.manifest.evidence, matching)
+        matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
         layout_cost, offsets = matching_cost.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = layout_cost[0] + matching.latent_weight * cost, offsets[0]
     hint_cost = np.zeros(len(poses))
     if not hints.are_none:
-        hint_cost = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
+        hint_cost = hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
     index = int((cost + hint_cost).argmin())
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:

@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lalaloc_core.localise.poses import RefinementJob
-from lalaloc_core.render.gradient import ProfileJacobian, log_distance_gradient, log_profile_gradient
+from lalaloc_core.render.gradient import ProfileJacobian, free_travel_m, log_profile_gradient
 
 # Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
 Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -222,9 +222,7 @@ class Problem:
     ) -> Float[Tensor, "k p"]:
         """Return the steps, shortened so that poses keep the margin to walls and all limits of the settings."""
         length = torch.linalg.vector_norm(step[:, :2], dim=1)
-        azimuth = torch.atan2(step[:, 0], step[:, 1])
-        free = log_distance_gradient(pose[:, :2], azimuth[:, None], self._walls_m).log_m[:, 0].exp() - config.margin_m
-        allowed = free.clamp(0.0, config.max_step_m)
+        allowed = free_travel_m(pose[:, :2], step[:, :2], self._walls_m, config.margin_m).clamp(max=config.max_step_m)
         scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
         turn = step[:, 2 : self._moving].clamp(-config.max_turn, config.max_turn)
         height, (low, high) = pose[:, self._moving :], self._height_bounds

@@ -5,7 +5,7 @@ neighbours (`motion.py`) link their states, and all share one error of the camer
 
 Begin with `search.py`, the path of a query. `chain.py` sums over all paths (forward-backward) and finds the best ones
 (Viterbi), `joint.py` refines all poses of a path together, `refinement.py` makes its jobs and reads its results, and
-`paths.py` computes the probability of paths.
+`paths.py` computes the probability of paths. `turn.py` is about photographs from one spot.
 """
 
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.sequence.motion import Motion
-from lalaloc_core.render.gradient import log_distance_gradient, log_profile_gradient
+from lalaloc_core.render.gradient import free_travel_m, log_profile_gradient
 
 _MARGIN_M, _MAX_STEP_M, _MAX_TURN = 0.03, 0.5, 0.2
 _ITERATIONS, _FIRST_DAMPING = 25, 1e-2
@@ -214,9 +214,8 @@ def _possible(
     poses = step[:, :-1].reshape(count * pictures, 3).copy()
     begin = (job.position_m + unknowns[:, :-1].reshape(count, pictures, 3)[:, :, :2]).reshape(-1, 2)
     length = np.hypot(poses[:, 0], poses[:, 1])
-    azimuth = np.arctan2(poses[:, 0], poses[:, 1])[:, None]
-    free_m = np.exp(log_distance_gradient(begin, azimuth, job.walls_m.reshape(len(begin), -1, 4)).log_m[:, 0])
-    allowed = np.clip(free_m - _MARGIN_M, 0.0, _MAX_STEP_M)
+    free_m = free_travel_m(begin, poses[:, :2], job.walls_m.reshape(len(begin), -1, 4), _MARGIN_M)
+    allowed = np.minimum(free_m, _MAX_STEP_M)
     poses[:, :2] *= np.minimum(1.0, allowed / np.maximum(length, 1e-9))[:, None]
     poses[:, 2] = np.clip(poses[:, 2], -_MAX_TURN, _MAX_TURN) * np.tile(job.turnable, count)
     height, (low, high) = unknowns[:, -1], job.height_bounds

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.posterior import Posterior, posterior_from_weights
 from lalaloc_core.localise.ranking import HEADING_SEPARATION
@@ -31,6 +32,7 @@ class Observation:
     """One picture of the chain.
 
     Attributes:
+        weights: of its matching cost.
         index: (n,) numbers of the grid poses that are its states, under each of k hypotheses.
         cost: (j, n, k) matching cost by height, pose and hypothesis.
         log_likelihood: (j, n, k) log likelihood with the prior of the state.
@@ -38,6 +40,7 @@ class Observation:
     """
 
     query: Query
+    weights: MatchingWeights
     index: np.ndarray
     states: States
     cost: Float[np.ndarray, "j n k"]

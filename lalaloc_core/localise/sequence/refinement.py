@@ -13,7 +13,6 @@ from jaxtyping import Float
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
-from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, RefinementJob, RefinementResult
@@ -49,13 +48,17 @@ def job_parts(
     grid: PoseGrid,
     pictures: list[Observation],
     paths: list[Path],
-    weights: MatchingWeights,
     config: LocaliseConfig,
 ) -> list[RefinementJob]:
     """Return the refinement job of every picture alone."""
     return [
         refinement_job(
-            plan, picture.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.matching
+            plan,
+            picture.query,
+            [path.starts[t] for path in paths],
+            grid.camera_height_m,
+            picture.weights,
+            config.matching,
         )
         for t, picture in enumerate(pictures)
     ]
@@ -67,7 +70,6 @@ def sequence_job(
     paths: list[Path],
     transitions: list[Transition],
     motions: Sequence[Motion],
-    temperature: float,
 ) -> SequenceJob:
     """Return the joint job of all pictures, with the motions that each path follows."""
     hypotheses = [[path.starts[t].hypothesis for path in paths] for t in range(len(pictures))]
@@ -93,7 +95,7 @@ def sequence_job(
         precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
         motions=tuple(motions),
         trusted=np.array(trusted, dtype=bool).reshape(len(paths), len(motions)),
-        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / temperature),
+        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / pictures[0].weights.temperature),
         height_offset=np.array([path.starts[0].height_offset for path in paths]),
         height_free=not height.is_exact,
         height_stiffness=parts[0].height_stiffness,
@@ -111,7 +113,6 @@ def ended_paths(
     config: LocaliseConfig,
 ) -> list[Path]:
     """Return the refined paths, best first, without duplicates."""
-    temperature = encoders.manifest.evidence.temperature
     ends: list[list[Candidate]] = []
     for t, picture in enumerate(pictures):
         starts = [path.starts[t] for path in paths]
@@ -137,10 +138,9 @@ def ended_paths(
     for path, log_motion in zip(moved, log_motions, strict=True):
         # Every picture's cost includes the prior of the shared height, which counts once.
         height = path.ends[0].terms["height"]
-        nll = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
-        priors = sum(
-            _log_prior(picture, state, temperature) for picture, state in zip(pictures, path.states, strict=True)
-        )
+        fits = sum(picture.weights.temperature * end.cost for picture, end in zip(pictures, path.ends, strict=True))
+        nll = fits - (len(path.ends) - 1) * height - log_motion.sum()
+        priors = sum(_log_prior(picture, state) for picture, state in zip(pictures, path.states, strict=True))
         found.append(replace(path, refined_nll=float(nll - priors)))
     kept: list[Path] = []
     for path in sorted(found, key=lambda ended: ended.refined_nll or 0.0):
@@ -149,10 +149,10 @@ def ended_paths(
     return kept
 
 
-def _log_prior(picture: Observation, state: int, temperature: float) -> float:
+def _log_prior(picture: Observation, state: int) -> float:
     """Return the log prior of a state."""
     row, hypothesis = divmod(state, len(picture.states.heading))
-    return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
+    return float((picture.log_likelihood + picture.weights.temperature * picture.cost)[0, row, hypothesis])
 
 
 def path_motion_costs(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import ConfidenceModel, MatchingWeights
+from lalaloc_core.localise.bundle import Manifest, MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
@@ -35,8 +35,9 @@ from lalaloc_core.localise.sequence.refinement import are_alike, ended_paths, jo
 SequenceRefine = Literal["none", "lpo"]
 # Runs joint refinement; None if it has no result (in time).
 SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
-# Maximum number of a picture's places, the best by every n-th azimuth, with n = `_STRIDE`.
-_MAX_PLACES, _STRIDE = 2048, 4
+# Maximum numbers of a picture's places, the best by every n-th azimuth, with n = `_STRIDE`, and of its states: places
+# under each hypothesis.
+_MAX_PLACES, _MAX_STATES, _STRIDE = 2048, 131_072, 4
 # Number of refined paths, and of modes of each picture through which paths are searched.
 _PATHS, _MODES = 8, 8
 # Half squared residual, of four standard deviations, beyond which the answer contradicts a motion.
@@ -64,9 +65,9 @@ class SequenceLocalisation:
         """Camera height that fits all pictures best."""
         return self.pictures[0].camera_height_m
 
-    def confidence(self, model: ConfidenceModel | None) -> float | None:
+    def confidence(self, manifest: Manifest) -> float | None:
         """Return the probability that all pictures are of the plan and all answers right; None as for one picture."""
-        alone = [picture.confidence(model) for picture in self.pictures]
+        alone = [picture.confidence(manifest.confidence_for(view=picture.query.is_view)) for picture in self.pictures]
         fits = [confidence.fit for confidence in alone if confidence is not None]
         return min(fits) * min(self.path_probability, 1.0) if len(fits) == len(alone) else None
 
@@ -114,9 +115,11 @@ def localise_sequence_steps(
     if len(motions) != len(queries) - 1:
         raise InvalidMotionError(f"{len(motions)} motions are given; {len(queries)} pictures need {len(queries) - 1}")
     config, clock = config or LocaliseConfig(), clock or StageClock()
-    weights, height = encoders.manifest.evidence, queries[0].camera_height
+    height = queries[0].camera_height
     with clock.stage("retrieve"):
-        pictures = [_picture(plan, grid, query, weights, config) for query in queries]
+        pictures = [
+            _picture(plan, grid, query, encoders.manifest.evidence_for(view=query.is_view), config) for query in queries
+        ]
         transitions = [
             transition(motion, first.states, second.states, grid.step_m)
             for motion, (first, second) in zip(motions, itertools.pairwise(pictures), strict=True)
@@ -129,8 +132,8 @@ def localise_sequence_steps(
     stage: Literal["retrieval", "lpo"] = "retrieval"
     if refine == "lpo" and all(config.matching.compares_profiles(picture.query) for picture in pictures):
         with clock.stage("lpo"):
-            parts = job_parts(plan, grid, pictures, paths, weights, config)
-            job = sequence_job(parts, pictures, paths, transitions, motions, weights.temperature)
+            parts = job_parts(plan, grid, pictures, paths, config)
+            job = sequence_job(parts, pictures, paths, transitions, motions)
             result = yield job
             if result is not None:
                 paths = ended_paths(plan, encoders, pictures, motions, paths, result, config)
@@ -209,7 +212,7 @@ def _signals(
     config: LocaliseConfig,
 ) -> Signals:
     """Return the signals of one picture, with the penalty of the camera height as for a single picture."""
-    query, weights = picture.query, encoders.manifest.evidence
+    query, weights = picture.query, picture.weights
     penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
     grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
     reach_m = config.matching.grid_reach * grid.step_m
@@ -232,9 +235,10 @@ def _picture(
     index = np.arange(len(grid.poses))
     if matching.compares_profiles(query):
         layouts, reach_m = grid.layouts(plan), matching.grid_reach * grid.step_m
-        if len(index) > _MAX_PLACES:
+        most = min(_MAX_PLACES, _MAX_STATES // len(query.roll))
+        if len(index) > most:
             coarse, _ = MatchingCost(plan, query, reach_m, weights, matching, stride=_STRIDE).costs(layouts)
-            index = np.sort(np.argpartition(coarse.min(axis=0), _MAX_PLACES)[:_MAX_PLACES])
+            index = np.sort(np.argpartition(coarse.min(axis=0), most)[:most])
             layouts = layouts.rows(index)
         costs = []
         for offset in query.camera_height.offsets:
@@ -249,7 +253,8 @@ def _picture(
     prior = area_shares(grid.poses, plan.areas_m2)
     prior = prior - np.logaddexp.reduce(prior) - math.log(len(query.roll))
     states = States(grid.poses.position_m[index], query.roll + query.frame_heading, query.sector)
-    return Observation(query, index, states, cost, -weights.temperature * cost + prior[index][None, :, None], doubted)
+    log_likelihood = -weights.temperature * cost + prior[index][None, :, None]
+    return Observation(query, weights, index, states, cost, log_likelihood, doubted)
 
 
 def _paths(

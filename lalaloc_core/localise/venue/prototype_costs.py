@@ -17,9 +17,17 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.cost_terms import ceiling_costs, mean_log, precisions, room_type_losses, smoothed
+from lalaloc_core.localise.cost_terms import (
+    ceiling_costs,
+    class_losses,
+    mean_log,
+    median_distance_m,
+    precisions,
+    room_type_losses,
+    smoothed,
+)
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import PredictedCeiling, Query
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
@@ -134,21 +142,21 @@ class PrototypeCosts:
         predicted = self._query.openings
         if predicted is None or not self._config.use_openings:
             return None
-        floor = self._config.floor
         probability = np.exp(predicted.log_probability[:: self._every])
-        probability = smoothed(probability, self._reach_m / float(np.exp(np.median(self.centre[0]))))
-        probability = probability[:, self._columns]
-        loss = np.empty((1 << _CLASSES, *probability.shape), np.float32)
-        for claims in range(len(loss)):
-            merged, prior = probability.copy(), predicted.prior.copy()
-            for code in range(_CLASSES):
-                if code != WALL_CODE and not claims >> code & 1:
-                    merged[..., WALL_CODE] += merged[..., code]
-                    prior[WALL_CODE] += prior[code]
-            loss[claims] = -np.log(floor + (1.0 - floor) * merged / prior)
-            for code in range(_CLASSES):
-                if code != WALL_CODE and not claims >> code & 1:
-                    loss[claims, ..., code] = loss[claims, ..., WALL_CODE]
+        spread = self._reach_m / median_distance_m(self.centre[0], self.precision[0])
+        probability = smoothed(probability, spread)[:, self._columns]
+        loss = np.stack(
+            [
+                class_losses(
+                    probability,
+                    predicted.prior,
+                    [code for code in range(_CLASSES) if claims >> code & 1],
+                    self._config.floor,
+                    self._weights.appearance,
+                )
+                for claims in range(1 << _CLASSES)
+            ]
+        ).astype(np.float32)
         # Costs are relative to the best class for a plan that claims all classes.
         loss -= loss[-1].min(axis=-1, keepdims=True)
         return loss * np.float32(_OPENINGS_SHARE * self._weights.openings / AZIMUTHS)

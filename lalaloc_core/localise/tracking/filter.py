@@ -1,0 +1,313 @@
+"""Path of a photograph of a tracked camera: move the belief, compare the photograph, refine the modes, answer.
+
+The belief after a photograph is
+
+    b'(s) ∝ (prediction(s) + ε prior(s)) · (exp(-T (cost(s) - best)) + exp(-F)),
+
+with the prediction of `motion.moved`, the share ε of being carried anywhere, and the likelihood of the posterior of a
+single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere better;
+exp(-F), the likelihood of an outlier, limits their effect. LPO refines the modes of the belief; its gain is evidence
+for a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.errors import InvalidStateError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.cohort import cost_by_chance
+from lalaloc_core.localise.confidence import confidence_of, signals_of
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.hints import NO_HINTS, Hints
+from lalaloc_core.localise.matching_cost import MatchingCost
+from lalaloc_core.localise.pipeline import LocaliseConfig, SearchStage, StageClock
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.posterior import area_shares
+from lalaloc_core.localise.refinement import refined_candidates, refinement_job, with_latents
+from lalaloc_core.localise.retrieval import grid_costs
+from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.tracking.modes import (
+    OUTLIER,
+    Compared,
+    hypothesis_of,
+    likelihood,
+    modes_of,
+    ranked_modes,
+    regained,
+    relative_likelihood,
+    sector_of,
+    share_alone,
+)
+from lalaloc_core.localise.tracking.motion import Odometry, States, WalkGraph, moved
+from lalaloc_core.localise.tracking.pose_fusion import carried_on, contradicted, fused, measured_pose
+from lalaloc_core.localise.tracking.state import (
+    COMPONENTS,
+    MAX_PATH,
+    MAX_STATES,
+    RECENT,
+    Component,
+    Mode,
+    TrackedPose,
+    TrackState,
+)
+
+# Probability of being carried elsewhere between two photographs.
+_CARRIED = 0.003
+# Predicted states that are compared in full, besides those that the grid offers.
+_PREDICTED = 1024
+# States below this share of the total are dropped.
+_NEGLIGIBLE_SHARE = 1e-7
+# The belief in being in the plan: probability of leaving or entering it between photographs, limits of the evidence of
+# one photograph, and thresholds of the modes.
+_LEAVING, _MAX_ODDS = 0.02, 10.0
+_LOST_BELOW, _TRACKING_FROM = 0.2, 0.5
+# Probability of its pose from which a photograph is sure by itself.
+_SURE = 0.9
+_RETRIEVAL: SearchStage = "retrieval"
+# Probability that a known heading is wrong, and the deviation (radians) of headings beyond its tolerance.
+_HEADING_DOUBT, _HEADING_STD = 0.02, math.radians(2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """Answer for one photograph.
+
+    Attributes:
+        state: state for the next photograph.
+        pose: the answer.
+        query, candidates: the best poses, the answer first as LPO has it; `probability` of each.
+        fit: probability that this photograph, by itself, is of the plan; None without a model.
+        contradicted: components of the motion that this photograph contradicts.
+        stage: last stage that ran.
+    """
+
+    state: TrackState
+    pose: TrackedPose
+    query: Query
+    candidates: list[Candidate]
+    probability: tuple[float, ...]
+    fit: float | None
+    contradicted: tuple[Component, ...]
+    stage: SearchStage
+
+
+TrackSteps = Generator[RefinementJob, RefinementResult | None, Tracked]
+
+
+def track_steps(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    graph: WalkGraph,
+    encoders: Encoders,
+    state: TrackState,
+    query: Query,
+    odometry: Odometry | None,
+    *,
+    known_heading: KnownHeading | None = None,
+    hints: Hints = NO_HINTS,
+    top_k: int = 5,
+    config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
+) -> TrackSteps:
+    """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
+
+    Args:
+        plan: the plan.
+        grid: its pose grid.
+        graph: the grid's links.
+        encoders: the networks.
+        state: state after the photographs before.
+        query: the photograph, encoded with an unknown heading.
+        odometry: motion since the photograph before; None if it is unknown.
+        known_heading: heading of the photograph with its largest error; None if it is unknown.
+        hints: the prior of the first photograph.
+        top_k: number of candidates.
+        config: settings of the search.
+        clock: times the stages.
+
+    Raises:
+        InvalidStateError: the state is of another grid or model.
+        InvalidHintError: see `Hints.check`.
+    """
+    config, clock = config or LocaliseConfig(), clock or StageClock()
+    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    sectors = len(query.roll)
+    if state.poses != len(grid.poses):
+        raise InvalidStateError(
+            f"the session has {state.poses} poses, the grid {len(grid.poses)}: the plan or the model has changed; "
+            "begin a new session"
+        )
+    state = state.with_sectors(sectors)
+    with clock.stage("predict"):
+        prediction = _prediction(plan, grid, graph, state, odometry, sectors, known_heading, hints)
+    with clock.stage("retrieve"):
+        everything, grid_cost = _compare(plan, grid, encoders, query, prediction, config)
+        compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
+    starts = modes_of(grid, query, compared, config)
+    refined = ends = starts
+    stage = _RETRIEVAL
+    with clock.stage("lpo"):
+        job = refinement_job(plan, query, starts, grid.camera_height_m, weights, matching)
+        result = yield job
+        if result is not None:
+            refined = refined_candidates(plan, encoders, query, starts, result, matching)
+            # The photograph is rather an outlier at modes that fit worse than this.
+            followed = relative_likelihood(refined, weights.temperature) >= 2.0 * math.exp(-OUTLIER)
+            ends = [
+                end if is_followed else start for start, end, is_followed in zip(starts, refined, followed, strict=True)
+            ]
+            stage = "lpo"
+    with clock.stage("rank"):
+        compared = regained(grid, query, compared, starts, refined, weights.temperature, config.separation_m)
+        candidates, posterior = ranked_modes(grid, query, compared, starts, ends, config, top_k)
+        candidates = with_latents(plan, encoders, query, candidates[:1], grid.camera_height_m) + candidates[1:]
+        by_chance = cost_by_chance(encoders.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
+        model = encoders.manifest.confidence_for(view=query.is_view)
+        signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
+        confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
+    fit = None if confidence is None else confidence.fit
+    in_plan = _in_plan(state.in_plan, fit)
+    probability = in_plan * posterior.position
+    mode = _mode(in_plan, probability)
+    measured = measured_pose(plan, encoders, query, candidates[0])
+    predicted = None if state.pose is None or odometry is None else carried_on(state.pose, odometry)
+    tracking = state.pose is not None and state.pose.mode == mode == "tracking"
+    # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
+    sure = share_alone(grid, query, everything, candidates[0], weights.temperature, config.separation_m) >= _SURE
+    comparable = tracking or (sure and state.pose is not None and state.pose.sure)
+    judged = comparable and candidates[0].information is not None
+    differing = contradicted(state.pose, odometry, predicted, measured) if comparable else ()
+    missed = differing if judged else ()
+    # A camera that was carried elsewhere is where the photograph says.
+    if tracking and predicted is not None and not differing:
+        measured = fused(predicted, measured)
+    (x_m, y_m, heading), covariance = measured
+    pose = TrackedPose(
+        float(x_m),
+        float(y_m),
+        float(wrap_angle(heading)),
+        covariance,
+        candidates[0].room_index,
+        probability,
+        mode,
+        state.number + 1,
+        sure,
+    )
+    shares = tuple(in_plan * share for share in posterior.candidate)
+    after = _state_after(state, compared, in_plan, pose, missed, judged=judged and odometry is not None)
+    return Tracked(after, pose, query, candidates, shares, fit, missed, stage)
+
+
+def _prediction(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    graph: WalkGraph,
+    state: TrackState,
+    odometry: Odometry | None,
+    sectors: int,
+    known: KnownHeading | None,
+    hints: Hints,
+) -> Float[np.ndarray, "n k"]:
+    """Return the belief before the photograph is compared."""
+    share = area_shares(grid.poses, plan.areas_m2)
+    if state.number == 0:
+        hints.check(plan)
+        share = share - hints.penalty(plan, grid.poses.position_m, grid.poses.room_index)
+    prior = np.exp(share - share.max())
+    prior = np.broadcast_to((prior / (prior.sum() * sectors))[:, None], (len(prior), sectors))
+    if len(state.belief.pose):
+        walked = moved(graph, state.belief, sectors, odometry)
+        rest = max(1.0 - float(state.belief.weight.sum()), _CARRIED)
+        prediction = (1.0 - rest) * walked + rest * prior
+    else:
+        prediction = prior
+    if known is None or known.heading is None:
+        return prediction
+    off = np.abs(wrap_angle(np.arange(sectors) * (TWO_PI / sectors) - known.heading))
+    beyond = np.maximum(off - known.tolerance, 0.0) / math.hypot(_HEADING_STD, TWO_PI / sectors / 3.0)
+    factor = np.exp(-0.5 * np.square(beyond))
+    return prediction * ((1.0 - _HEADING_DOUBT) * factor / factor.mean() + _HEADING_DOUBT)
+
+
+def _compare(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    encoders: Encoders,
+    query: Query,
+    prediction: Float[np.ndarray, "n k"],
+    config: LocaliseConfig,
+) -> tuple[Compared, float]:
+    """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
+    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    sectors = prediction.shape[1]
+    costs = grid_costs(plan, grid, query, weights, matching)
+    number = costs.pose * sectors + sector_of(query, costs.hypothesis)
+    cost, offset = costs.cost.astype(np.float64), costs.offset
+    flat = prediction.ravel()
+    likely = np.argpartition(-flat, min(_PREDICTED, len(flat) - 1))[:_PREDICTED]
+    missing = np.setdiff1d(likely, number[: costs.compared])
+    if len(missing) and matching.compares_profiles(query):
+        pose, sector = np.divmod(missing, sectors)
+        matching_cost = MatchingCost(plan, query, matching.grid_reach * grid.step_m, weights, matching)
+        more, more_offset = matching_cost.pairs(grid.layouts(plan), pose, hypothesis_of(query)[sector])
+        left = ~np.isin(number, missing)
+        number = np.append(number[left], missing)
+        cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
+    weight = flat[number] * likelihood(cost, float(cost.min()), weights.temperature)
+    rest = max(float(flat.sum() - flat[number].sum()), 0.0) * math.exp(-OUTLIER)
+    total = float(weight.sum()) + rest
+    pose, sector = np.divmod(number, sectors)
+    compared = Compared(pose, sector, cost, offset, weight / total, rest / total)
+    return compared, float(costs.cost.min())
+
+
+def _in_plan(before: float, fit: float | None) -> float:
+    """Return the probability of being in the plan after a photograph that fits it with some probability."""
+    before = before + _LEAVING * (1.0 - 2.0 * before)
+    if fit is None:
+        return before
+    odds = min(max(fit / max(1.0 - fit, 1e-9), 1.0 / _MAX_ODDS), _MAX_ODDS)
+    return before * odds / (before * odds + 1.0 - before)
+
+
+def _mode(in_plan: float, probability: float) -> Mode:
+    if in_plan < _LOST_BELOW:
+        return "lost"
+    return "tracking" if probability >= _TRACKING_FROM else "searching"
+
+
+def _state_after(
+    state: TrackState,
+    compared: Compared,
+    in_plan: float,
+    pose: TrackedPose,
+    missed: tuple[Component, ...],
+    *,
+    judged: bool,
+) -> TrackState:
+    """Return the state for the next photograph."""
+    most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
+    bits = state.contradicted
+    if judged:
+        mask = (1 << RECENT) - 1
+        first, second, third = (
+            ((old << 1) | (name in missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
+        )
+        bits = first, second, third
+    point = [pose.number, pose.x_m, pose.y_m, pose.heading, pose.room_index, pose.probability]
+    return replace(
+        state,
+        belief=States(compared.pose[most], compared.sector[most], compared.weight[most]),
+        in_plan=in_plan,
+        number=pose.number,
+        pose=pose,
+        contradicted=bits,
+        path=np.concatenate([state.path, [point]])[-MAX_PATH:],
+    )

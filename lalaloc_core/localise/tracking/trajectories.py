@@ -1,0 +1,124 @@
+"""Odometry and trajectories in files: CSV, and the format of the TUM RGB-D benchmark.
+
+Both have one pose per line, in the frames of REP 103: x forward, y to the left, yaw counter-clockwise from +x.
+TUM: `time x y z qx qy qz qw`. CSV: a header with `time_s`, `x_m`, `y_m` and `yaw_deg`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidMotionError
+from lalaloc_core.localise.tracking.motion import Odometry
+
+_CSV = ("time_s", "x_m", "y_m", "yaw_deg")
+_TUM_VALUES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometryErrors:
+    """Standard deviations of odometry: shares of the distance and radians per metre, and what is added."""
+
+    drift: float = 0.05
+    least_m: float = 0.02
+    turn_per_m: float = math.radians(2.0)
+    least_turn: float = math.radians(1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses by time: seconds, positions (m), and yaws (radians, counter-clockwise from +x)."""
+
+    time_s: Float[np.ndarray, "n"]
+    position_m: Float[np.ndarray, "n 2"]
+    yaw: Float[np.ndarray, "n"]
+
+    def at(self, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
+        """Return the interpolated position and yaw at a time.
+
+        Raises:
+            InvalidMotionError: the time is outside the trajectory.
+        """
+        if not self.time_s[0] <= time_s <= self.time_s[-1]:
+            raise InvalidMotionError(
+                f"a photograph was taken at {time_s:g} s; the odometry is from {self.time_s[0]:g} to "
+                f"{self.time_s[-1]:g} s"
+            )
+        position = np.array([np.interp(time_s, self.time_s, self.position_m[:, axis]) for axis in (0, 1)])
+        return position, float(np.interp(time_s, self.time_s, np.unwrap(self.yaw)))
+
+    def motion(self, first_s: float, second_s: float, errors: OdometryErrors, mount: float = 0.0) -> Odometry:
+        """Return the motion between two times, in the frame of the camera.
+
+        `mount` is the azimuth (radians, clockwise) of the camera's heading relative to the frame's x.
+        """
+        (start, yaw), (end, later) = self.at(first_s), self.at(second_s)
+        x, y = end - start
+        # Clockwise from the camera's heading, as azimuths.
+        ahead = -math.atan2(y, x) + yaw - mount
+        length_m = math.hypot(x, y)
+        std_m = errors.drift * length_m + errors.least_m
+        stds = std_m, std_m, errors.turn_per_m * length_m + errors.least_turn
+        turn = -float(wrap_angle(later - yaw))
+        return Odometry.of_stds(length_m * math.cos(ahead), length_m * math.sin(ahead), turn, stds)
+
+
+def read_trajectory(text: str) -> Trajectory:
+    """Read a CSV or TUM file.
+
+    Raises:
+        InvalidMotionError: a line is invalid, or times do not rise.
+    """
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    rows = _csv_rows(lines) if lines and "," in lines[0] else [_tum_row(line, n) for n, line in enumerate(lines, 1)]
+    if len(rows) < 2:
+        raise InvalidMotionError(f"the odometry has {len(rows)} poses; it needs at least 2")
+    values = np.array(rows, dtype=float)
+    if not np.isfinite(values).all():
+        raise InvalidMotionError("the odometry has values that are not finite")
+    if not (np.diff(values[:, 0]) > 0.0).all():
+        row = int(np.argmin(np.diff(values[:, 0]))) + 2
+        raise InvalidMotionError(f"pose {row} of the odometry is not later than the one before: sort it by time")
+    return Trajectory(values[:, 0], values[:, 1:3], values[:, 3])
+
+
+def tum_line(time_s: float, position_m: Float[np.ndarray, "2"], z_m: float, heading: float) -> str:
+    """Return a pose of the plan frame as a line of a TUM file; `heading` is an azimuth (radians)."""
+    yaw = 0.5 * math.pi - heading
+    x, y = position_m
+    return f"{time_s:.6f} {x:.4f} {y:.4f} {z_m:.4f} 0 0 {math.sin(0.5 * yaw):.7f} {math.cos(0.5 * yaw):.7f}"
+
+
+def _csv_rows(lines: list[str]) -> list[list[float]]:
+    reader = csv.DictReader(io.StringIO("\n".join(lines)))
+    if missing := [name for name in _CSV if name not in (reader.fieldnames or [])]:
+        raise InvalidMotionError(f"the odometry has no column {missing[0]}; it needs {', '.join(_CSV)}")
+    rows = []
+    for number, row in enumerate(reader, 1):
+        time_s, x, y, yaw_deg = (_number(row[name], number) for name in _CSV)
+        rows.append([time_s, x, y, math.radians(yaw_deg)])
+    return rows
+
+
+def _tum_row(line: str, number: int) -> list[float]:
+    values = [_number(word, number) for word in line.split()]
+    if len(values) != _TUM_VALUES:
+        raise InvalidMotionError(
+            f"pose {number} of the odometry has {len(values)} values; TUM lines have {_TUM_VALUES}"
+        )
+    time_s, x, y, _, qx, qy, qz, qw = values
+    return [time_s, x, y, math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))]
+
+
+def _number(text: str | None, number: int) -> float:
+    try:
+        return float(text or "")
+    except ValueError as error:
+        raise InvalidMotionError(f"pose {number} of the odometry has '{text}', which is not a number") from error
