@@ -18,7 +18,9 @@ from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, ImportLi
 from lalaloc_core.importers.common.options import ImportOptions, KnownDistance
 from lalaloc_core.importers.common.report import ImportReport, LayerUse
 from lalaloc_core.importers.common.sketch import Level
+from lalaloc_core.importers.common.trace import Trace
 from lalaloc_core.importers.importing import (
+    building_name,
     detect_format,
     detect_media_type,
     export_plan,
@@ -43,6 +45,8 @@ __all__ = [
     "KnownDistance",
     "LayerUse",
     "Level",
+    "Trace",
+    "building_name",
     "detect_format",
     "detect_media_type",
     "export_plan",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -10,12 +11,13 @@ from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
 from lalaloc_core.file_kinds import describe_file
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
 from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
 from lalaloc_core.importers.common.options import DEFAULT_OPTIONS, ImportOptions
+from lalaloc_core.importers.common.trace import Trace
 from lalaloc_core.importers.registry import EXPORT_FORMATS, FORMATS, HEAD_BYTES, Format
 
 _GEOJSON_TYPES = {
@@ -24,6 +26,12 @@ _GEOJSON_TYPES = {
 }  # fmt: skip
 # Advice for files of other kinds, by the last word of their description.
 _ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": "unpack it"}
+# Suffixes of plan files, such as .imdf.zip.
+_SUFFIXES = re.compile(r"(?:(?<=.)\.imdf)?(?<=.)\.[A-Za-z0-9]{1,10}$")
+# Members of a JSON document of no known format that are named.
+_MAX_MEMBERS = 8
+# Files of IMDF, zipped IFC models and ROS maps.
+_IN_ARCHIVES = (".geojson", ".json", ".ifc", ".yaml", ".yml", ".pgm", ".png")
 _OPTIONS_OF_ALL_FORMATS = {"name", "ceiling_height_m"}
 
 
@@ -32,8 +40,19 @@ def import_plans(
     options: ImportOptions = DEFAULT_OPTIONS,
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
     clock: Callable[[], float] = time.monotonic,
+    *,
+    building: str | None = None,
+    trace: Trace | None = None,
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans in a file, one per storey, lowest first.
+
+    Args:
+        content: the file.
+        options: options of the import.
+        limits: limits of the file and its plans.
+        clock: clock for the time limit.
+        building: name for plans of several storeys, unless the options have one: "Duplex – Level 1".
+        trace: receives what is read from a drawing or a picture, also of a file that is refused.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
@@ -44,7 +63,7 @@ def import_plans(
             f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes); "
             "export a single storey"
         )
-    budget = Budget(limits, clock)
+    budget = Budget(limits, clock, trace)
     try:
         format, source = _open(content, limits)
         plans = format.read(source, options, budget)
@@ -54,6 +73,9 @@ def import_plans(
         ) from error
     except MemoryError as error:
         raise InvalidFloorPlanError("the file needs more memory than is available; export a single storey") from error
+    building = options.name or building
+    if len(plans) > 1 and building is not None:
+        plans = [_named_by_level(plan, building) for plan in plans]
     return tuple(_with_option_warnings(plan, format, options) for plan in plans)
 
 
@@ -120,6 +142,12 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
     return _format_by_magic(content).name
 
 
+def building_name(file_name: str | None) -> str | None:
+    """Return the name of a building from the name of its file: "Duplex" for "Duplex.ifc"; None for an empty name."""
+    last = re.split(r"[/\\]", file_name or "")[-1]
+    return clean_name(_SUFFIXES.sub("", last))
+
+
 def is_json(content: bytes) -> bool:
     """Return whether a file starts like JSON and like no other format."""
     start = content[:1024].removeprefix(codecs.BOM_UTF8).lstrip()
@@ -145,8 +173,11 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
     if format.name != "imdf":
         return format, content
     from lalaloc_core.importers.formats.imdf import read_archive
+    from lalaloc_core.importers.formats.ros import YAML_SUFFIXES
 
-    files = read_archive(content, limits, suffixes=(".geojson", ".json", ".ifc"))
+    files = read_archive(content, limits, suffixes=_IN_ARCHIVES)
+    if any(name.casefold().endswith(YAML_SUFFIXES) for name in files):
+        return FORMATS["ros"], files
     # A zip archive with a single IFC model is an .ifczip file.
     models = [name for name in files if name.casefold().endswith(".ifc")]
     return (FORMATS["ifc"], files[models[0]]) if len(models) == 1 else (format, files)
@@ -154,8 +185,19 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
 
 def _json_format(document: Any) -> Format:
     if isinstance(document, dict):
-        is_geojson = document.get("type") in _GEOJSON_TYPES and "rooms" not in document
-        return FORMATS["geojson" if is_geojson else "native"]
+        known = (format for format in FORMATS.values() if format.keys and format.keys <= document.keys())
+        format = next(known, None)
+        if format is not None:
+            return format
+        if "rooms" in document:
+            return FORMATS["native"]
+        if document.get("type") in _GEOJSON_TYPES:
+            return FORMATS["geojson"]
+        members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
+        raise InvalidFloorPlanError(
+            f"the JSON has the members {members}, of no known format; the native format has 'rooms', GeoJSON 'type', "
+            "OpenStreetMap 'elements', and RoomPlan 'walls', 'doors' and 'windows'"
+        )
     found = "a list" if isinstance(document, list) else "a single value"
     raise InvalidFloorPlanError(
         f"the JSON is {found}; it must be an object: a plan with 'rooms', or GeoJSON with 'type'"
@@ -174,11 +216,19 @@ def _format_by_magic(content: bytes) -> Format:
     if kind is not None:
         found = f"{kind}, which cannot be read: {_ADVICE.get(kind.rpartition(' ')[2], 'convert it')}"
     elif start.startswith(b"<"):
-        found = "XML without an <svg> element: save the drawing as SVG or DXF"
+        found = "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"
     else:
         found = "in no known format"
     titles = ", ".join(format.title for format in FORMATS.values())
     raise InvalidFloorPlanError(f"the file is {found}; supported formats are {titles}")
+
+
+def _named_by_level(plan: ImportedPlan, name: str) -> ImportedPlan:
+    """Return the plan of one of several storeys, named "Duplex – Level 1"."""
+    level = "" if plan.level is None else f" – {plan.level.title}"
+    longest = DEFAULT_LIMITS.max_name_length
+    name = f"{name[: max(longest - len(level), 0)]}{level}"[:longest]
+    return replace(plan, document=plan.document | {"name": name}, checked=None)
 
 
 def _with_option_warnings(plan: ImportedPlan, format: Format, options: ImportOptions) -> ImportedPlan:

@@ -18,7 +18,7 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 
 # Formats with a function `write` in their module.
-ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg"]
+ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg", "ros"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 # Bytes at the start of a file that are matched with `Format.magic`.
 HEAD_BYTES = 65536
@@ -41,7 +41,8 @@ class Format:
         media_type: media type of its files.
         suffix: suffix of its files, without a dot.
         options: import options that the format uses, besides `name` and `ceiling_height_m`.
-        magic: pattern that matches at the start of its files; None for JSON, which is recognised by its contents.
+        magic: pattern that matches at the start of its files; None for JSON.
+        keys: members that recognise a JSON document of the format; without them it is GeoJSON or native.
         extra: optional dependency of this package that installs its libraries.
     """
 
@@ -51,6 +52,7 @@ class Format:
     suffix: str
     options: frozenset[str]
     magic: re.Pattern[bytes] | None = None
+    keys: frozenset[str] = frozenset()
     extra: str = "plans"
 
     def read(self, source: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -81,6 +83,12 @@ class Format:
             raise MissingExtraError(f"{activity} {self.title}", self.extra) from error
 
 
+def _xml(element: str) -> re.Pattern[bytes]:
+    """Return a pattern for XML files that begin with an element, after declarations and comments."""
+    name = re.escape(element.encode())
+    return re.compile(_START + rb"(?=<(?:\?xml|!--|!DOCTYPE|[A-Za-z])).*?(?:<|:)" + name, re.DOTALL)
+
+
 _DRAWN_SCALE = {"metres_per_pixel", "known_distance"}
 
 FORMATS: Mapping[str, Format] = {
@@ -101,12 +109,38 @@ FORMATS: Mapping[str, Format] = {
             options=frozenset({"units", "y_axis", "level", "layers"}),
         ),
         Format(
+            name="osm",
+            title="OpenStreetMap (XML, Overpass JSON)",
+            media_type="application/vnd.openstreetmap.data+xml",
+            suffix="osm",
+            options=frozenset({"level", "layers"}),
+            magic=_xml("osm"),
+            keys=frozenset({"elements"}),
+        ),
+        Format(
+            name="roomplan",
+            title="RoomPlan",
+            media_type="application/json",
+            suffix="json",
+            options=frozenset({"level"}),
+            keys=frozenset({"walls", "doors", "windows"}),
+        ),
+        Format(
             name="imdf",
             title="IMDF",
             media_type="application/zip",
             suffix="imdf.zip",
             options=frozenset({"level", "layers"}),
             magic=re.compile(rb"PK\x03\x04"),
+        ),
+        Format(
+            name="ros",
+            title="ROS map (zip archive of YAML and PGM)",
+            media_type="application/zip",
+            suffix="map.zip",
+            options=frozenset({"metres_per_pixel"}),
+            # A picture of a map, or its YAML file.
+            magic=re.compile(rb"P[25]\s|(?:[a-z_]+:[^\n]*\n|\s|#[^\n]*\n)*image:"),
         ),
         Format(
             name="dxf",
@@ -119,12 +153,28 @@ FORMATS: Mapping[str, Format] = {
             ),
         ),
         Format(
+            name="dwg",
+            title="DWG (with a converter)",
+            media_type="image/vnd.dwg",
+            suffix="dwg",
+            options=frozenset({"units", "layers", "y_axis", *_DRAWN_SCALE}),
+            magic=re.compile(rb"AC10\d\d"),
+        ),
+        Format(
+            name="indoorgml",
+            title="IndoorGML",
+            media_type="application/gml+xml",
+            suffix="gml",
+            options=frozenset({"units", "level"}),
+            magic=_xml("IndoorFeatures"),
+        ),
+        Format(
             name="svg",
             title="SVG",
             media_type="image/svg+xml",
             suffix="svg",
             options=frozenset({"units", "scale", "layers", "y_axis", *_DRAWN_SCALE}),
-            magic=re.compile(_START + rb"(?=<(?:\?xml|!--|!DOCTYPE|[A-Za-z])).*?(?:<svg|:svg)", re.DOTALL),
+            magic=_xml("svg"),
         ),
         Format(
             name="ifc",

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from ezdxf.filemanagement import new as new_dxf
+from PIL import Image
 
 from lalaloc_core.cli import main
 from lalaloc_core.floorplan import FloorPlan
-from tests.importers.conftest import FLAT
+from tests.importers.conftest import FLAT, dxf_file
+from tests.importers.test_pictures import open_hall
+
+ROOM = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]]}}
 
 
 @pytest.fixture
@@ -17,6 +28,12 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "flat.json"
     path.write_text(json.dumps(FLAT), encoding="utf-8")
     return path
+
+
+def _run(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
+    """Run the command in a process of its own."""
+    command = "import sys; from lalaloc_core.cli import main; sys.exit(main())"
+    return subprocess.run([sys.executable, "-c", command, *arguments], check=False, **streams)
 
 
 def test_plan_is_exported_and_imported(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -35,6 +52,30 @@ def test_check_prints_warnings(file: Path, capsys: pytest.CaptureFixture[str]):
     shown = capsys.readouterr().out
     assert "3 rooms" in shown
     assert "looks like feet" in shown
+
+
+def test_plan_is_written_although_the_reader_of_the_report_left(file: Path, tmp_path: Path):
+    out = tmp_path / "out.json"
+    read, write = os.pipe()
+    os.close(read)
+    run = _run("plan", "import", str(file), "--out", str(out), stdout=write, stderr=write)
+    os.close(write)
+    assert run.returncode == 0
+    assert len(FloorPlan.from_json(out.read_bytes()).rooms) == 3
+
+
+def test_export_to_dxf_logs_nothing(file: Path, tmp_path: Path):
+    run = _run(
+        "plan", "export", str(file), "--format", "dxf", "--out", str(tmp_path / "flat.dxf"), stderr=subprocess.PIPE
+    )
+    assert (run.returncode, run.stderr) == (0, b"")
+
+
+def test_drawing_is_opaque(file: Path, tmp_path: Path):
+    out = tmp_path / "flat.png"
+    assert main(["plan", "draw", str(file), "--out", str(out)]) == 0
+    with Image.open(out) as picture:
+        assert np.asarray(picture.convert("RGBA"))[..., 3].min() == 255
 
 
 def test_anchor_option_is_used_for_imdf(file: Path, tmp_path: Path):
@@ -57,3 +98,71 @@ def test_invalid_options_are_rejected(file: Path, tmp_path: Path, arguments: lis
 def test_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["plan", "import", str(tmp_path / "none.svg")]) == 2
     assert "none.svg' cannot be read: No such file" in capsys.readouterr().err
+
+
+def test_every_level_is_written_to_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file, folder = tmp_path / "Duplex.geojson", tmp_path / "plans" / "duplex"
+    rooms = [ROOM | {"properties": {"indoor": "room", "level": level}} for level in ("Attic", "2")]
+    file.write_text(json.dumps({"type": "FeatureCollection", "units": "m", "features": rooms}), encoding="utf-8")
+    assert main(["plan", "import", str(file), "--all-levels"]) == 2
+    assert "add --out FOLDER" in capsys.readouterr().err
+    assert main(["plan", "import", str(file), "--all-levels", "-o", str(folder)]) == 0
+    written = sorted(folder.iterdir())
+    assert capsys.readouterr().out.split() == [str(folder / "attic.json"), str(folder / "level-2.json")]
+    assert [FloorPlan.from_json(path.read_bytes()).name for path in written] == ["Duplex – Attic", "Duplex – Level 2"]
+
+
+def test_plan_without_levels_is_written_to_a_folder(file: Path, tmp_path: Path):
+    assert main(["plan", "import", str(file), "--all-levels", "-o", str(tmp_path / "out")]) == 0
+    assert FloorPlan.from_json((tmp_path / "out" / "flat.json").read_bytes()).name == "Flat"
+
+
+def test_area_without_a_room_is_drawn(tmp_path: Path):
+    picture, out = tmp_path / "hall.png", tmp_path / "hall.svg"
+    picture.write_bytes(open_hall())
+    assert main(["plan", "draw", str(picture), "--metres-per-pixel", "0.01", "--out", str(out)]) == 0
+    drawn = out.read_text(encoding="utf-8")
+    assert drawn.count('class="no-room"') == 1
+    # The view shows the whole area, to x = 9.8 m.
+    left, _, width, _ = (float(value) for value in re.findall(r'viewBox="([^"]*)"', drawn)[0].split())
+    assert left + width > 9.8
+
+
+def test_debug_draws_a_drawing_that_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    space = document.modelspace()
+    for start, end in (((0, 0), (4, 0)), ((4, 0), (4, 3)), ((9, 0), (9, 3))):
+        space.add_line(start, end, dxfattribs={"layer": "WALL"})
+    space.add_line((1, 0), (2, 0), dxfattribs={"layer": "A-DOOR"})
+    drawing, out = tmp_path / "open.dxf", tmp_path / "read.svg"
+    drawing.write_bytes(dxf_file(document))
+    assert main(["plan", "import", str(drawing), "--debug", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "no room was found" in error
+    assert "3 lines: wall on 'WALL'" in error
+    drawn = out.read_text(encoding="utf-8")
+    assert ">line of a wall<" in drawn
+    assert ">door<" in drawn
+    assert ">room<" not in drawn
+    assert main(["plan", "import", str(drawing), "--debug", str(tmp_path / "read.gif")]) == 2
+    assert "must end in .png or .svg (--debug)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["svg", "png"])
+def test_debug_draws_rooms_gaps_and_lost_areas(tmp_path: Path, kind: str):
+    picture, out = tmp_path / "hall.png", tmp_path / f"read.{kind}"
+    picture.write_bytes(open_hall())
+    arguments = ["plan", "import", str(picture), "--metres-per-pixel", "0.01", "-o", str(tmp_path / "plan.json")]
+    assert main([*arguments, "--debug", str(out)]) == 0
+    if kind == "svg":
+        assert all(f">{part}<" in out.read_text(encoding="utf-8") for part in ("wall", "room", "inside, but no room"))
+    else:
+        with Image.open(out) as drawn:
+            assert drawn.width == 1600
+
+
+def test_debug_of_a_file_without_a_drawing_says_so(file: Path, tmp_path: Path):
+    out = tmp_path / "read.svg"
+    assert main(["plan", "import", str(file), "-o", str(tmp_path / "plan.json"), "--debug", str(out)]) == 0
+    assert "Nothing was read from a drawing." in out.read_text(encoding="utf-8")

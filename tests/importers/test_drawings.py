@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from itertools import pairwise
 
 import pytest
@@ -13,6 +14,7 @@ from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import role_from_name, room_type_from_name
+from lalaloc_core.importers.drawing.dimensions import scale_by_dimensions
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import dxf_file, lines, shapes
 
@@ -104,6 +106,50 @@ def test_german_wall_lines_become_rooms():
     assert window.length == pytest.approx(1.5, abs=0.01)
     used = {(use.layer, use.used_as) for use in plan.report.layers}
     assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "door swings")} <= used
+
+
+def _single_lines():
+    """Draw walls of single lines on one layer in metres, 3 rooms above a corridor, with half open leaves and arcs."""
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    space = document.modelspace()
+    # The upper left corner stays open by 3 cm.
+    space.add_line((0.03, 6), (12, 6))
+    space.add_line((0, 0), (0, 5.97))
+    space.add_line((0, 0), (12, 0))
+    space.add_line((12, 0), (12, 6))
+    for x in (4, 8):
+        space.add_line((x, 2), (x, 6))
+    start = 0.0
+    for hinge, angle in ((1.0, 40.0), (5.0, 65.0), (9.0, 90.0)):
+        space.add_line((start, 2), (hinge, 2))
+        turn = math.radians(angle)
+        space.add_line((hinge, 2), (hinge + 0.9 * math.cos(turn), 2 + 0.9 * math.sin(turn)))
+        space.add_arc((hinge, 2), 0.9, 0, angle)
+        start = hinge + 0.9
+    space.add_line((start, 2), (12, 2))
+    return document
+
+
+def test_slanted_leaves_are_doors_and_not_walls():
+    plan = import_plan(dxf_file(_single_lines()))
+    areas = sorted(room.area for room in shapes(plan.document))
+    assert areas == pytest.approx([16.0, 16.0, 16.0, 24.0], rel=0.01)
+    doors = sorted(lines(plan.document, "door"), key=lambda line: line.bounds)
+    assert [door.bounds[0] for door in doors] == pytest.approx([1.0, 5.0, 9.0], abs=0.01)
+    assert [door.length for door in doors] == pytest.approx([0.9] * 3, abs=0.02)
+    assert not lines(plan.document, "passage")
+
+
+def test_drawing_without_rooms_names_layers_and_attempts():
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    for x in range(5):
+        document.modelspace().add_line((x, 0), (x, 9), dxfattribs={"layer": "WALL"})
+    with pytest.raises(
+        InvalidFloorPlanError, match=r"has 5 lines: wall on 'WALL' \(tried: rooms are the areas enclosed"
+    ):
+        import_plan(dxf_file(document))
 
 
 def test_unknown_layers_are_rejected_with_the_known_ones():
@@ -199,3 +245,59 @@ def test_role_of_a_layer(layer: str, role: str | None):
 )
 def test_type_of_a_room(name: str, kind: str | None):
     assert room_type_from_name(name) == kind
+
+
+def _dimensioned_svg(unit: float, texts: tuple[str, ...]) -> bytes:
+    """Draw two rooms of 4 m and 5 m by 3 m in units of 1 / `unit` m, with three chained dimensions and one in all."""
+    walls = ((0, 0, 9.3, 0), (0, 3.2, 9.3, 3.2), (0, 0, 0, 3.2), (4.2, 0, 4.2, 3.2), (9.3, 0, 9.3, 3.2))
+    chains = (((0.1, 4.1), 3.6), ((4.3, 9.2), 3.6), ((0, 9.3), 4.0))
+    shapes = [f'<line x1="{a * unit}" y1="{b * unit}" x2="{c * unit}" y2="{d * unit}"/>' for a, b, c, d in walls]
+    shapes.append(f'<line x1="0" y1="{3.6 * unit}" x2="{9.3 * unit}" y2="{3.6 * unit}"/>')
+    shapes.append(f'<line x1="0" y1="{4.0 * unit}" x2="{9.3 * unit}" y2="{4.0 * unit}"/>')
+    for (start, end), y in chains:
+        shapes += [
+            f'<line x1="{x * unit}" y1="{(y - 0.1) * unit}" x2="{x * unit}" y2="{(y + 0.1) * unit}"/>'
+            for x in (start, end)
+        ]
+    shapes += [
+        f'<text x="{0.5 * (start + end) * unit}" y="{(y - 0.05) * unit}">{text}</text>'
+        for ((start, end), y), text in zip(chains, texts, strict=True)
+    ]
+    drawn = f'<g id="walls">{"".join(shapes[:5])}</g>{"".join(shapes[5:])}'
+    head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 900 500"><g stroke="black" stroke-width="1">'
+    return f"{head}{drawn}</g></svg>".encode()
+
+
+@pytest.mark.parametrize("texts", [("4.00", "4,90", "9.30 m"), ("400", "490 cm", "930"), ("4000", "4900", "9300")])
+def test_dimensions_give_the_scale(texts: tuple[str, ...]):
+    plan = import_plan(_dimensioned_svg(37.0, texts))
+    assert plan.report.scale_source == "3 dimensions written in the drawing"
+    assert plan.report.metres_per_unit == pytest.approx(1.0 / 37.0, rel=1e-3)
+    assert max(room.bounds[2] for room in shapes(plan.document)) == pytest.approx(9.3, abs=0.05)
+
+
+@pytest.mark.parametrize("texts", [("4.00", "5.90", "9.30"), ("12", "4.90", "9.30"), ("4.00", "4.90", "R 7")])
+def test_dimensions_that_disagree_give_no_scale(texts: tuple[str, ...]):
+    with pytest.raises(InvalidFloorPlanError, match="gives no scale"):
+        import_plan(_dimensioned_svg(37.0, texts))
+
+
+def test_whole_numbers_of_a_large_drawing_are_ambiguous():
+    dimensions = [("400", [4.0]), ("490", [4.9]), ("930", [9.3])]
+    assert scale_by_dimensions(dimensions, 9.3) == (pytest.approx(1.0), "3 dimensions written in the drawing")
+    # 50 m in centimetres, or 5 m in millimetres.
+    assert scale_by_dimensions(dimensions, 50.0) is None
+    feet = [("13'-1\"", [400.0]), ("16' 4\"", [498.0]), ("30'", [914.0])]
+    assert scale_by_dimensions(feet, 1000.0) == (pytest.approx(0.01, rel=5e-3), "3 dimensions written in the drawing")
+
+
+def test_dimensions_of_a_dxf_give_its_unit():
+    document = _german_walls(insunits=0)
+    with pytest.raises(InvalidFloorPlanError, match="gives no unit"):
+        import_plan(dxf_file(document))
+    space = document.modelspace()
+    for start, end in ((0, 4000), (0, 6200), (4000, 6200)):
+        space.add_linear_dim(base=(0, -900), p1=(start, 0), p2=(end, 0), dimstyle="Standard").render()
+    plan = import_plan(dxf_file(document))
+    assert plan.report.scale_source == "3 dimensions written in the drawing"
+    assert plan.report.metres_per_unit == pytest.approx(1e-3)

@@ -19,6 +19,7 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
 from lalaloc_core.importers.common.report import ReportBuilder
@@ -206,10 +207,11 @@ def test_import_above_the_time_limit():
     ("content", "message"),
     [
         (b"", "empty"),
-        (b"hello there", "in no known format; supported formats are native JSON, GeoJSON, IMDF, DXF"),
-        (b"AC1032 dwg", "a DWG drawing, which cannot be read: save it as DXF"),
+        (b"hello there", "in no known format; supported formats are native JSON, GeoJSON, OpenStreetMap"),
+        (b"AC1032 dwg", "a DWG drawing, and no program that reads it is installed|could not read the DWG drawing"),
+        (b'{"doors": [], "foo": 1}', "the members 'doors', 'foo', of no known format; .* RoomPlan 'walls'"),
         (b"GIF89a", "a GIF picture, which cannot be read: save it as PNG"),
-        (b"<html></html>", "XML without an <svg> element"),
+        (b"<html></html>", "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"),
         (b"Rar!....", "a RAR archive, which cannot be read: unpack it"),
         (b"[1, 2]", "the JSON is a list"),
         (b"%PDF-1.7 nothing", "cannot be read"),
@@ -262,7 +264,15 @@ def test_obstacles_are_compared_with_the_rooms_near_them(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(shapely.Polygon, "intersects", counted)
     options = ImportOptions(ceiling_height_m=2.5)
-    plan = assemble(lined_up_rooms(40), ReportBuilder(), options, format="dxf", metres_per_unit=1.0, scale_source="m")
+    plan = assemble(
+        lined_up_rooms(40),
+        ReportBuilder(),
+        options,
+        DEFAULT_LIMITS,
+        format="dxf",
+        metres_per_unit=1.0,
+        scale_source="m",
+    )
     assert all(len(room["holes"]) == 1 for room in plan.document["rooms"])
     assert len(compared) == 40
 

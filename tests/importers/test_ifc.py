@@ -20,7 +20,7 @@ DUPLEX = next((parent / _NAME for parent in Path(__file__).parents if (parent / 
 
 
 class _Model:
-    """IFC 4 model in millimetres, of one storey."""
+    """IFC 4 model in millimetres."""
 
     def __init__(self) -> None:
         self.file: Any = ifcopenshell.file(schema="IFC4")
@@ -29,7 +29,12 @@ class _Model:
         self.context = make("IfcGeometricRepresentationContext", None, "Model", 3, 1e-5, self.placement((0, 0, 0)))
         self.project = make("IfcProject", ifcopenshell.guid.new(), UnitsInContext=units)
         self.project.RepresentationContexts = [self.context]
-        self.storey = make("IfcBuildingStorey", ifcopenshell.guid.new(), Name="EG", Elevation=0.0)
+        self.begin_storey("EG", 0.0)
+
+    def begin_storey(self, name: str, elevation: float) -> None:
+        """Add a storey, which further elements belong to."""
+        make = self.file.create_entity
+        self.storey = make("IfcBuildingStorey", ifcopenshell.guid.new(), Name=name, Elevation=elevation)
         make("IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=self.project, RelatedObjects=[self.storey])
 
     def placement(self, origin: tuple[float, float, float]) -> Any:
@@ -86,6 +91,22 @@ def ifc_flat() -> _Model:
     column = model.prism("IfcColumn", _box(7000, 2000, 7300, 2300), 0, 2600)
     model.contain(door, window, column)
     return model
+
+
+def ifc_house() -> _Model:
+    """Return the flat with a storey above it, and a roof that has a space without a floor."""
+    model = ifc_flat()
+    model.begin_storey("Obergeschoss", 3000.0)
+    model.spaces(model.prism("IfcSpace", _box(0, 0, 9000, 3000), 3000, 2400, LongName="Atelier"))
+    model.begin_storey("Dach", 6000.0)
+    model.spaces(model.prism("IfcSpace", _box(0, 0, 200, 200), 6000, 2400, LongName="Schacht"))
+    return model
+
+
+def test_levels_without_a_room_are_left_out():
+    plans = import_plans(ifc_house().content(), building="Haus")
+    assert [plan.plan().name for plan in plans] == ["Haus – EG", "Haus – Obergeschoss"]
+    assert "level 'Dach' has no room and was left out" in plans[0].report.notes
 
 
 def test_ifc_elements_give_rooms_openings_and_holes():

@@ -72,6 +72,35 @@ def test_drawings_of_plan_svg_are_read_back(coloured: bool):
         assert all(min(shapely.hausdorff_distance(line, near) for near in found_lines) < 0.2 for line in true)
 
 
+def open_hall(gap_m: float = 2.4) -> bytes:
+    """Return a picture of two rooms at 1 cm per pixel, the right one with a gap in its outer wall."""
+    page = Image.new("L", (1100, 500), 255)
+    pen = ImageDraw.Draw(page)
+    pen.rectangle((100, 100, 1000, 400), outline=0, width=20)
+    pen.line((550, 100, 550, 400), fill=0, width=16)
+    # Without a symbol so wide a gap is no opening, and the room to the right stays open.
+    if gap_m:
+        pen.rectangle((660, 375, 660 + 100 * gap_m, 410), fill=255)
+    stream = io.BytesIO()
+    page.save(stream, "PNG")
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("gap_m", [0.0, 2.4])
+def test_area_without_rooms_is_reported(gap_m: float):
+    plan = import_plan(open_hall(gap_m), ImportOptions(metres_per_pixel=0.01))
+    warnings = [text for text in plan.report.warnings if "without a room" in text]
+    assert len(plan.document["rooms"]) == (1 if gap_m else 2)
+    assert bool(warnings) == bool(gap_m)
+    if gap_m:
+        assert re.search(r"cover only [45]\d% .* without a room are 1\d m² at \(7\.", warnings[0])
+        (outline,) = plan.report.no_room
+        # The drawing marks it: x from 5.6 to 9.9 m, y from 1.1 to 3.9 m.
+        assert shapely.Polygon(outline).bounds == pytest.approx((5.6, 1.1, 9.9, 3.9), abs=0.2)
+    else:
+        assert plan.report.no_room == ()
+
+
 def test_single_line_is_a_window_outside_and_a_passage_inside():
     page = Image.new("L", (900, 500), 255)
     pen = ImageDraw.Draw(page)

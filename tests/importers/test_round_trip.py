@@ -76,9 +76,9 @@ def test_imdf_archive_conforms_to_the_standard(flat: FloorPlan):
 def test_invalid_exports_are_rejected(flat: FloorPlan):
     with pytest.raises(InvalidFloorPlanError, match="anchor"):
         export_plan(flat, "imdf")
-    with pytest.raises(InvalidFloorPlanError, match="set it to one of native, geojson, imdf, dxf, svg"):
+    with pytest.raises(InvalidFloorPlanError, match="set it to one of native, geojson, imdf, dxf, svg, ros"):
         export_plan(flat, "dwg")
-    assert set(EXPORT_FORMATS) == {"native", "geojson", "imdf", "dxf", "svg"}
+    assert set(EXPORT_FORMATS) == {"native", "geojson", "imdf", "dxf", "svg", "ros"}
 
 
 def test_scale_option_overrides_an_exported_scale(flat: FloorPlan):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,21 +18,28 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.checks import check_document
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.limits import ImportLimits
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ImportReport, ReportBuilder
-from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, chosen_levels
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
+# Tolerances (m) tried in turn for outlines with more vertices than allowed, such as curved walls.
+_SIMPLER_M = (0.005, 0.01, 0.02)
 _FAR_M = 10_000.0
 # Up to this distance from an anchor, lengths and directions are accurate to a few centimetres.
 _MAX_ANCHOR_SHIFT_M = 20_000.0
 # Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
-_MAX_NAMED = 5
+_MAX_NAMED, _MAX_USES = 5, 12
+
+
+class NoRoomError(InvalidFloorPlanError):
+    """A level of a file has no room."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +73,7 @@ def assemble(
     sketch: Sketch,
     builder: ReportBuilder,
     options: ImportOptions,
+    limits: PlanLimits,
     *,
     format: str,
     metres_per_unit: float,
@@ -73,14 +82,19 @@ def assemble(
 ) -> ImportedPlan:
     """Make a plan from a sketch in metres, y up.
 
+    Outlines with more vertices than `limits` allows are simplified within 2 cm.
+
     Raises:
-        InvalidFloorPlanError: the sketch has no rooms, or the plan is invalid.
+        NoRoomError: the sketch has no rooms.
+        InvalidFloorPlanError: the plan is invalid.
     """
     obstacles = shapely.STRtree(sketch.obstacles)
-    rooms = [room for drawn in sketch.rooms for room in _clean(drawn, obstacles, builder)]
+    rooms = [room for drawn in sketch.rooms for room in _clean(drawn, obstacles, limits, builder)]
     if not rooms:
-        raise InvalidFloorPlanError(
-            f"no room was found in the {format} file, which has {_contents(builder)}; check layers, level and the scale"
+        raise NoRoomError(
+            f"no room was found in the {format} file, which has {_contents(builder)}"
+            + (f" (tried: {'; '.join(builder.notes[:_MAX_NAMED])})" if builder.notes else "")
+            + "; check layers, level and the scale"
         )
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shifted(opening, shift) for opening in sketch.openings]
@@ -105,11 +119,51 @@ def assemble(
         document["openings"] = [_opening(opening) for opening in placed.openings]
     if sketch.opening_kinds is not None:
         document["opening_kinds"] = list(sketch.opening_kinds)
-    builder.warnings.extend(check_document(document))
+    # Coordinates on Earth have no unit that could be mistaken.
+    builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
     # Validate now, while the error can still refer to the file.
-    checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
+    checked = (limits, FloorPlan.from_dict(document, limits))
     report = builder.build(format, metres_per_unit, scale_source, is_draft=is_draft)
     return ImportedPlan(document, report, sketch.level, anchor, checked)
+
+
+def assemble_levels(
+    levels: Mapping[str, tuple[Level, T]],
+    options: ImportOptions,
+    limits: ImportLimits,
+    make: Callable[[Level, T], ImportedPlan],
+) -> tuple[ImportedPlan, ...]:
+    """Return the plans of the chosen levels, lowest first; of several levels, those without a room are left out.
+
+    Args:
+        levels: levels of a file, with their contents.
+        options: options of the import.
+        limits: limits of the import.
+        make: makes the plan of a level.
+
+    Raises:
+        InvalidFloorPlanError: no level is chosen, none has a room, or the plan of one is invalid; names the level.
+    """
+    chosen = chosen_levels(levels, options)
+    if len(chosen) > limits.max_levels:
+        raise InvalidFloorPlanError(
+            f"the file has {len(chosen)} levels; the limit is {limits.max_levels} (max_levels); choose one with level"
+        )
+    plans: list[ImportedPlan] = []
+    empty: dict[str, NoRoomError] = {}
+    for level, content in chosen:
+        try:
+            plans.append(make(level, content))
+        except NoRoomError as error:
+            empty[level.name] = error
+        except InvalidFloorPlanError as error:
+            if len(chosen) == 1:
+                raise
+            raise InvalidFloorPlanError(f"level '{level.name}': {error}") from error
+    if not plans:
+        raise next(iter(empty.values()))
+    notes = tuple(f"level '{name}' has no room and was left out" for name in list(empty)[:_MAX_NAMED])
+    return tuple(replace(plan, report=replace(plan.report, notes=(*plan.report.notes, *notes))) for plan in plans)
 
 
 def clean_name(name: str | None) -> str | None:
@@ -120,20 +174,25 @@ def clean_name(name: str | None) -> str | None:
     return " ".join(spaced.split())[: DEFAULT_LIMITS.max_name_length] or None
 
 
-def _clean(room: SketchedRoom, obstacles: shapely.STRtree, builder: ReportBuilder) -> list[SketchedRoom]:
+def _clean(
+    room: SketchedRoom, obstacles: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder
+) -> list[SketchedRoom]:
+    label = f"room '{room.name}'" if room.name else "a room without a name"
     shape = room.shape
     for obstacle in obstacles.geometries[np.sort(obstacles.query(shape))]:
         if obstacle.intersects(shape):
             shape = shapely.difference(shape, obstacle)
-    floors = [simple for floor in polygons_from_geometry(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]
-    floors = [floor for floor in floors if floor.area >= DEFAULT_LIMITS.min_room_area_m2]
-    label = f"room '{room.name}'" if room.name else "a room without a name"
+    floors = [
+        simple
+        for floor in polygons_from_geometry(shape)
+        for simple in _simple(_simplified(floor, label, limits, builder))
+    ]
+    floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
     if not floors and room.shape.area < _SLIVER_M2:
         return []
     if not floors:
         builder.notes.append(
-            f"{label} of {room.shape.area:.2g} m² was left out: the smallest room is "
-            f"{DEFAULT_LIMITS.min_room_area_m2:g} m²"
+            f"{label} of {room.shape.area:.2g} m² was left out: the smallest room is {limits.min_room_area_m2:g} m²"
         )
         return []
     if len(floors) > 1:
@@ -146,6 +205,28 @@ def _clean(room: SketchedRoom, obstacles: shapely.STRtree, builder: ReportBuilde
         kind = room.type or room_type_from_name(name)
         cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
     return cleaned
+
+
+def _simplified(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: ReportBuilder) -> BaseGeometry:
+    """Return a floor without vertices on straight walls, and within the limit of vertices if 2 cm suffice for that."""
+    shape = floor.simplify(_STRAIGHT_M)
+    drawn, limit = _vertices(shape), limits.max_vertices_per_room
+    for tolerance_m in _SIMPLER_M:
+        if _vertices(shape) <= limit:
+            break
+        shape = floor.simplify(tolerance_m)
+    if drawn > limit:
+        builder.notes.append(
+            f"{label} has {drawn} vertices; the limit is {limit} (LALALOC_MAX_VERTICES), so its outline was simplified "
+            f"within {100.0 * _SIMPLER_M[-1]:g} cm to {_vertices(shape)}"
+        )
+    return shape
+
+
+def _vertices(shape: BaseGeometry) -> int:
+    return sum(
+        len(ring.coords) - 1 for part in polygons_from_geometry(shape) for ring in (part.exterior, *part.interiors)
+    )
 
 
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
@@ -241,5 +322,6 @@ def _xy(point: tuple[float, ...]) -> list[float]:
 
 
 def _contents(builder: ReportBuilder) -> str:
-    uses = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(builder.uses.items())][:_MAX_NAMED]
-    return ", ".join(uses) or "nothing that could be a room"
+    uses = [f"{count} {use} on '{layer}'" for (layer, use), count in builder.uses.most_common()]
+    more = f" and {len(uses) - _MAX_USES} more" if len(uses) > _MAX_USES else ""
+    return ", ".join(uses[:_MAX_USES]) + more or "nothing that could be a room"

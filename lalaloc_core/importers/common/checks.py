@@ -22,16 +22,17 @@ _MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
 _UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
 
 
-def check_document(document: Mapping[str, Any]) -> list[str]:
+def check_document(document: Mapping[str, Any], *, is_scale_certain: bool = False) -> list[str]:
     """Return warnings about a plan as `FloorPlan.from_dict` expects it, except overlaps, of which `FloorPlan` warns.
 
-    Values of the document may be out of range.
+    Values of the document may be out of range. With `is_scale_certain`, rooms and doors of unusual size give no
+    warning.
     """
     rooms = [shapely.Polygon(room["polygon"]) for room in document["rooms"]]
     names = [room.get("name", f"room {index + 1}") for index, room in enumerate(document["rooms"])]
     warnings = _ceiling_warnings(document, names)
-    warnings += _door_warnings(document)
-    warnings += _size_warnings(rooms)
+    if not is_scale_certain:
+        warnings += _door_warnings(document) + _size_warnings(rooms)
     duplicates = [name for name, count in Counter(names).items() if count > 1]
     if duplicates:
         warnings.append(f"rooms share a name: {_listed(duplicates)}; answers distinguish them by id only")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, PlanLimits
+from lalaloc_core.importers.common.trace import Trace
 
 _REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
 
@@ -24,15 +25,17 @@ class ImportLimits:
         max_entities: number of lines, polygons, texts and blocks, plus their vertices.
         max_depth: nesting depth of elements, blocks and objects.
         max_plan_pixels: pixels of a picture, or of a page that is rendered.
+        max_levels: number of storeys with rooms.
         max_import_s: duration of an import. It is checked between entities, so a library call can exceed it.
     """
 
-    max_plan_bytes: int = 50_000_000
+    max_plan_bytes: int = 40 * 2**20
     max_unpacked_bytes: int = 200_000_000
     max_archive_files: int = 200
     max_entities: int = 300_000
     max_depth: int = 64
     max_plan_pixels: int = 40_000_000
+    max_levels: int = 200
     max_import_s: float = 30.0
     plan: PlanLimits = DEFAULT_LIMITS
 
@@ -47,10 +50,15 @@ DEFAULT_IMPORT_LIMITS = ImportLimits()
 
 @dataclass
 class Budget:
-    """Counter of the entities and the time that an import has used."""
+    """Counter of the entities and the time that an import has used.
+
+    Attributes:
+        trace: receives what is read from a drawing, if anyone asks for it.
+    """
 
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS
     clock: Callable[[], float] = time.monotonic
+    trace: Trace | None = None
     entities: int = 0
     started_s: float = field(init=False)
 

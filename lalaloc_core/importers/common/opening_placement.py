@@ -14,13 +14,15 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.common.geometry import cross, point_xy
-from lalaloc_core.importers.common.sketch import SketchedOpening
+from lalaloc_core.importers.common.geometry import cross, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.sketch import Point, SketchedOpening
 
 # Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
 MAX_WALL_THICKNESS_M = 0.7
 _STRAIGHT = math.sin(math.radians(12.0))
 _MIN_LENGTH_M = 0.25
+# Rounding of points that should lie on a wall (m).
+_ON_WALL_M = 0.05
 _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
@@ -54,6 +56,35 @@ def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.
         else:
             kept.append(free)
     return PlacedOpenings(kept, off_wall, overlapping)
+
+
+class WallLines:
+    """Straight walls of rooms, for openings drawn as points.
+
+    Vertices that lie on a straight wall within 5 cm, as the doors of OpenStreetMap do, do not divide it.
+    """
+
+    def __init__(self, rooms: Sequence[shapely.Polygon]) -> None:
+        self._edges = _edges([part for room in rooms for part in polygons_from_geometry(room.simplify(_ON_WALL_M))])
+        self._tree = shapely.STRtree([_segment(edge) for edge in self._edges])
+
+    def line_at(self, point: Point, width_m: float) -> tuple[Point, Point] | None:
+        """Return the ends of an opening of a width on the longest of the walls nearest to a point, None if none is."""
+        near = self._tree.query(shapely.Point(point), predicate="dwithin", distance=MAX_WALL_THICKNESS_M)
+        segments = [_segment(self._edges[index]) for index in near]
+        apart = [segment.distance(shapely.Point(point)) for segment in segments]
+        nearest = min(apart, default=0.0) + _ON_WALL_M
+        wall = max(
+            (s for s, away in zip(segments, apart, strict=True) if away <= nearest),
+            key=lambda s: s.length,
+            default=None,
+        )
+        if wall is None:
+            return None
+        half = 0.5 * min(width_m, wall.length)
+        middle = min(max(wall.project(shapely.Point(point)), half), wall.length - half)
+        start, end = wall.interpolate(middle - half), wall.interpolate(middle + half)
+        return (start.x, start.y), (end.x, end.y)
 
 
 def _edges(rooms: Sequence[shapely.Polygon]) -> Float[np.ndarray, "n 4"]:

@@ -6,8 +6,14 @@ from collections import Counter
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import shapely
+
+# Corners of an area in metres.
+Outline = tuple[tuple[float, float], ...]
 # Limits the size of the report on a file full of mistakes.
-_MAX_LINES = 50
+_MAX_LINES, _MAX_AREAS = 50, 20
+# Detail (m) that outlines in reports leave out.
+_COARSE_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class ImportReport:
         is_draft: the plan was inferred from a picture or from unnamed lines; review it before use.
         layers: use of the entities, by layer.
         unsure: guesses and their reasons.
+        no_room: outlines (m) of the largest areas inside the drawn walls that became no room.
     """
 
     format: str
@@ -40,6 +47,7 @@ class ImportReport:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
+    no_room: tuple[Outline, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -48,12 +56,13 @@ class ImportReport:
 
 @dataclass
 class ReportBuilder:
-    """Report under construction while a file is read."""
+    """Report under construction while a file is read; `no_room` are areas in metres inside walls, largest first."""
 
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     unsure: list[str] = field(default_factory=list)
     uses: Counter[tuple[str, str]] = field(default_factory=Counter)
+    no_room: list[shapely.Polygon] = field(default_factory=list)
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -71,6 +80,7 @@ class ReportBuilder:
             notes=_bounded(self.notes),
             warnings=_bounded(self.warnings),
             unsure=_bounded(self.unsure),
+            no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
         )
 
 
@@ -79,3 +89,7 @@ def _bounded(lines: list[str]) -> tuple[str, ...]:
     if len(distinct) <= _MAX_LINES:
         return tuple(distinct)
     return (*distinct[:_MAX_LINES], f"and {len(distinct) - _MAX_LINES} more")
+
+
+def _outline(area: shapely.Polygon) -> Outline:
+    return tuple((round(x, 2), round(y, 2)) for x, y in area.exterior.simplify(_COARSE_M).coords[:-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
@@ -16,6 +17,7 @@ OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]
 T = TypeVar("T")
 _MAX_NAMED_LEVELS = 12
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,11 @@ class Level:
     name: str
     number: float | None = None
     elevation_m: float | None = None
+
+    @property
+    def title(self) -> str:
+        """Name of the storey in a plan's name: "Level 1", also if the file has the number alone."""
+        return f"Level {self.name}" if _NUMBER.fullmatch(self.name) else self.name
 
     def matches(self, wanted: str) -> bool:
         """Return whether the option `level` names this storey, by name or number."""

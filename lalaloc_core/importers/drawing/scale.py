@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
@@ -20,11 +20,12 @@ def drawing_scale(
     paper_m_per_unit: float | None = None,
     own: tuple[float, str] | None = None,
     texts: Iterable[str] = (),
+    dimensions: Callable[[], tuple[float, str] | None] = lambda: None,
 ) -> tuple[float, str]:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then `texts`, which can contain "1:100" if
-    a unit has a length on paper. `subject` names the file in the error message.
+    a unit has a length on paper, then the `dimensions`. `subject` names the file in the error message.
 
     Raises:
         InvalidFloorPlanError: neither the options nor the file give a scale.
@@ -47,6 +48,8 @@ def drawing_scale(
     written = written_scale(texts)
     if written is not None and paper_m_per_unit is not None:
         return written * paper_m_per_unit, f"1:{written:g}, written in the drawing"
+    if (measured := dimensions()) is not None:
+        return measured
     hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
     raise InvalidFloorPlanError(
         f"{subject} gives no scale{hint}: set scale (1:100), metres_per_pixel (metres per unit of the drawing) or "

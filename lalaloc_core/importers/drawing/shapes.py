@@ -104,8 +104,10 @@ class Drawing:
         )
 
 
-def fit_swing(points: Float[np.ndarray, "n 2"], layer: str) -> Swing | None:
-    """Return the quarter circle that a curve follows, None if it is too long, too short or not round."""
+def fit_swing(
+    points: Float[np.ndarray, "n 2"], layer: str, angles_deg: tuple[float, float] = _SWING_DEG
+) -> Swing | None:
+    """Return the arc that a curve follows, None if its angle is outside `angles_deg` or it is not round."""
     if len(points) < 4 or not np.isfinite(points).all():
         return None
     middle = points.mean(axis=0)
@@ -121,7 +123,7 @@ def fit_swing(points: Float[np.ndarray, "n 2"], layer: str) -> Swing | None:
     if radius <= 0.0 or float(np.abs(radii - radius).max()) > _ROUND * radius:
         return None
     angles = np.unwrap(np.arctan2(*(local - centre).T[::-1]))
-    if not _SWING_DEG[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= _SWING_DEG[1]:
+    if not angles_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= angles_deg[1]:
         return None
     hinge, first, last = centre + middle, points[0], points[-1]
     return Swing((float(hinge[0]), float(hinge[1])), (float(first[0]), float(first[1])),

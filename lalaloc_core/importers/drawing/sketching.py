@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,18 +21,20 @@ from lalaloc_core.importers.common.geometry import opening_line
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.common.trace import Trace, TracePart
+from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
+from lalaloc_core.importers.drawing.leaves import LEAF_M, take_leaves
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
 
 _MIN_ROOM_M2 = 0.6
-# Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
-_LEAF_M = (0.45, 1.6)
 # Largest distance between parts of one symbol (leaf, frame, panes).
 _SYMBOL_M = 0.12
 _OPENING_M = (0.3, 8.0)
 # Largest distance of a hinge from an end of its gap, and width of a leaf as a share of the gap.
 _HINGE_M, _LEAF_OF_GAP = 0.4, (0.7, 1.35)
+# Largest distance of the tip of an open leaf from the other end of its gap, as a share of the gap: open by 90°.
+_OPEN_LEAF = 1.45
 # Area written after a room's name.
 _SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z])\)?", re.IGNORECASE)
 # Width of pens that draw walls.
@@ -39,6 +42,10 @@ _THICK_M = (0.05, 0.6)
 # Lines of walls nearer to a room's outline are its own walls.
 _OFF_WALL_M = 0.03
 _MAX_SEGMENTS = 60_000
+# Parts of a trace by the roles of lines.
+_TRACED: Mapping[Role | None, TracePart] = {None: "line", "wall": "wall line", "room": "line", "door": "door",
+                                            "window": "window", "passage": "passage", "obstacle": "other",
+                                            "ignored": "other", "text": "other"}  # fmt: skip
 
 
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:
@@ -48,22 +55,37 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         InvalidFloorPlanError: the drawing has too many lines that could be walls, or the time is over.
     """
     sketch = Sketch()
+    _trace_drawing(drawing, budget.trace)
     rooms = [area for area in drawing.areas if area.role == "room"]
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
     gaps: Sequence[Gap] = ()
+    leaves: Sequence[Swing] = ()
     if rooms:
         shapes = _without_containers(rooms, builder)
         sketch.inner_walls = _free_standing(drawing, shapes)
         builder.notes.append("rooms are the areas that the file marks as rooms")
     else:
+        walls = take_leaves([stroke for stroke in drawing.strokes if stroke.role in (None, "wall")], drawing.swings)
+        others = [stroke for stroke in drawing.strokes if stroke.role not in (None, "wall")]
+        leaves = walls.swings
+        drawing = replace(drawing, strokes=[*walls.strokes, *others])
         enclosed, source = _enclosed(drawing, budget)
         gaps = enclosed.gaps
+        if leaves:
+            builder.notes.append(f"{len(leaves)} leaves of doors and their arcs are not walls")
+        if budget.trace is not None:
+            budget.trace.add("wall", [enclosed.walls])
+            budget.trace.add("gap", [gap.shape for gap in gaps])
         shapes = [Area(shape, "", "room") for shape in enclosed.rooms]
         builder.notes.append(
             f"rooms are the areas enclosed by {source}; gaps up to {DEFAULT_WALLS.widest_gap:g} m were closed"
         )
     sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
-    sketch.openings = [*_symbols(drawing), *_swings(drawing.swings, gaps, shapes)]
+    if budget.trace is not None:
+        budget.trace.add("room", [room.shape for room in sketch.rooms])
+    # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
+    closing = [swing for swing in leaves if _gap_of(swing, gaps) is not None]
+    sketch.openings = [*_symbols(drawing), *_swings([*drawing.swings, *closing], gaps, shapes)]
     taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
     for gap in gaps:
         line = shapely.LineString([gap.start, gap.end])
@@ -75,6 +97,17 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             )
     budget.check_time()
     return sketch
+
+
+def _trace_drawing(drawing: Drawing, trace: Trace | None) -> None:
+    """Add the lines of a drawing to a trace, by their roles."""
+    if trace is None:
+        return
+    for role, part in _TRACED.items():
+        trace.add(part, [stroke.line for stroke in drawing.strokes if stroke.role == role])
+        trace.add(part, [area.shape.boundary for area in drawing.areas if area.role == role])
+    swings = [np.array([swing.first, swing.hinge, swing.last]) for swing in drawing.swings]
+    trace.add("door", [shapely.LineString(points) for points in swings])
 
 
 def _free_standing(drawing: Drawing, rooms: Sequence[Area]) -> list[shapely.LineString]:
@@ -243,7 +276,7 @@ def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area])
     found: list[SketchedOpening] = []
     closed: set[int] = set()
     for swing in swings:
-        if not _LEAF_M[0] <= swing.radius <= _LEAF_M[1]:
+        if not LEAF_M[0] <= swing.radius <= LEAF_M[1]:
             continue
         index = _gap_of(swing, gaps)
         if index is not None:
@@ -264,7 +297,12 @@ def _gap_of(swing: Swing, gaps: Sequence[Gap]) -> int | None:
             shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
             fits = any(_LEAF_OF_GAP[0] <= share <= _LEAF_OF_GAP[1] for share in shares)
             tip_distance = min(math.dist(swing.first, far), math.dist(swing.last, far))
-            if distance <= _HINGE_M and fits and tip_distance <= gap.width and (best is None or distance < best[0]):
+            if (
+                distance <= _HINGE_M
+                and fits
+                and tip_distance <= _OPEN_LEAF * gap.width
+                and (best is None or distance < best[0])
+            ):
                 best = (distance, index)
     return None if best is None else best[1]
 

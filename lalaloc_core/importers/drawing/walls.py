@@ -303,8 +303,14 @@ def _from_single_lines(
     ends, outward = _loose_ends(segments)
     tree, ends_tree = shapely.STRtree(segments), shapely.STRtree(np.asarray(shapely.points(ends)))
     gaps: list[Gap] = []
+    corners: list[shapely.LineString] = []
     for end, direction in zip(ends, outward, strict=True):
         check_time()
+        near = ends[_near(ends_tree, shapely.Point(end), config.snap)]
+        meeting = [shapely.LineString([end, tip]) for tip in near if 1e-9 < math.dist(tip, end) <= config.snap]
+        if meeting:
+            corners += meeting
+            continue
         ray = shapely.LineString([end + 1e-4 * direction, end + config.widest_gap * direction])
         hits = [segments[k].intersection(ray) for k in tree.query(ray, predicate="intersects")]
         reached = [shapely.distance(shapely.Point(end), hit) for hit in hits if not hit.is_empty]
@@ -320,7 +326,7 @@ def _from_single_lines(
         far = end + width * direction
         line = shapely.LineString([end, end + (width + 0.002) * direction])
         gaps.append(Gap(line.buffer(0.001), (float(end[0]), float(end[1])), (float(far[0]), float(far[1]))))
-    joints = [shapely.LineString([gap.start, gap.end]).buffer(0.002) for gap in gaps]
+    joints = [line.buffer(0.002) for line in (*corners, *(shapely.LineString([g.start, g.end]) for g in gaps))]
     walls = shapely.unary_union([line.buffer(0.002) for line in segments])
     distinct = {tuple(sorted((gap.start, gap.end))): gap for gap in gaps if gap.width >= config.narrowest_gap}
     return Enclosed(_insides([walls, *joints, *closers], config), list(distinct.values()), walls)

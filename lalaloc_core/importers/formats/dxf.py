@@ -28,18 +28,15 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.checks import likely_unit
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
-from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.drawing.sketching import sketch_drawing
+from lalaloc_core.importers.formats.dxf_unit import find_unit
 
-# (metres, value of the option `units`) by $INSUNITS; DXF reference.
-_INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
@@ -47,7 +44,6 @@ _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
 # Maximum distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
-_USUAL_EXTENT_M = (4.0, 120.0)
 # A polyline is closed if its ends are nearer than this share of its length. The distance to the origin must not matter,
 # because surveyed coordinates are large.
 _CLOSED = 1e-5
@@ -74,14 +70,18 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     _check_blocks(document, budget)
     builder = ReportBuilder()
     drawing = _read_drawing(document, options, builder, budget)
-    factor, source = _unit(document, drawing, options, builder)
+    factor, source = find_unit(document, drawing, options, builder)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
     drawing = drawing.scaled(factor, flip_y=options.y_axis == "down")
     sketch = sketch_drawing(drawing, builder, budget)
-    return (assemble(sketch, builder, options, format="dxf", metres_per_unit=factor, scale_source=source),)
+    return (
+        assemble(
+            sketch, builder, options, budget.limits.plan, format="dxf", metres_per_unit=factor, scale_source=source
+        ),
+    )
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
@@ -340,51 +340,3 @@ def _sag(document: DxfDocument) -> float:
     low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
     size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
     return _SAG * size if 0.0 < size < 1e9 else 0.01
-
-
-def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder) -> tuple[float, str]:
-    """Return the metres per unit and their source, the options or $INSUNITS.
-
-    Raises:
-        InvalidFloorPlanError: neither gives a unit; the message names the likely one.
-    """
-    code = document.header.get("$INSUNITS", 0)
-    own_unit = _INSUNITS.get(code)
-    extent = _extent(drawing)
-    if (
-        options.units is None
-        and options.known_distance is None
-        and options.metres_per_pixel is None
-        and own_unit is None
-    ):
-        fitting = likely_unit(extent, _USUAL_EXTENT_M)
-        hint = (
-            f"; it is {extent:g} units across and looks like {fitting}: units={fitting}"
-            if fitting
-            else f"; it is {extent:g} units across"
-        )
-        raise InvalidFloorPlanError(
-            f"the DXF gives no unit ($INSUNITS is {code}){hint}; set units to mm, cm, m, in or ft"
-        )
-    factor, source = drawing_scale(
-        options, "the DXF", own=None if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
-    )
-    if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
-        fitting = likely_unit(extent, _USUAL_EXTENT_M)
-        hint = (
-            f"; it looks like {fitting}: set units={fitting}"
-            if fitting and own_unit and fitting != own_unit[1]
-            else "; check units"
-        )
-        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
-    return factor, source
-
-
-def _extent(drawing: Drawing) -> float:
-    shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
-    if not shapes:
-        raise InvalidFloorPlanError(
-            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
-        )
-    x0, y0, x1, y1 = shapely.total_bounds(shapes)
-    return float(max(x1 - x0, y1 - y0))

@@ -17,7 +17,7 @@ from pyproj.exceptions import ProjError
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
-from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
@@ -28,7 +28,6 @@ from lalaloc_core.importers.common.sketch import (
     Sketch,
     SketchedOpening,
     SketchedRoom,
-    chosen_levels,
 )
 from lalaloc_core.importers.common.vocabulary import role_from_name
 
@@ -63,26 +62,32 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
     anchor = _anchor(model)
     meshes = _Meshes(budget)
-    plans = []
-    for level, (storey, spaces) in chosen_levels(storeys, options):
+
+    def make(level: Level, content: tuple[Any, list[Any]]) -> ImportedPlan:
+        storey, spaces = content
         builder = ReportBuilder()
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
         floor_m = _add_spaces(spaces, sketch, builder, meshes)
         _add_elements(storey, floor_m, sketch, builder, meshes)
-        _join_touching(sketch, builder)
         if not sketch.rooms:
-            raise InvalidFloorPlanError(
+            raise NoRoomError(
                 f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
             )
+        _join_touching(sketch, builder)
         kinds = {opening.kind for opening in sketch.openings}
         sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
-        plans.append(
-            assemble(
-                sketch, builder, options, format="ifc", metres_per_unit=_unit(model), scale_source="the model's unit"
-            )
+        return assemble(
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format="ifc",
+            metres_per_unit=_unit(model),
+            scale_source="the model's unit",
         )
-    return tuple(plans)
+
+    return assemble_levels(storeys, options, budget.limits, make)
 
 
 def _open(content: bytes) -> Any:

@@ -17,11 +17,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.features import import_features
 from lalaloc_core.importers.common.geojson_features import Projector, plan_features
 from lalaloc_core.importers.common.limits import Budget, ImportLimits
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.formats.geojson import import_features, parse_features
+from lalaloc_core.importers.formats.geojson import parse_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
 # Exported archives carry no time, so that equal plans give equal bytes.

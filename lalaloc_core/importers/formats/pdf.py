@@ -15,6 +15,7 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
+from lalaloc_core.importers.drawing.dimensions import drawn_scale
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area
 from lalaloc_core.importers.drawing.sketching import named_rooms, sketch_drawing
@@ -41,7 +42,13 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         texts = [lettering.text for lettering in found.drawing.letterings]
         # A unit of a PDF is always a point.
         without_units = replace(options, units=None)
-        factor, source = drawing_scale(without_units, "the PDF", paper_m_per_unit=_METRES_PER_POINT, texts=texts)
+        factor, source = drawing_scale(
+            without_units,
+            "the PDF",
+            paper_m_per_unit=_METRES_PER_POINT,
+            texts=texts,
+            dimensions=lambda: drawn_scale(found.drawing, budget.check_time),
+        )
         builder = ReportBuilder()
         sketch = _as_drawing(found, factor, builder, budget)
         if sketch is None or not sketch.rooms:
@@ -50,7 +57,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             sketch = _as_picture(page, found, factor, builder, budget)
     finally:
         document.close()
-    plan = assemble(sketch, builder, options, format="pdf", metres_per_unit=factor, scale_source=source, is_draft=True)
+    plan = assemble(
+        sketch,
+        builder,
+        options,
+        budget.limits.plan,
+        format="pdf",
+        metres_per_unit=factor,
+        scale_source=source,
+        is_draft=True,
+    )
     return (plan,)
 
 

@@ -47,7 +47,14 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
     return (
         assemble(
-            sketch, builder, options, format="picture", metres_per_unit=factor, scale_source=source, is_draft=True
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format="picture",
+            metres_per_unit=factor,
+            scale_source=source,
+            is_draft=True,
         ),
     )
 

@@ -11,13 +11,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
-import defusedxml
 import numpy as np
 import shapely
 import svgelements
-from defusedxml import ElementTree as SafeElementTree
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
@@ -27,6 +25,8 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
+from lalaloc_core.importers.common.xml import read_xml
+from lalaloc_core.importers.drawing.dimensions import drawn_scale
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import (
     CURVE_STEPS,
@@ -99,12 +99,21 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     builder = ReportBuilder()
     drawing = _read_drawing(root, options, builder, budget)
     texts = [lettering.text for lettering in drawing.letterings]
-    factor, source = drawing_scale(options, "the SVG", paper_m_per_unit=paper_m, own=own, texts=texts)
+    factor, source = drawing_scale(
+        options,
+        "the SVG",
+        paper_m_per_unit=paper_m,
+        own=own,
+        texts=texts,
+        dimensions=lambda: drawn_scale(drawing, budget.check_time),
+    )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
     drawing = drawing.scaled(factor, flip_y=options.y_axis != "up")
     sketch = sketch_drawing(drawing, builder, budget)
-    plan = assemble(sketch, builder, options, format="svg", metres_per_unit=factor, scale_source=source)
+    plan = assemble(
+        sketch, builder, options, budget.limits.plan, format="svg", metres_per_unit=factor, scale_source=source
+    )
     return (plan,)
 
 
@@ -146,36 +155,6 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         attributes = {"class": opening["kind"].capitalize(), "fill": "none", "points": points(opening["line"])}
         ElementTree.SubElement(root, "polyline", attributes)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-
-
-def read_xml(content: bytes, budget: Budget) -> Element:
-    """Parse XML without entities and external references, and return its root.
-
-    Raises:
-        InvalidFloorPlanError: the XML is invalid, declares entities, or exceeds a limit.
-    """
-    try:
-        root = SafeElementTree.fromstring(content, forbid_dtd=False, forbid_entities=True, forbid_external=True)
-    except defusedxml.EntitiesForbidden as error:
-        raise InvalidFloorPlanError(
-            "the XML declares entities, which are not supported; save the drawing without them (plain SVG)"
-        ) from error
-    except defusedxml.DefusedXmlException as error:
-        raise InvalidFloorPlanError(
-            f"the XML refers to other files, which are not read: {error}; save the drawing as plain SVG"
-        ) from error
-    except (ParseError, ValueError, LookupError) as error:
-        raise InvalidFloorPlanError(f"the XML is not well-formed: {error}; save the drawing again") from error
-    pending = [(root, 1)]
-    while pending:
-        element, depth = pending.pop()
-        if depth > budget.limits.max_depth:
-            raise InvalidFloorPlanError(
-                f"elements are nested more than {budget.limits.max_depth} deep (max_depth); ungroup the drawing"
-            )
-        budget.spend()
-        pending.extend((child, depth + 1) for child in element)
-    return root
 
 
 def _drop_ignored(root: Element) -> None:

@@ -59,9 +59,13 @@ class Ink:
 
 
 def read_ink(
-    gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, warmth: UInt8[np.ndarray, "h w"] | None = None
+    gray: UInt8[np.ndarray, "h w"],
+    metres_per_pixel: float,
+    warmth: UInt8[np.ndarray, "h w"] | None = None,
+    *,
+    straighten: bool = True,
 ) -> Ink:
-    """Even out the lighting, straighten the picture, and threshold it.
+    """Even out the lighting, straighten the picture unless told not to, and threshold it.
 
     Rows of `gray` are from the top, and 255 is white; for `warmth` see `Ink`.
     """
@@ -75,10 +79,10 @@ def read_ink(
     even = _even_light(gray, metres_per_pixel)
     threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     threshold = float(np.clip(threshold, *_THRESHOLD))
-    skew_deg = find_skew(even < threshold)
+    skew_deg = find_skew(even < threshold) if straighten else 0.0
     if skew_deg:
-        even = _turned(even, skew_deg)
-        warmth = None if warmth is None else _turned(warmth, skew_deg, fill=COLOURLESS)
+        even = turned(even, skew_deg)
+        warmth = None if warmth is None else turned(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
     size = (int(gray.shape[0]), int(gray.shape[1]))
     return Ink(
@@ -113,8 +117,8 @@ def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt
     return np.clip(even, 0, 255).astype(np.uint8)
 
 
-def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
-    """Return the rotation (degrees) that aligns most lines of a drawing with rows and columns.
+def find_skew(ink: Bool[np.ndarray, "h w"], reach_deg: float = _MAX_SKEW_DEG) -> float:
+    """Return the rotation (degrees) that aligns most lines of a drawing with rows and columns, up to `reach_deg`.
 
     It maximises the energy of the differences between neighbouring row sums and column sums.
     """
@@ -122,18 +126,18 @@ def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
     small = cv2.resize(ink.astype(np.float32), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
     def energy(degrees: float) -> float:
-        turned = _turned(small, degrees, fill=0.0)
-        return sum(float(np.sum(np.diff(turned.sum(axis=axis)) ** 2)) for axis in (0, 1))
+        rotated = turned(small, degrees, fill=0.0)
+        return sum(float(np.sum(np.diff(rotated.sum(axis=axis)) ** 2)) for axis in (0, 1))
 
     best = 0.0
-    for step, reach in ((1.0, _MAX_SKEW_DEG), (0.25, 1.0), (0.05, 0.25)):
+    for step, reach in ((1.0, reach_deg), (0.25, 1.0), (0.05, 0.25)):
         candidates = best + np.arange(-reach, reach + 0.5 * step, step)
         best = float(max(candidates, key=lambda degrees: energy(float(degrees))))
     # Skip small rotations, because resampling blurs a straight drawing.
     return best if abs(best) >= 0.15 and energy(best) > 1.02 * energy(0.0) else 0.0
 
 
-def _turned(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
+def turned(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
     """Rotate the picture about its centre, on a canvas that holds all of it."""
     rows, columns = picture.shape
     angle = math.radians(abs(degrees))

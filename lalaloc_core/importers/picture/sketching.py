@@ -11,6 +11,7 @@ import shapely
 from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
@@ -29,6 +30,9 @@ _MAX_ISLAND_M2 = 2.0
 # Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area.
 _OUTLINE_ADVANTAGE = 1.6
 _SURE = 0.85
+# Gaps of twice this width are closed to find the drawn area; parts of it thinner than the walls and the clearance (m)
+# are no rooms. A smaller share covered by rooms gives a warning, with its largest parts.
+_CLOSING_M, _CLEARANCE_M, _COVERED, _MAX_NAMED = 1.5, 0.2, 0.9, 5
 _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M = 1.2
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
@@ -57,17 +61,20 @@ def sketch_picture(
     builder: ReportBuilder,
     budget: Budget,
     warmth: UInt8[np.ndarray, "h w"] | None = None,
+    *,
+    straighten: bool = True,
 ) -> Sketch:
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
     Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used. The
     sketch claims no kind of opening as complete: a reviewer of the draft has to set `opening_kinds`. Rows of `gray` are
-    from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards blue.
+    from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards blue. Without
+    `straighten`, the coordinates are those of the picture even if its lines are skew.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
     """
-    ink = read_ink(gray, metres_per_pixel, warmth)
+    ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)
     budget.check_time()
     readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
     if not readings:
@@ -84,6 +91,12 @@ def sketch_picture(
             f"{_MAX_WALL_THICKNESS_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
     _report(best, ink, metres_per_pixel, builder)
+    _report_coverage(best, builder)
+    if budget.trace is not None:
+        budget.trace.add("wall", [best.enclosed.walls])
+        budget.trace.add("gap", [gap.shape for gap in best.enclosed.gaps])
+        budget.trace.add("room", best.enclosed.rooms)
+        budget.trace.add("no room", builder.no_room)
     rooms = [SketchedRoom(straightened(_without_islands(room, builder))) for room in best.enclosed.rooms]
     openings = _openings(best, ink, builder)
     if openings:
@@ -181,6 +194,32 @@ def _doubt(content: GapContent, kind: OpeningKind) -> str | None:
     if content.kind == "pane" and kind == "door":
         return "it is drawn like a window, but " + ("brown" if content.warmth >= _COLOURED else "in an inner wall")
     return f"{content.confidence:.0%} of its symbol is drawn" if content.confidence < _SURE else None
+
+
+def _report_coverage(reading: _Reading, builder: ReportBuilder) -> None:
+    """Report the share of the drawn area that became rooms, and the parts that did not."""
+    walls = shapely.union_all([reading.enclosed.walls, *(gap.shape for gap in reading.enclosed.gaps)])
+    closed = walls.buffer(_CLOSING_M, join_style="mitre")
+    drawn = shapely.union_all([shapely.Polygon(part.exterior) for part in polygons_from_geometry(closed)])
+    inside = drawn.buffer(-_CLOSING_M, join_style="mitre").difference(walls)
+    rooms = shapely.union_all(reading.enclosed.rooms)
+    half_m = 0.5 * reading.walls.thickness_m + _CLEARANCE_M
+    missing = polygons_from_geometry(inside.difference(rooms).buffer(-half_m).buffer(half_m))
+    lost = sorted((part for part in missing if part.area >= _MIN_ROOM_M2), key=lambda part: -part.area)
+    if inside.area <= 0.0:
+        return
+    builder.no_room += lost
+    share = 1.0 - sum(part.area for part in lost) / inside.area
+    builder.notes.append(f"rooms cover {share:.0%} of the area inside the drawn walls")
+    if share < _COVERED:
+        middles = (part.representative_point() for part in lost[:_MAX_NAMED])
+        places = ", ".join(
+            f"{part.area:.0f} m² at ({p.x:.1f}, {p.y:.1f})" for part, p in zip(lost, middles, strict=False)
+        )
+        builder.warnings.append(
+            f"rooms cover only {share:.0%} of the area inside the drawn walls; without a room are {places}; draw these "
+            "rooms, or send a larger picture whose walls are closed"
+        )
 
 
 def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: ReportBuilder) -> None:

@@ -1,0 +1,359 @@
+"""Features with tags, as in GeoJSON, IMDF and OpenStreetMap, and their conversion to plans.
+
+The kind of a feature is read from `feature_type` (IMDF), `indoor` (OpenStreetMap's Simple Indoor Tagging), or the words
+in `type`, `kind`, `category` and `class`. By default a polygon is a room and a line is a door.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import DEFAULT_LIMITS
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.opening_placement import WallLines
+from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.projection import projection
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import (
+    Level,
+    OpeningKind,
+    Point,
+    Sketch,
+    SketchedOpening,
+    SketchedRoom,
+)
+from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
+
+_FEATURE_TYPES: Mapping[str, Role] = {
+    "unit": "room", "room": "room", "corridor": "room", "area": "room", "opening": "door", "door": "door",
+    "window": "window", "passage": "passage", "wall": "wall", "fixture": "obstacle", "kiosk": "obstacle",
+    "column": "obstacle",
+}  # fmt: skip
+# Feature types of IMDF that are not part of a plan, and categories of units without a floor.
+_IGNORED_TYPES = {"venue", "building", "footprint", "level", "address", "section", "geofence", "anchor", "occupant",
+                  "amenity"}  # fmt: skip
+_NO_FLOOR = {"opentobelow", "structure", "column", "elevator", "escalator", "movingwalkway", "shaft"}
+# Values of `indoor` in Simple Indoor Tagging. Its files also have features that belong to no plan, such as paths.
+_INDOOR: Mapping[str, Role] = {"room": "room", "corridor": "room", "area": "room", "yes": "room", "wall": "wall",
+                               "door": "door", "column": "obstacle", "pillar": "obstacle"}  # fmt: skip
+# Roles of features with a tag, and of those where it is "no".
+_OPENING_TAGS: Mapping[str, tuple[Role, Role]] = {
+    "window": ("window", "ignored"), "door": ("door", "passage"), "entrance": ("door", "ignored"),
+}  # fmt: skip
+# Width (m) of an opening drawn as a point without a width.
+_USUAL_WIDTH_M: Mapping[OpeningKind, float] = {"door": 0.9, "window": 1.2, "passage": 1.0}
+_LENGTH = re.compile(r"(\d+(?:[.,]\d+)?)\s*(mm|cm|m|ft|in|'|\"|)(?:\s*(\d+(?:\.\d+)?)\s*(?:in|\"))?")
+_RANGE = re.compile(r"(-?\d{1,3})\s*-\s*(-?\d{1,3})")
+_MAX_LEVELS = 200
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Feature with a geometry in the file's coordinates."""
+
+    shape: BaseGeometry
+    properties: Mapping[str, Any]
+    id: str | None
+
+
+@dataclass(frozen=True)
+class _PointOpening:
+    """Opening drawn as a point on a wall, as in OpenStreetMap; `has_level` is False if it may belong to any level."""
+
+    kind: OpeningKind
+    position: Point
+    width_m: float
+    name: str | None
+    head_m: float | None
+    layer: str
+    has_level: bool
+
+
+def import_features(
+    features: Sequence[Feature],
+    crs: str | None,
+    format: str,
+    options: ImportOptions,
+    budget: Budget,
+    levels: Mapping[str, Level] | None = None,
+) -> tuple[ImportedPlan, ...]:
+    """Make one plan per level.
+
+    `crs` is the code of the features' coordinate reference system, None for WGS84, and `format` the name of the file's
+    format.
+
+    Raises:
+        InvalidFloorPlanError: there are no features, or their coordinates cannot be converted.
+    """
+    if not features:
+        raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
+    project, anchor, metres_per_unit, source = projection([feature.shape for feature in features], crs, options)
+    is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
+    by_level: dict[str, tuple[Level, list[Feature]]] = {}
+    on_any_level: list[Feature] = []
+    for feature in features:
+        keys = _levels_of(feature)
+        if not keys and is_indoor and shapely.get_dimensions(feature.shape) == 0:
+            on_any_level.append(feature)
+            continue
+        # A feature on several levels is as much work as several features.
+        budget.spend(max(len(keys) - 1, 0) * (1 + shapely.count_coordinates(feature.shape)))
+        for key in keys or ["0"]:
+            level = (levels or {}).get(key) or _level(key)
+            by_level.setdefault(key, (level, []))[1].append(feature)
+    by_level = _levels_with_rooms(by_level, is_indoor)
+
+    def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
+        builder = ReportBuilder()
+        sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
+        if anchor is not None:
+            sketch.north_deg = anchor.north_deg
+        sketch.name = level.name if len(by_level) > 1 else None
+        points: list[_PointOpening] = []
+        for feature in (*members, *on_any_level):
+            role = _indoor_role(feature) if is_indoor else _role(feature)
+            _add_to_sketch(feature, role, project(feature.shape), sketch, points, options, builder)
+            budget.check_time()
+        _add_points(points, sketch, builder)
+        return assemble(
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format=format,
+            metres_per_unit=metres_per_unit,
+            scale_source=source,
+        )
+
+    return assemble_levels(by_level, options, budget.limits, make)
+
+
+def _levels_of(feature: Feature) -> list[str]:
+    """Return the ids of a feature's levels, none if it gives none; OpenStreetMap writes "0;1" and "0-2"."""
+    found: dict[str, None] = {}
+    for key in ("level_id", "level", "ordinal", "floor", "storey", "repeat_on"):
+        value = feature.properties.get(key)
+        if found and key != "repeat_on":
+            continue
+        if isinstance(value, str):
+            parts = (part.strip() for part in value.split(";")[:_MAX_LEVELS])
+            found |= dict.fromkeys(name for part in parts for name in _level_names(part))
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            found[f"{value:g}"] = None
+    return list(found)[:_MAX_LEVELS]
+
+
+def _level_names(text: str) -> list[str]:
+    match = _RANGE.fullmatch(text)
+    if match is None:
+        return [text[:100]] if text else []
+    low, high = sorted((int(match[1]), int(match[2])))
+    return [str(number) for number in range(low, min(high, low + _MAX_LEVELS) + 1)]
+
+
+def _level(key: str) -> Level:
+    try:
+        number = float(key)
+    except ValueError:
+        number = math.nan
+    return Level(key, number if math.isfinite(number) else None)
+
+
+def _levels_with_rooms(
+    levels: dict[str, tuple[Level, list[Feature]]], is_indoor: bool
+) -> dict[str, tuple[Level, list[Feature]]]:
+    """Drop levels without a room, so that features without a level do not make one."""
+    role = _indoor_role if is_indoor else _role
+    with_rooms = {key: item for key, item in levels.items() if any(role(feature) == "room" for feature in item[1])}
+    return with_rooms or levels
+
+
+def _role(feature: Feature) -> Role:
+    properties = feature.properties
+    kind = str(properties.get("feature_type") or properties.get("indoor") or "").casefold()
+    category = str(properties.get("category") or "").casefold()
+    if kind in _IGNORED_TYPES:
+        return "ignored"
+    is_area = shapely.get_dimensions(feature.shape) == 2
+    if kind in ("unit", "area", "room") and category in _NO_FLOOR:
+        return "obstacle"
+    if kind == "opening":
+        return _opening_role(properties, category)
+    role: Role
+    if kind in _FEATURE_TYPES:
+        role = _FEATURE_TYPES[kind]
+    elif str(properties.get("door") or "no").casefold() != "no":
+        role = "door"
+    else:
+        role = "room" if is_area else "door"
+        for key in ("layer", "class", "category", "type", "kind"):
+            role = role_from_name(str(properties.get(key) or "")) or role
+    return "obstacle" if role == "wall" and is_area else role
+
+
+def _indoor_role(feature: Feature) -> Role:
+    """Return the role of a feature of OpenStreetMap's Simple Indoor Tagging."""
+    properties = feature.properties
+    is_area = shapely.get_dimensions(feature.shape) == 2
+    if not is_area:
+        for key, (yes, no) in _OPENING_TAGS.items():
+            value = str(properties.get(key) or "").casefold()
+            if value:
+                return no if value == "no" else yes
+    role: Role = _INDOOR.get(str(properties.get("indoor")), "ignored")
+    if role == "room" and any(properties.get(key) in _NO_FLOOR for key in ("room", "highway")):
+        return "obstacle"
+    if role == "room" and not is_area:
+        return "ignored"
+    return "obstacle" if role == "wall" and is_area else role
+
+
+def _opening_role(properties: Mapping[str, Any], category: str) -> Role:
+    """Return the role of an IMDF opening: a door, or a passage if `door` is null; windows need a `kind`."""
+    role = role_from_name(str(properties.get("kind") or category))
+    if role == "door" or role == "window" or role == "passage":
+        return role
+    return "passage" if "door" in properties and properties["door"] is None else "door"
+
+
+def _add_to_sketch(
+    feature: Feature,
+    role: Role,
+    shape: BaseGeometry,
+    sketch: Sketch,
+    points: list[_PointOpening],
+    options: ImportOptions,
+    builder: ReportBuilder,
+) -> None:
+    """Add a feature to the sketch by its role, or to `points` if it is an opening without a direction."""
+    properties = feature.properties
+    layer = _layer(properties)
+    if not options.includes_layer(layer, str(properties.get("category") or "")):
+        builder.use(layer, "ignored (not in the option layers)")
+    elif role == "room":
+        _add_rooms(feature, shape, layer, sketch, builder)
+    elif role == "obstacle":
+        parts = polygons_from_geometry(shape)
+        builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
+        sketch.obstacles += parts
+    elif role == "door" or role == "window" or role == "passage":
+        _add_opening(feature, role, shape, layer, sketch, points, builder)
+    elif role == "wall":
+        lines = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.LineString)]
+        pieces = [
+            shapely.LineString(pair) for line in lines for pair in zip(line.coords, line.coords[1:], strict=False)
+        ]
+        builder.use(layer, "free-standing walls", max(len(pieces), 1))
+        sketch.inner_walls += pieces
+    else:
+        builder.use(layer, "ignored")
+
+
+def _layer(properties: Mapping[str, Any]) -> str:
+    """Return the word that a report names a feature by."""
+    given = (properties.get(key) for key in ("feature_type", "indoor", "kind", "type"))
+    openings = (key for key in ("door", "window", "entrance") if properties.get(key))
+    return str(next((value for value in given if value), None) or next(openings, ""))[:100]
+
+
+def _add_rooms(feature: Feature, shape: BaseGeometry, layer: str, sketch: Sketch, builder: ReportBuilder) -> None:
+    properties, parts = feature.properties, polygons_from_geometry(shape)
+    builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
+    name = _name(properties)
+    kind = _room_type(properties, name)
+    ceiling_m = _number(properties, "ceiling_height_m", "ceiling_height", "height")
+    lowest_m, highest_m = DEFAULT_LIMITS.min_ceiling_height_m, DEFAULT_LIMITS.max_ceiling_height_m
+    if ceiling_m is not None and not lowest_m <= ceiling_m <= highest_m:
+        builder.warnings.append(
+            f"the height of '{name}' is {ceiling_m:g} m and was ignored; it must be between {lowest_m:g} and "
+            f"{highest_m:g} m"
+        )
+        ceiling_m = None
+    room_id = feature.id if len(parts) == 1 else None
+    sketch.rooms += [SketchedRoom(part, name, kind, ceiling_m, room_id) for part in parts]
+
+
+def _add_opening(
+    feature: Feature,
+    kind: OpeningKind,
+    shape: BaseGeometry,
+    layer: str,
+    sketch: Sketch,
+    points: list[_PointOpening],
+    builder: ReportBuilder,
+) -> None:
+    properties, name = feature.properties, _name(feature.properties)
+    sill_m, head_m = _number(properties, "sill_m"), _number(properties, "head_m")
+    if head_m is None and kind != "window":
+        head_m = _number(properties, "height")
+    if isinstance(shape, shapely.Point):
+        width_m = _number(properties, "width", "est_width")
+        if width_m is None or width_m <= 0.0:
+            width_m = _USUAL_WIDTH_M[kind]
+            builder.unsure.append(f"{kind}s drawn as points without a width; {width_m:g} m is assumed")
+        position = (shape.x, shape.y)
+        points.append(_PointOpening(kind, position, width_m, name, head_m, layer, bool(_levels_of(feature))))
+        return
+    ends = opening_line(shape)
+    builder.use(layer, kind if ends is not None else "ignored (no length)")
+    if ends is not None:
+        sketch.openings.append(SketchedOpening(kind, *ends, name, sill_m, head_m))
+
+
+def _add_points(points: Sequence[_PointOpening], sketch: Sketch, builder: ReportBuilder) -> None:
+    """Add the openings drawn as points, each along the nearest wall."""
+    if not points:
+        return
+    walls = WallLines([room.shape for room in sketch.rooms])
+    lost = 0
+    for point in points:
+        ends = walls.line_at(point.position, point.width_m)
+        builder.use(point.layer, point.kind if ends is not None else "ignored (on no wall of the level)")
+        if ends is not None:
+            sketch.openings.append(SketchedOpening(point.kind, *ends, point.name, None, point.head_m))
+        lost += ends is None and point.has_level
+    if lost:
+        builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
+
+
+def _name(properties: Mapping[str, Any]) -> str | None:
+    """Return the name of a feature; of IMDF's names by language the English one, else the first."""
+    for key in ("name", "alt_name", "label", "ref", "title"):
+        value = properties.get(key)
+        if isinstance(value, Mapping):
+            value = value.get("en") or next(iter(value.values()), None)
+        if isinstance(value, str) and value.strip():
+            return value
+        if isinstance(value, int) and not isinstance(value, bool):
+            return str(value)
+    return None
+
+
+def _room_type(properties: Mapping[str, Any], name: str | None) -> str | None:
+    words = [properties.get(key) for key in ("type", "room", "category", "indoor")]
+    found = [room_type_from_name(str(word)) for word in words if isinstance(word, str)]
+    return next((kind for kind in found if kind is not None), None) or room_type_from_name(name)
+
+
+def _number(properties: Mapping[str, Any], *keys: str) -> float | None:
+    """Return the first length (m) under the keys: a number, or a text such as "2.8", "90 cm" or 6'8"."""
+    for key in keys:
+        value = properties.get(key)
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+        match = _LENGTH.fullmatch(value.strip()) if isinstance(value, str) else None
+        if match is not None:
+            unit = {"'": "ft", '"': "in", "": "m"}.get(match[2], match[2])
+            inches = float(match[3] or 0.0) * METRES_PER_UNIT["in"]
+            return float(match[1].replace(",", ".")) * METRES_PER_UNIT[unit] + inches
+    return None

@@ -1,0 +1,136 @@
+"""Scale of a drawing from its dimensions: lengths that are written at lines."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import numpy as np
+import shapely
+
+from lalaloc_core.importers.drawing.shapes import Drawing
+
+# "4.20", "4,205 m", "420", "4200 mm".
+_METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{2,5})\s*(m|cm|mm|)")
+_IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″])?")
+_UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+# Whole numbers without a unit are millimetres from here on, and centimetres or millimetres below it.
+_SURELY_MM = 1000
+_LENGTH_M = (0.2, 200.0)
+# A dimension is written nearer to its line than this share of the drawing, and away from the ends of the line.
+_NEAR, _ENDS = 0.02, 0.15
+_MAX_TEXTS, _MAX_LINES_PER_TEXT, _MAX_PIECES = 1000, 12, 60_000
+# Ratios within this share agree. So many dimensions of different lengths must agree, and twice as many as on any other
+# ratio.
+_AGREE, _MIN_AGREEING, _MIN_LENGTHS, _MARGIN = 0.01, 3, 2, 2
+# Usual size of a drawing (m).
+_EXTENT_M = (3.0, 300.0)
+
+# Text of a dimension, and the lengths in units of the drawing that it may be about.
+Dimension = tuple[str, Sequence[float]]
+
+
+def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:
+    """Return metres per unit that most dimensions agree on, and their number in words; None if too few agree.
+
+    `extent` is the size of the drawing in its units.
+    """
+    votes = [
+        (math.log(value_m / length), index, value_m)
+        for index, (text, lengths) in enumerate(dimensions)
+        for value_m in _values_m(text)
+        for length in lengths
+        if length > 0.0 and _EXTENT_M[0] <= extent * value_m / length <= _EXTENT_M[1]
+    ]
+    best = _agreeing(votes)
+    middle = float(np.median([vote[0] for vote in best])) if best else 0.0
+    count = len({index for _, index, _ in best})
+    others = _agreeing([vote for vote in votes if abs(vote[0] - middle) > 3.0 * _AGREE])
+    lengths = {round(value_m, 2) for _, _, value_m in best}
+    if count < max(_MIN_AGREEING, _MARGIN * len({index for _, index, _ in others})) or len(lengths) < _MIN_LENGTHS:
+        return None
+    return math.exp(middle), f"{count} dimensions written in the drawing"
+
+
+def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
+    """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
+    shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
+    if not shapes:
+        return None
+    x0, y0, x1, y1 = shapely.total_bounds(shapes)
+    return scale_by_dimensions(_written(drawing, check_time), float(max(x1 - x0, y1 - y0)))
+
+
+def _written(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
+    """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
+    texts = [lettering for lettering in drawing.letterings if _values_m(lettering.text)][:_MAX_TEXTS]
+    points = [shapely.get_coordinates(stroke.line) for stroke in drawing.strokes]
+    ends = [pair for line in points for pair in pairwise(line) if (pair[0] != pair[1]).any()]
+    if len(texts) < _MIN_AGREEING or not ends or len(ends) > _MAX_PIECES:
+        return []
+    pieces = [shapely.LineString(pair) for pair in ends]
+    tree = shapely.STRtree(pieces)
+    x0, y0, x1, y1 = shapely.total_bounds(pieces)
+    reach = _NEAR * max(x1 - x0, y1 - y0)
+    found: list[Dimension] = []
+    for lettering in texts:
+        check_time()
+        place = shapely.Point(lettering.position)
+        near = tree.query(place, predicate="dwithin", distance=reach)
+        nearest = sorted(near, key=lambda index: pieces[index].distance(place))[:_MAX_LINES_PER_TEXT]
+        lengths = [length for index in nearest for length in _lengths_at(place, pieces[index], tree)]
+        if lengths:
+            found.append((lettering.text, lengths))
+    return found
+
+
+def _lengths_at(place: shapely.Point, line: shapely.LineString, tree: shapely.STRtree) -> list[float]:
+    """Return the length of a line, and that between the marks across it on both sides of a place."""
+    at = line.project(place)
+    is_inside = _ENDS * line.length <= at <= (1.0 - _ENDS) * line.length
+    whole = [line.length] if is_inside else []
+    crossing = tree.geometries[tree.query(line, predicate="intersects")]
+    marks = shapely.get_coordinates(shapely.intersection(crossing, line))
+    along = np.unique(np.round([line.project(shapely.Point(mark)) for mark in marks], 6))
+    below, above = along[along < at], along[along > at]
+    between = [float(above[0] - below[-1])] if len(below) and len(above) else []
+    return [*whole, *(length for length in between if not whole or abs(length - whole[0]) > 1e-6)]
+
+
+def _values_m(text: str) -> tuple[float, ...]:
+    """Return the lengths (m) that a text can mean."""
+    text = text.strip()
+    if match := _IMPERIAL.fullmatch(text):
+        values = [0.3048 * int(match[1]) + 0.0254 * int(match[2] or 0)]
+    elif match := _METRIC.fullmatch(text):
+        number, unit = float(match[1].replace(",", ".")), match[2]
+        if unit:
+            values = [number * _UNIT_M[unit]]
+        elif not match[1].isdigit():
+            values = [number]
+        else:
+            values = [0.001 * number] if number >= _SURELY_MM else [0.01 * number, 0.001 * number]
+    else:
+        values = []
+    return tuple(value for value in values if _LENGTH_M[0] <= value <= _LENGTH_M[1])
+
+
+def _agreeing(votes: Sequence[tuple[float, int, float]]) -> list[tuple[float, int, float]]:
+    """Return the votes in the window of ratios that has most dimensions."""
+    ordered = sorted(votes)
+    inside: Counter[int] = Counter()
+    first, best, window = 0, 0, (0, 0)
+    for last, (ratio, index, _) in enumerate(ordered):
+        inside[index] += 1
+        while ratio - ordered[first][0] > _AGREE:
+            left = ordered[first][1]
+            inside[left] -= 1
+            if not inside[left]:
+                del inside[left]
+            first += 1
+        if len(inside) > best:
+            best, window = len(inside), (first, last + 1)
+    return ordered[slice(*window)]

@@ -1,0 +1,90 @@
+"""Door leaves and their arcs among the lines of a drawing, which would otherwise be taken for walls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+
+from lalaloc_core.importers.common.geometry import point_xy
+from lalaloc_core.importers.drawing.shapes import Stroke, Swing, fit_swing
+
+# Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
+LEAF_M = (0.45, 1.6)
+# Angles of the arc of a leaf that is drawn half open.
+_ARC_DEG = (8.0, 125.0)
+# Smallest angle between a slanted leaf and the walls.
+_SLANTED_DEG = 8.0
+# Ends of lines nearer than this touch (m).
+_TOUCH_M = 0.03
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Lines of a drawing without door leaves, and the leaves."""
+
+    strokes: list[Stroke]
+    swings: list[Swing]
+
+
+def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing]) -> Leaves:
+    """Separate door leaves and their arcs from the lines that could be walls, in metres.
+
+    A leaf is a line as long as a door is wide with one free end, whose other end is the hinge: it is slanted against
+    most lines, or an arc turns about its hinge.
+    """
+    arcs = {index: arc for index, stroke in enumerate(strokes) if (arc := _arc(stroke)) is not None}
+    others = [stroke for index, stroke in enumerate(strokes) if index not in arcs]
+    turning = [*swings, *arcs.values()]
+    tree = shapely.STRtree([stroke.line for stroke in others])
+    axis = _axis(others)
+    kept, leaves = [], list(arcs.values())
+    for index, stroke in enumerate(others):
+        leaf = _leaf(stroke, index, tree, axis, turning)
+        if leaf is None:
+            kept.append(stroke)
+        # The arc of a leaf shows its width and both positions.
+        elif not any(math.dist(leaf.hinge, arc.hinge) <= 5 * _TOUCH_M for arc in turning):
+            leaves.append(leaf)
+    return Leaves(kept, leaves)
+
+
+def _arc(stroke: Stroke) -> Swing | None:
+    swing = fit_swing(shapely.get_coordinates(stroke.line), stroke.layer, _ARC_DEG)
+    return swing if swing is not None and LEAF_M[0] <= swing.radius <= LEAF_M[1] else None
+
+
+def _axis(strokes: Sequence[Stroke]) -> float:
+    """Return the direction (radians, modulo a quarter turn) of most lines."""
+    steps = [np.subtract(b, a) for stroke in strokes for a, b in pairwise(shapely.get_coordinates(stroke.line))]
+    if not steps:
+        return 0.0
+    x, y = np.array(steps).T
+    total = np.sum(np.hypot(x, y) * np.exp(4j * np.arctan2(y, x)))
+    return float(np.angle(total)) / 4.0
+
+
+def _leaf(stroke: Stroke, index: int, tree: shapely.STRtree, axis: float, turning: Sequence[Swing]) -> Swing | None:
+    points = shapely.get_coordinates(stroke.line)
+    if len(points) != 2 or not LEAF_M[0] <= stroke.line.length <= LEAF_M[1]:
+        return None
+    first, last = (
+        any(other != index for other in tree.query(shapely.Point(end), predicate="dwithin", distance=_TOUCH_M))
+        for end in points
+    )
+    if first == last:
+        return None
+    hinge, tip = points if first else points[::-1]
+    x, y = tip - hinge
+    off_axis = abs((math.atan2(y, x) - axis + 0.25 * math.pi) % (0.5 * math.pi) - 0.25 * math.pi)
+    has_arc = any(
+        math.dist(hinge, arc.hinge) <= 5 * _TOUCH_M and abs(arc.radius - stroke.line.length) <= 0.1 * arc.radius
+        for arc in turning
+    )
+    if math.degrees(off_axis) < _SLANTED_DEG and not has_arc:
+        return None
+    return Swing(point_xy(hinge), point_xy(tip), point_xy(tip), stroke.layer)

@@ -1,0 +1,92 @@
+"""Unit of a DXF drawing: an option, the header, or the dimensions."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import shapely
+from ezdxf.document import Drawing as DxfDocument
+from ezdxf.entities.dimension import Dimension as DimensionEntity
+from ezdxf.lldxf.const import DXFError
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.checks import likely_unit
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.drawing.dimensions import Dimension, scale_by_dimensions
+from lalaloc_core.importers.drawing.scale import drawing_scale
+from lalaloc_core.importers.drawing.shapes import Drawing
+
+# (metres, value of the option `units`) by $INSUNITS; DXF reference.
+_INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
+_USUAL_EXTENT_M = (4.0, 120.0)
+_MAX_DIMENSIONS = 1000
+
+
+def find_unit(
+    document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder
+) -> tuple[float, str]:
+    """Return the metres per unit and their source, the options, $INSUNITS or the dimensions.
+
+    Raises:
+        InvalidFloorPlanError: none gives a unit; the message names the likely one.
+    """
+    code = document.header.get("$INSUNITS", 0)
+    own_unit = _INSUNITS.get(code)
+    extent = _extent(drawing)
+    measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
+    if (
+        options.units is None
+        and options.known_distance is None
+        and options.metres_per_pixel is None
+        and own_unit is None
+        and measured is None
+    ):
+        fitting = likely_unit(extent, _USUAL_EXTENT_M)
+        hint = (
+            f"; it is {extent:g} units across and looks like {fitting}: units={fitting}"
+            if fitting
+            else f"; it is {extent:g} units across"
+        )
+        raise InvalidFloorPlanError(
+            f"the DXF gives no unit ($INSUNITS is {code}){hint}; set units to mm, cm, m, in or ft"
+        )
+    own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
+    factor, source = drawing_scale(options, "the DXF", own=own)
+    if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
+        fitting = likely_unit(extent, _USUAL_EXTENT_M)
+        hint = (
+            f"; it looks like {fitting}: set units={fitting}"
+            if fitting and own_unit and fitting != own_unit[1]
+            else "; check units"
+        )
+        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
+    return factor, source
+
+
+def _dimensions(document: DxfDocument) -> list[Dimension]:
+    """Return the texts of the linear dimensions in the model space, with the lengths that they measure."""
+    found: list[Dimension] = []
+    for entity in islice(document.modelspace().query("DIMENSION"), _MAX_DIMENSIONS):
+        try:
+            length = entity.get_measurement() if isinstance(entity, DimensionEntity) else None
+            # Angles and ordinates measure no length.
+            if not isinstance(entity, DimensionEntity) or entity.dimtype not in (0, 1) or not isinstance(length, float):
+                continue
+            style = entity.override()
+            shown = f"{round(length * style.get('dimlfac', 1.0), style.get('dimdec', 2)):g}"
+        except (DXFError, AttributeError, TypeError, ValueError, ArithmeticError):
+            continue
+        text = entity.dxf.get("text", "")
+        found.append((shown if text in ("", "<>") else text.replace("<>", shown), [length]))
+    return found
+
+
+def _extent(drawing: Drawing) -> float:
+    shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
+    if not shapes:
+        raise InvalidFloorPlanError(
+            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
+        )
+    x0, y0, x1, y1 = shapely.total_bounds(shapes)
+    return float(max(x1 - x0, y1 - y0))

@@ -1,0 +1,281 @@
+"""IndoorGML 1.x: cells become rooms, and the boundaries and transitions between them doors.
+
+The floor of a cell is its surface, or the lowest faces of its solid. A transition whose dual is a boundary with a
+geometry gives an exact door, another one a door where its line leaves a cell. https://docs.ogc.org/is/19-011r4/19-011r4.html
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.opening_placement import WallLines
+from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.common.xml import read_xml
+
+# Kinds of cells: of the core, and of the module for navigation. Doors can be cells as well.
+_CELLS = {"CellSpace", "NavigableSpace", "GeneralSpace", "TransferSpace", "TransitionSpace"}
+_DOOR_CELLS = {"ConnectionSpace", "AnchorSpace"}
+_BOUNDARIES = {"CellSpaceBoundary", "NavigableBoundary", "TransferBoundary", "ConnectionBoundary", "AnchorBoundary"}
+# Faces up to this height above the lowest point of a solid are its floor; floors farther apart are levels (m).
+_FLOOR_M, _STOREY_M = 0.1, 1.5
+_HEIGHT_M = (1.0, 20.0)
+_USUAL_DOOR_M = 0.9
+_SRS_UNITS = re.compile(r"4326|4979|CRS84", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """Cell with its outline, the height of its floor, and that of its ceiling over it if it has a solid."""
+
+    shape: BaseGeometry
+    floor: float
+    height: float | None
+    name: str | None
+    kind: str | None
+    key: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Door:
+    """Boundary or transition between two cells, seen from above; `is_exact` is False for the line of a transition."""
+
+    shape: BaseGeometry
+    low: float
+    high: float
+    name: str | None
+    is_exact: bool
+
+
+def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per storey, lowest first.
+
+    Raises:
+        InvalidFloorPlanError: the file is invalid, or no cell has a geometry.
+    """
+    root = read_xml(content, budget)
+    srs = next((found for element in root.iter() if (found := element.get("srsName"))), "")
+    if _SRS_UNITS.search(srs):
+        raise InvalidFloorPlanError(
+            f"the coordinates of the IndoorGML file are degrees ({srs[:100]}); export it in metres, in a projected or "
+            "local coordinate system"
+        )
+    factor = METRES_PER_UNIT[options.units or "m"]
+    elements = list(root.iter())
+    cells = [cell for element in elements for cell in _cells(element, factor, budget)]
+    if not cells:
+        raise InvalidFloorPlanError(
+            "no CellSpace of the IndoorGML file has a geometry; export cells with cellSpaceGeometry (a surface or a "
+            "solid)"
+        )
+    doors = list(_doors(elements, factor, budget))
+    levels = _levels(cells)
+
+    def make(level: Level, members: list[_Cell]) -> ImportedPlan:
+        builder = ReportBuilder()
+        sketch = Sketch(level=level if len(levels) > 1 else None, name=level.name if len(levels) > 1 else None)
+        for cell in members:
+            builder.use(cell.kind or "CellSpace", "rooms")
+            height_m = cell.height if cell.height is not None and _HEIGHT_M[0] <= cell.height <= _HEIGHT_M[1] else None
+            sketch.rooms += [
+                SketchedRoom(part, cell.name, room_type_from_name(cell.name), height_m, cell.key)
+                for part in polygons_from_geometry(cell.shape)
+            ]
+        lowest = level.elevation_m or 0.0
+        on_level = [door for door in doors if lowest - _STOREY_M < door.low < lowest + _STOREY_M]
+        _add_doors(on_level, lowest, sketch, builder, budget)
+        sketch.opening_kinds = ("door",) if sketch.openings else None
+        return assemble(
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format="indoorgml",
+            metres_per_unit=factor,
+            scale_source="the option units" if options.units else "the format: metres",
+        )
+
+    return assemble_levels(levels, options, budget.limits, make)
+
+
+def _cells(element: Element, factor: float, budget: Budget) -> Iterator[_Cell]:
+    kind = _tag(element)
+    if kind not in _CELLS:
+        return
+    rings = [ring * factor for ring in _rings(element, "cellSpaceGeometry", budget)]
+    if not rings:
+        return
+    low = min(float(ring[:, 2].min()) for ring in rings)
+    high = max(float(ring[:, 2].max()) for ring in rings)
+    floors = [ring for ring in rings if len(ring) >= 4 and float(ring[:, 2].max()) <= low + _FLOOR_M]
+    shape = shapely.union_all(
+        [part for ring in floors for part in polygons_from_geometry(shapely.Polygon(ring[:, :2]))]
+    )
+    if shape.area > 0.0:
+        height = high - low if high > low + _FLOOR_M else None
+        yield _Cell(shape, low, height, _name(element), _usage(element) or kind, _key(element))
+
+
+def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_Door]:
+    """Yield the doors: duals of transitions, connection boundaries, cells of doors, and lines of other transitions."""
+    boundaries = {_key(element): element for element in elements if _tag(element) in _BOUNDARIES}
+    drawn = {
+        _key(element) for element in boundaries.values() if _tag(element) in ("ConnectionBoundary", "AnchorBoundary")
+    }
+    plain = []
+    for element in elements:
+        if _tag(element) != "Transition":
+            continue
+        dual = _reference(element, "duality")
+        if dual in boundaries and next(_rings(boundaries[dual], "cellSpaceBoundaryGeometry", budget), None) is not None:
+            drawn.add(dual)
+        else:
+            plain.append(element)
+    for key in sorted(key for key in drawn if key is not None):
+        yield from _door(boundaries[key], "cellSpaceBoundaryGeometry", factor, budget, is_exact=True)
+    for element in elements:
+        if _tag(element) in _DOOR_CELLS:
+            yield from _door(element, "cellSpaceGeometry", factor, budget, is_exact=True)
+    for element in plain:
+        yield from _door(element, "geometry", factor, budget, is_exact=False)
+
+
+def _door(element: Element, member: str, factor: float, budget: Budget, *, is_exact: bool) -> Iterator[_Door]:
+    rings = [ring * factor for ring in _rings(element, member, budget)]
+    if rings:
+        points = np.concatenate(rings)
+        line = shapely.LineString(points[:, :2])
+        shape = line.convex_hull if is_exact else line
+        yield _Door(shape, float(points[:, 2].min()), float(points[:, 2].max()), _name(element), is_exact)
+
+
+def _add_doors(doors: list[_Door], floor: float, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
+    walls = WallLines([room.shape for room in sketch.rooms])
+    outlines = shapely.STRtree([room.shape.boundary for room in sketch.rooms])
+    assumed = 0
+    for door in doors:
+        budget.check_time()
+        ends: tuple[Point, Point] | None
+        if door.is_exact:
+            ends = opening_line(door.shape) if door.shape.length > 0.0 else None
+        else:
+            crossed = outlines.geometries[outlines.query(door.shape, predicate="intersects")]
+            points = shapely.get_coordinates(shapely.intersection(crossed, door.shape))
+            place = points.mean(axis=0) if len(points) else None
+            ends = None if place is None else walls.line_at((float(place[0]), float(place[1])), _USUAL_DOOR_M)
+            assumed += ends is not None
+        builder.use("doors", "door" if ends is not None else "ignored (no place on a wall)")
+        if ends is not None:
+            head_m = door.high - floor if door.is_exact and door.high > door.low + 1.0 else None
+            sketch.openings.append(SketchedOpening("door", *ends, door.name, None, head_m))
+    if assumed:
+        builder.unsure.append(f"{assumed} doors are transitions without a boundary; {_USUAL_DOOR_M:g} m is assumed")
+
+
+def _levels(cells: list[_Cell]) -> Mapping[str, tuple[Level, list[_Cell]]]:
+    """Return the cells by storey; the ground floor is the storey nearest to zero."""
+    storeys: list[list[_Cell]] = []
+    for cell in sorted(cells, key=lambda cell: cell.floor):
+        if not storeys or cell.floor > storeys[-1][0].floor + _STOREY_M:
+            storeys.append([])
+        storeys[-1].append(cell)
+    ground = min(range(len(storeys)), key=lambda index: abs(storeys[index][0].floor))
+    return {
+        str(index): (Level(f"{index - ground}", float(index - ground), members[0].floor), members)
+        for index, members in enumerate(storeys)
+    }
+
+
+def _rings(element: Element, member: str, budget: Budget) -> Iterator[Float[np.ndarray, "n 3"]]:
+    """Yield the positions of every outer ring or line in a member of an element, with z 0 where there is none."""
+    for child in element:
+        if _tag(child) != member:
+            continue
+        for part in child.iter():
+            if _is_line(part):
+                points = _positions(part, budget)
+                if len(points) >= 2:
+                    yield points
+
+
+def _is_line(element: Element) -> bool:
+    """Return whether an element is a line, or the outer ring of a face; a solid has an exterior too."""
+    kind = _tag(element)
+    return kind in ("LineString", "Curve") or (
+        kind == "exterior" and any(_tag(child) in ("LinearRing", "Ring") for child in element)
+    )
+
+
+def _positions(element: Element, budget: Budget) -> Float[np.ndarray, "n 3"]:
+    found: list[list[float]] = []
+    for part in element.iter():
+        if _tag(part) not in ("pos", "posList"):
+            continue
+        try:
+            values = [float(text) for text in (part.text or "").split()]
+        except ValueError as error:
+            raise InvalidFloorPlanError(
+                f"a position in the IndoorGML file is '{(part.text or '').strip()[:50]}'; positions must be numbers"
+            ) from error
+        size = _dimension(part, values)
+        budget.spend(len(values) // size)
+        found += [[*values[first : first + size], 0.0][:3] for first in range(0, len(values) - size + 1, size)]
+    points = np.array(found, dtype=float).reshape(-1, 3)
+    if not np.isfinite(points).all() or np.abs(points).max(initial=0.0) > 1e9:
+        raise InvalidFloorPlanError(
+            "a position in the IndoorGML file is not a finite number below 1e9; export it again"
+        )
+    return points
+
+
+def _dimension(part: Element, values: list[float]) -> int:
+    stated = part.get("srsDimension")
+    if stated in ("2", "3"):
+        return int(stated)
+    if _tag(part) == "pos":
+        return 2 if len(values) == 2 else 3
+    return 3 if len(values) % 3 == 0 else 2
+
+
+def _tag(element: Element) -> str:
+    return str(element.tag).rpartition("}")[2]
+
+
+def _key(element: Element) -> str | None:
+    return next((value for name, value in element.attrib.items() if name.rpartition("}")[2] == "id"), None)
+
+
+def _reference(element: Element, member: str) -> str | None:
+    for child in element:
+        if _tag(child) == member:
+            for name, value in child.attrib.items():
+                if name.rpartition("}")[2] == "href":
+                    return value.removeprefix("#")
+    return None
+
+
+def _name(element: Element) -> str | None:
+    return _text(element, "name")
+
+
+def _usage(element: Element) -> str | None:
+    return _text(element, "class")
+
+
+def _text(element: Element, member: str) -> str | None:
+    found = next((child.text for child in element if _tag(child) == member and child.text), None)
+    return None if found is None or not found.strip() else found.strip()[:200]

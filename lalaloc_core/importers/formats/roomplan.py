@@ -1,0 +1,178 @@
+"""Apple RoomPlan: the JSON of a `CapturedRoom` or `CapturedStructure`, as apps on phones with a depth sensor save it.
+
+Walls, doors, windows and openings are upright rectangles with their width and height (`dimensions`) and their place
+(`transform`, 4 x 4, column by column) in metres, y up. Floors have outlines in their own frame (`polygonCorners`).
+https://developer.apple.com/documentation/roomplan/capturedroom
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.values import is_number
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import (
+    Level,
+    OpeningKind,
+    Point,
+    Sketch,
+    SketchedOpening,
+    SketchedRoom,
+)
+from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.drawing.walls import enclose
+
+_OPENINGS: Mapping[str, OpeningKind] = {"doors": "door", "windows": "window", "openings": "passage"}
+# Walls that enclose less than this share of the floors have gaps; the floors' outlines are used then.
+_ENCLOSED_SHARE = 0.8
+# A sill nearer to the floor is rounding of the scan (m).
+_MIN_SILL_M = 0.1
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Upright rectangle: its ends seen from above, and the heights of its edges (m)."""
+
+    start: Point
+    end: Point
+    low_m: float
+    high_m: float
+
+    @property
+    def line(self) -> shapely.LineString:
+        return shapely.LineString([self.start, self.end])
+
+
+def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per story of a scan.
+
+    Raises:
+        InvalidFloorPlanError: the scan is invalid, or has neither floors nor walls around a room.
+    """
+    keys = ("walls", "floors", "sections", *_OPENINGS)
+    surfaces = {key: list(_objects(document, key, budget)) for key in keys}
+    stories = sorted({_story(raw) for key in ("walls", "floors") for raw in surfaces[key]})
+    levels = {str(story): (Level(f"story {story}", float(story)), story) for story in stories}
+    if not levels:
+        raise InvalidFloorPlanError("the RoomPlan scan has no walls and no floors; scan the room again")
+
+    def make(level: Level, story: int) -> ImportedPlan:
+        builder = ReportBuilder()
+        on_story = {key: [raw for raw in found if _story(raw) == story] for key, found in surfaces.items()}
+        sketch = _sketch(on_story, builder, budget)
+        if len(levels) > 1:
+            sketch.level, sketch.name = level, level.name
+        return assemble(
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format="roomplan",
+            metres_per_unit=1.0,
+            scale_source="the scan: metres",
+        )
+
+    return assemble_levels(levels, options, budget.limits, make)
+
+
+def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: ReportBuilder, budget: Budget) -> Sketch:
+    walls = [_surface(raw, f"wall {index}") for index, raw in enumerate(surfaces["walls"])]
+    builder.use("walls", "walls", len(walls))
+    floors = [floor for index, raw in enumerate(surfaces["floors"]) for floor in _floor(raw, f"floor {index}")]
+    rooms = enclose([], [wall.line for wall in walls], check_time=budget.check_time).rooms
+    if sum(room.area for room in rooms) < _ENCLOSED_SHARE * sum(floor.area for floor in floors):
+        rooms = floors
+        builder.use("floors", "rooms", len(floors))
+    floor_m = float(np.median([wall.low_m for wall in walls])) if walls else 0.0
+    sketch = Sketch(opening_kinds=tuple(_OPENINGS.values()))
+    for room in rooms:
+        name = _label(room, surfaces["sections"])
+        around = [wall for wall in walls if room.distance(wall.line.interpolate(0.5, normalized=True)) < 0.3]
+        height_m = float(np.median([wall.high_m - floor_m for wall in around])) if around else None
+        sketch.rooms.append(SketchedRoom(room, name, room_type_from_name(name), height_m))
+    for key, kind in _OPENINGS.items():
+        for index, raw in enumerate(surfaces[key]):
+            part = _surface(raw, f"{key} {index}")
+            builder.use(key, kind)
+            sill_m = part.low_m - floor_m if part.low_m - floor_m >= _MIN_SILL_M else None
+            sketch.openings.append(SketchedOpening(kind, part.start, part.end, None, sill_m, part.high_m - floor_m))
+    return sketch
+
+
+def _objects(document: Mapping[str, Any], key: str, budget: Budget) -> Iterator[Mapping[str, Any]]:
+    found = document.get(key) or []
+    if not isinstance(found, list) or not all(isinstance(raw, Mapping) for raw in found):
+        raise InvalidFloorPlanError(f"'{key}' of the RoomPlan scan must be a list of objects; export the scan again")
+    for raw in found:
+        corners = raw.get("polygonCorners")
+        budget.spend(1 + (len(corners) if isinstance(corners, list) else 0))
+        yield raw
+
+
+def _story(raw: Mapping[str, Any]) -> int:
+    story = raw.get("story")
+    return int(story) if is_number(story) and abs(story) < 1000 else 0
+
+
+def _surface(raw: Mapping[str, Any], where: str) -> _Surface:
+    width_m, height_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}").tolist()
+    ends = _placed(np.array([[-0.5 * width_m, 0.0, 0.0], [0.5 * width_m, 0.0, 0.0]]), raw, where)
+    middle_m = float(ends[:, 1].mean())
+    start, end = _from_above(ends)
+    return _Surface(point_xy(start), point_xy(end), middle_m - 0.5 * height_m, middle_m + 0.5 * height_m)
+
+
+def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
+    corners = raw.get("polygonCorners")
+    if isinstance(corners, list) and len(corners) >= 3:
+        local = np.stack([_numbers(corner, 3, f"corners of {where}") for corner in corners])
+    else:
+        width_m, depth_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}")
+        local = 0.5 * np.array([[-width_m, -depth_m, 0], [width_m, -depth_m, 0], [width_m, depth_m, 0],
+                                [-width_m, depth_m, 0]])  # fmt: skip
+    return polygons_from_geometry(shapely.Polygon(_from_above(_placed(local, raw, where))))
+
+
+def _placed(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> Float[np.ndarray, "n 3"]:
+    """Return points of a surface in the frame of the scan."""
+    transform = _numbers(raw.get("transform"), 16, f"transform of {where}").reshape(4, 4).T
+    return local @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _from_above(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Return points seen from above: the scan's z points down on the plan."""
+    return np.column_stack([points[:, 0], -points[:, 2]])
+
+
+def _numbers(raw: Any, count: int, where: str) -> Float[np.ndarray, "n"]:
+    # Some encoders write matrices as four columns.
+    parts = raw if isinstance(raw, list) else []
+    flat = [value for part in parts for value in (part if isinstance(part, list) else [part])]
+    if len(flat) != count or not all(is_number(value) and math.isfinite(value) for value in flat):
+        raise InvalidFloorPlanError(f"the {where} must be {count} numbers; export the RoomPlan scan again")
+    return np.array(flat, dtype=float)
+
+
+def _label(room: shapely.Polygon, sections: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return the name of the section whose centre lies in a room: "livingRoom" is "living room"."""
+    for section in sections:
+        label, centre = section.get("label"), section.get("center")
+        if not isinstance(label, str) or not isinstance(centre, list) or label == "unidentified":
+            continue
+        ((x, y),) = _from_above(_numbers(centre, 3, f"centre of section '{label[:50]}'")[None])
+        if room.contains(shapely.Point(x, y)):
+            return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", label).lower()[:100]
+    return None

@@ -1,0 +1,278 @@
+"""Maps of ROS `map_server`: an occupancy grid as a picture (PGM or PNG), and its YAML file, in a zip archive.
+
+The plan frame is the map frame. https://wiki.ros.org/map_server
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from jaxtyping import UInt8
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.values import is_number
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, Budget
+from lalaloc_core.importers.common.map_frame import MapFrame
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+
+if TYPE_CHECKING:
+    from lalaloc_core.importers.picture.occupancy import OccupancyGrid
+
+YAML_SUFFIXES = (".yaml", ".yml")
+_MAX_YAML_BYTES = 65_536
+_RESOLUTION_M = (0.001, 1.0)
+# Written maps: cell size, margin around the rooms and thickness of outer walls (m), and the usual values of cells.
+_CELL_M, _MARGIN_M, _WALL_M = 0.05, 1.0, 0.15
+# Cells of larger maps are twice, four times ... as large.
+_MAX_CELLS = 4_000_000
+_FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+# Exported archives carry no time, so that equal plans give equal bytes.
+_EPOCH = (2000, 1, 1, 0, 0, 0)
+
+
+def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan in a map, as a draft.
+
+    Args:
+        source: files of an archive by name, or a picture in PGM without its YAML file.
+        options: options of the import.
+        budget: limits.
+
+    Raises:
+        InvalidFloorPlanError: the map is invalid, or has no room.
+    """
+    # Imported late: a map is written without the libraries of pictures.
+    from lalaloc_core.importers.picture.occupancy import sketch_grid
+
+    grid = _picture_alone(source, options, budget) if isinstance(source, bytes) else _open(source, budget)
+    frame = grid.frame
+    builder = ReportBuilder()
+    builder.use("occupied cells", "walls", int(grid.occupied.sum()))
+    builder.use("free cells", "floor", int(grid.free.sum()))
+    sketch = sketch_grid(grid, builder, budget)
+    if not sketch.rooms:
+        rows, columns = frame.size
+        raise InvalidFloorPlanError(
+            f"no walls that enclose a room were found in the map, which is {columns * frame.resolution_m:.1f} m by "
+            f"{rows * frame.resolution_m:.1f} m at {frame.resolution_m:g} m per cell; check the resolution, and close "
+            "the walls in the picture"
+        )
+    return (
+        assemble(
+            sketch,
+            builder,
+            options,
+            budget.limits.plan,
+            format="ros",
+            metres_per_unit=frame.resolution_m,
+            scale_source="the map's resolution" if isinstance(source, Mapping) else "metres_per_pixel",
+            is_draft=True,
+        ),
+    )
+
+
+def read_frame(source: Mapping[str, bytes]) -> MapFrame:
+    """Return the grid of a map from its files.
+
+    Raises:
+        InvalidFloorPlanError: the map is invalid.
+    """
+    return _open(source, Budget(DEFAULT_IMPORT_LIMITS)).frame
+
+
+def map_files(yaml_file: Path) -> dict[str, bytes]:
+    """Return the files of a map by name: a YAML file, and the picture that it names.
+
+    Raises:
+        InvalidFloorPlanError: a file cannot be read, or is invalid.
+    """
+    try:
+        content = yaml_file.read_bytes()
+        picture = yaml_file.parent / _text(_settings(content), "image")
+        return {yaml_file.name: content, picture.name: picture.read_bytes()}
+    except OSError as error:
+        raise InvalidFloorPlanError(f"'{error.filename}' cannot be read: {error.strerror}") from error
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive of files."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), content, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
+
+
+def write(document: Mapping[str, Any], _anchor: Anchor | None, frame: MapFrame | None = None) -> bytes:
+    """Return a map in a zip archive: rooms, doors and passages are free, walls and windows occupied.
+
+    Args:
+        document: the plan; its frame is the map frame.
+        frame: the grid; by default cells of 5 cm, or more for large plans, with a margin of 1 m.
+    """
+    rooms = [shapely.Polygon(room["polygon"], room.get("holes", ())) for room in document["rooms"]]
+    frame = frame or _frame_of(rooms)
+    picture = _drawn(document, rooms, frame)
+    x, y, yaw = frame.origin
+    settings = (
+        f"image: map.pgm\nmode: trinary\nresolution: {frame.resolution_m:.10g}\n"
+        f"origin: [{x:.10g}, {y:.10g}, {yaw:.10g}]\nnegate: 0\n"
+        f"occupied_thresh: {_OCCUPIED_THRESHOLD}\nfree_thresh: {_FREE_THRESHOLD}\n"
+    )
+    header = f"P5\n{frame.size[1]} {frame.size[0]}\n255\n".encode()
+    return pack({"map.yaml": settings.encode(), "map.pgm": header + picture.tobytes()})
+
+
+def _picture_alone(content: bytes, options: ImportOptions, budget: Budget) -> OccupancyGrid:
+    """Return the map of a picture in PGM, with its corner at the origin and the usual thresholds."""
+    if options.metres_per_pixel is None:
+        raise InvalidFloorPlanError(
+            "the file is a part of a ROS map; send the YAML file and the picture in one zip archive, or the PGM "
+            "picture with metres_per_pixel"
+        )
+    settings = {"resolution": options.metres_per_pixel, "origin": [0.0, 0.0, 0.0]}
+    return _classified(_gray(content, budget), settings)
+
+
+def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
+    names = [name for name in files if name.casefold().endswith(YAML_SUFFIXES)]
+    if len(names) != 1:
+        raise InvalidFloorPlanError(f"the archive has {len(names)} YAML files; a ROS map has one, and a picture")
+    settings = _settings(files[names[0]])
+    image = _text(settings, "image").replace("\\", "/").rpartition("/")[2]
+    found = next((content for name, content in files.items() if name.rpartition("/")[2] == image), None)
+    if found is None:
+        raise InvalidFloorPlanError(f"the archive has no picture '{image[:100]}', which the ROS map names; add it")
+    return _classified(_gray(found, budget), settings)
+
+
+def _settings(content: bytes) -> Mapping[str, Any]:
+    if len(content) > _MAX_YAML_BYTES:
+        raise InvalidFloorPlanError(f"the YAML of the ROS map has {len(content)} bytes; the limit is {_MAX_YAML_BYTES}")
+    import yaml
+
+    try:
+        settings = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError) as error:
+        raise InvalidFloorPlanError(f"the YAML of the ROS map is invalid: {error}"[:500]) from error
+    if not isinstance(settings, Mapping):
+        raise InvalidFloorPlanError("the YAML of the ROS map must have 'image', 'resolution' and 'origin'")
+    return settings
+
+
+def _classified(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> OccupancyGrid:
+    from lalaloc_core.importers.picture.occupancy import OccupancyGrid
+
+    resolution_m = _number(settings, "resolution", None, _RESOLUTION_M)
+    origin = settings.get("origin")
+    if not isinstance(origin, list) or len(origin) < 2 or not all(_is_near(value) for value in origin):
+        raise InvalidFloorPlanError(f"origin of the ROS map is {str(origin)[:50]}; it must be [x, y, yaw]")
+    x, y, yaw, *_ = [float(value) for value in origin] + [0.0]
+    occupied_at = _number(settings, "occupied_thresh", _OCCUPIED_THRESHOLD, (0.0, 1.0))
+    free_at = _number(settings, "free_thresh", _FREE_THRESHOLD, (0.0, 1.0))
+    values = np.arange(256) / 255.0
+    occupancy = values if settings.get("negate") in (1, True) else 1.0 - values
+    rows, columns = gray.shape
+    return OccupancyGrid(
+        MapFrame(resolution_m, (x, y, yaw), (rows, columns)),
+        (occupancy > occupied_at)[gray],
+        (occupancy < free_at)[gray],
+    )
+
+
+def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content), formats=("PPM", "PNG")) as picture:
+                pixels, limit = picture.width * picture.height, budget.limits.max_plan_pixels
+                if pixels > limit:
+                    raise InvalidFloorPlanError(
+                        f"the map has {picture.width} x {picture.height} cells; the limit is {limit} in total "
+                        "(max_plan_pixels); crop it"
+                    )
+                # Transparent cells are unknown.
+                flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
+                flat.alpha_composite(picture.convert("RGBA"))
+                return np.asarray(flat.convert("L"))
+    except InvalidFloorPlanError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError,
+            Image.DecompressionBombWarning) as error:  # fmt: skip
+        raise InvalidFloorPlanError(f"the picture of the ROS map cannot be read: {error}; save it again") from error
+
+
+def _frame_of(rooms: list[shapely.Polygon]) -> MapFrame:
+    x0, y0, x1, y1 = shapely.total_bounds(rooms)
+    cell_m = _CELL_M
+    while (x1 - x0 + 2.0 * _MARGIN_M) * (y1 - y0 + 2.0 * _MARGIN_M) > _MAX_CELLS * cell_m**2:
+        cell_m *= 2.0
+    left, bottom = (math.floor((value - _MARGIN_M) / cell_m) for value in (x0, y0))
+    right, top = (math.ceil((value + _MARGIN_M) / cell_m) for value in (x1, y1))
+    return MapFrame(cell_m, (left * cell_m, bottom * cell_m, 0.0), (top - bottom, right - left))
+
+
+def _drawn(document: Mapping[str, Any], rooms: list[shapely.Polygon], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
+    half_m = 0.5 * frame.resolution_m
+    # Gaps between rooms up to twice a wall's thickness are walls.
+    around = shapely.union_all(rooms).buffer(2.0 * _WALL_M, join_style="mitre")
+    walls = around.buffer(-_WALL_M, join_style="mitre")
+    doors = [
+        shapely.LineString(opening["line"]).buffer(2.0 * _WALL_M, cap_style="flat")
+        for opening in document.get("openings", ())
+        if opening["kind"] != "window"
+    ]
+    inner = [shapely.LineString(line) for room in document["rooms"] for line in room.get("walls", ())]
+    layers = (
+        (walls, _OCCUPIED),
+        (shapely.union_all(rooms), _FREE),
+        (shapely.union_all([*inner, *_shared_edges(rooms, half_m)]).buffer(1.5 * half_m), _OCCUPIED),
+        (shapely.union_all(doors).intersection(walls), _FREE),
+    )
+    for shape, _ in layers:
+        shapely.prepare(shape)
+    picture = np.full(frame.size, _UNKNOWN, np.uint8)
+    for row in range(frame.size[0]):
+        x, y = frame.cells(row).T
+        for shape, value in layers:
+            picture[row, shapely.contains_xy(shape, x, y)] = value
+    return picture
+
+
+def _shared_edges(rooms: list[shapely.Polygon], reach_m: float) -> list[shapely.Geometry]:
+    """Return the edges of rooms that touch: no cell lies between them."""
+    tree = shapely.STRtree(rooms)
+    pairs = tree.query(rooms, predicate="dwithin", distance=reach_m).T
+    return [rooms[a].boundary.intersection(rooms[b].buffer(reach_m)) for a, b in pairs if a < b]
+
+
+def _text(settings: Mapping[str, Any], key: str) -> str:
+    value = settings.get(key)
+    if not isinstance(value, str) or not value.strip():
+        raise InvalidFloorPlanError(f"the YAML of the ROS map has no '{key}'; add the name of its picture")
+    return value.strip()
+
+
+def _number(settings: Mapping[str, Any], key: str, default: float | None, limits: tuple[float, float]) -> float:
+    value, (low, high) = settings.get(key, default), limits
+    if not is_number(value) or not low <= value <= high:
+        raise InvalidFloorPlanError(f"{key} of the ROS map is {str(value)[:50]}; it must be {low:g} to {high:g}")
+    return float(value)
+
+
+def _is_near(value: object) -> bool:
+    return is_number(value) and abs(float(value)) < 1e6  # type: ignore[arg-type]
