@@ -8,7 +8,7 @@ import os
 import sys
 
 from lalaloc_core import __version__
-from lalaloc_core.cli import evaluation, localising, measuring, plans, synthesis, training
+from lalaloc_core.cli import evaluation, localising, measuring, plans, synthesis, tracking, training
 from lalaloc_core.errors import InvalidInputError, LaLaLocError
 
 # The exit code that shells use for a command ended by Ctrl-C.
@@ -18,13 +18,16 @@ _INTERRUPTED = 130
 def main(argv: list[str] | None = None) -> int:
     """Run one command; return 0 on success, 2 for invalid input, 1 for any other error of this project."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    # It lists every repaired detail of a DXF; the import's report has what matters.
+    logging.getLogger("ezdxf").setLevel(logging.ERROR)
     arguments = build_parser().parse_args(argv)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader closed the pipe, as `head` does. Redirecting keeps Python from flushing to it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -50,12 +53,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (localising, plans, evaluation, measuring, synthesis, training):
+    for group in (localising, tracking, plans, evaluation, measuring, synthesis, training):
         group.add_commands(commands)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
     )
-    completion.add_argument("shell", choices=("bash", "zsh"), help="shell")
+    completion.add_argument("shell", choices=("bash", "zsh", "fish"), help="shell")
     completion.set_defaults(run=lambda arguments: _complete(parser, arguments.shell))
     return parser
 

@@ -19,6 +19,10 @@ from lalaloc_core.localise.bundle import default_bundle
 
 # Ratio of calibration homes to homes that get photographs of other homes.
 _PER_MISMATCHED_HOME = 1
+# Views of each camera, at equal angles.
+_VIEWS_PER_CAMERA = 2
+# Ratio of calibration homes to homes that are also asked for in plans without openings.
+_PER_UNOPENED_HOME = 4
 # Homes of the cohort.
 _COHORT_HOMES = 60
 # Columns of the printed table.
@@ -55,6 +59,12 @@ def add_commands(commands: Any) -> None:
         default=0.5,
         metavar="M",
         help="step of the pose grid, metres (default: %(default)s)",
+    )
+    evaluate.add_argument(
+        "--view", type=positive, metavar="DEG", help="cut views of this field of view (default: whole spheres)"
+    )
+    evaluate.add_argument(
+        "--heading-error", type=positive, metavar="DEG", help="largest error of the known heading of views (default: 0)"
     )
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
     evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
@@ -100,6 +110,14 @@ def add_commands(commands: Any) -> None:
         "--keep-evidence", action="store_true", help="keep the bundle's matching weights and fit only confidence"
     )
     calibrate.add_argument(
+        "--views", action="store_true", help="calibrate the encoder of views, on views of 55° to 110°, not on spheres"
+    )
+    calibrate.add_argument(
+        "--errors",
+        action="store_true",
+        help="only measure the predictions' errors, for `plan check --localisability`",
+    )
+    calibrate.add_argument(
         "--out", type=Path, metavar="DIR", help="folder to store predictions in and to continue from"
     )
     calibrate.set_defaults(run=_calibrate)
@@ -143,13 +161,20 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
     if arguments.refine is not None and method != "lalaloc":
         raise InvalidInputError(f"--refine {arguments.refine} is for method 'lalaloc', not '{method}'")
+    if arguments.view is not None and not (panorama and method == "lalaloc"):
+        raise InvalidInputError(f"--view is for photographs and method 'lalaloc', not {method} {arguments.kind}")
+    if arguments.heading_error is not None and (arguments.view is None or arguments.heading == "unknown"):
+        raise InvalidInputError("--heading-error is for --view with a known heading")
+    given = {"refine": arguments.refine, "heading_error_deg": arguments.heading_error}
+    settings = {name: value for name, value in given.items() if value is not None}
     info = RunInfo(
         label=f"{method} {arguments.kind}",
         method=method,
         kind=arguments.kind,
         dataset="",
         split=arguments.split,
-        settings={} if arguments.refine is None else {"refine": arguments.refine},
+        settings=settings,
+        views=None if arguments.view is None else {"field_deg": arguments.view},
         data=None if arguments.data is None else str(arguments.data),
         data_format=arguments.dataset,
         generated=_generated_homes(arguments) if arguments.data is None else None,
@@ -190,6 +215,8 @@ def _score(arguments: argparse.Namespace) -> None:
 
 def _print_scores(report: dict[str, Any]) -> None:
     """Print the main figures as a table; the run's folder and its report have all of them."""
+    from lalaloc_core.evaluate.runs.score import MIN_QUERIES
+
     skipped = f", {report['skipped']} left out" if report["skipped"] else ""
     print(f"{report['label']}, {report['dataset']}: {report['n']} queries, {report['unanswered']} unanswered{skipped}")
     stages = {**report["stages"], "answer": report["final"]}
@@ -206,7 +233,10 @@ def _print_scores(report: dict[str, Any]) -> None:
         ],
     )
     interval = report["final"]["within_1m"]
-    print(f"answers within 1 m: 95 % interval {100 * interval['low']:.1f} to {100 * interval['high']:.1f} %")
+    if report["n"] < MIN_QUERIES:
+        print(f"too few queries for an interval: {report['n']}; give at least {MIN_QUERIES}")
+    else:
+        print(f"answers within 1 m: 95 % interval {100 * interval['low']:.1f} to {100 * interval['high']:.1f} %")
     if report["calibration_error"] is not None:
         print(f"expected calibration error of the confidence: {report['calibration_error']:.3f}")
 
@@ -223,67 +253,114 @@ def _worst(arguments: argparse.Namespace) -> None:
     print_json(write_worst(arguments.folder, arguments.out, arguments.count))
 
 
+def _measure_errors(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluate.bench.prediction_errors import measure_errors, outcomes_of
+    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.localise.localisability import errors_of
+
+    bundle = Bundle.open(arguments.bundle)
+    if bundle.manifest.view is None:
+        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --errors")
+    manifest = measure_errors(bundle, outcomes_of(bundle, arguments.homes, "validation", None)).manifest
+    sphere, view = errors_of(manifest)
+    print_json({"sphere_spread": sphere.spread, "view_spread": view.spread})
+
+
 def _calibrate(arguments: argparse.Namespace) -> None:
+    if arguments.errors:
+        _measure_errors(arguments)
+        return
+    from lalaloc_core.evaluate.appearance import fit_appearance
     from lalaloc_core.evaluate.calibrate import (
         Answers,
         calibrate,
         fit_matching_weights,
         store_cohort,
         store_matching_weights,
+        with_heading_doubt,
     )
-    from lalaloc_core.evaluate.runs.factories import describe_model
+    from lalaloc_core.evaluate.runs.factories import build_dataset, describe_model
     from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluate.runs.run import run_evaluation
     from lalaloc_core.learn.data.synthetic import training_plans
-    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.localise.bundle import Bundle, MatchingWeights
     from lalaloc_core.localise.cohort import cohort_of
+    from lalaloc_core.localise.encoders import Encoders
 
-    def predictions(generated: dict[str, Any], known: bool, source: str) -> list[Prediction]:
+    def run_info(generated: dict[str, Any], known: bool, source: str) -> RunInfo:
         heading = "known" if known else "searched"
-        info = RunInfo(
+        return RunInfo(
             label=f"calibration, {source} homes, heading {heading}",
             method="lalaloc",
             kind="panorama",
             dataset="generated homes",
             split="validation",
             generated=generated,
+            views={"per_camera": _VIEWS_PER_CAMERA} if arguments.views else None,
             heading_known=known,
             bundle=str(arguments.bundle),
             model=describe_model(arguments.bundle),
         )
+
+    def predictions(generated: dict[str, Any], known: bool, source: str) -> list[Prediction]:
+        info = run_info(generated, known, source)
         if arguments.out is not None:
-            return run_evaluation(RunFolder(arguments.out / f"{source}-{heading}"), info)
+            return run_evaluation(RunFolder(arguments.out / f"{source}-{'known' if known else 'searched'}"), info)
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 
     bundle = Bundle.open(arguments.bundle)
-    cohort_plans = training_plans(_COHORT_HOMES, arguments.seed)
-    store_cohort(bundle, cohort_of(cohort_plans, bundle.manifest.profile_columns, arguments.seed))
+    if arguments.views and bundle.manifest.view is None:
+        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --views")
+    if not arguments.views:
+        cohort_plans = training_plans(_COHORT_HOMES, arguments.seed)
+        store_cohort(bundle, cohort_of(cohort_plans, bundle.manifest.profile_columns, arguments.seed))
     own = _generated(arguments, None)
     disturbed = own | {"generator": "disturbed"}
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on predictions made with them.
-    weights = bundle.manifest.evidence
+    weights = bundle.manifest.evidence_for(view=arguments.views)
     if not arguments.keep_evidence:
+        # Views are of the same plans, so they share the appearance that was fitted on spheres.
+        appearance = bundle.manifest.evidence.appearance
+        encoders = Encoders(Bundle.open(arguments.bundle), threads=1)
+        if encoders.predicts_structure and not arguments.views:
+            datasets = [build_dataset(run_info(source, True, "appearance")) for source in (own, disturbed)]
+            scenes = (dataset.load(name) for dataset in datasets for name in dataset.scenes("validation"))
+            appearance = fit_appearance(encoders, scenes)
+        store_matching_weights(bundle, replace(weights, appearance=appearance), views=arguments.views)
+        default = MatchingWeights(appearance=appearance)
         weights = fit_matching_weights(
-            [prediction for heading in (True, False) for prediction in predictions(own, heading, "unweighed")]
+            [prediction for heading in (True, False) for prediction in predictions(own, heading, "unweighed")], default
         )
     if arguments.openings_weight is not None:
-        weights = dataclasses.replace(weights, openings=arguments.openings_weight)
-    print_json(dataclasses.asdict(store_matching_weights(Bundle.open(arguments.bundle), weights).manifest.evidence))
+        weights = replace(weights, openings=arguments.openings_weight)
+    store_matching_weights(Bundle.open(arguments.bundle), weights, views=arguments.views)
+    print_json(dataclasses.asdict(weights))
+    few = max(arguments.homes // _PER_UNOPENED_HOME, 1)
     known, searched = (
         Answers(
             own=predictions(own, heading, "own"),
-            disturbed=predictions(disturbed, heading, "disturbed"),
-            mismatched=predictions(mismatched, heading, "mismatched"),
+            disturbed=[
+                *predictions(disturbed, heading, "disturbed"),
+                *predictions(own | {"generator": "unopened", "homes": few}, heading, "unopened"),
+            ],
+            mismatched=[
+                *predictions(mismatched, heading, "mismatched"),
+                *predictions(own | {"generator": "foreign"}, heading, "foreign"),
+            ],
         )
         for heading in (True, False)
     )
+    if not arguments.keep_evidence:
+        weights = with_heading_doubt(weights, known, searched)
+        store_matching_weights(Bundle.open(arguments.bundle), weights, views=arguments.views)
+    queries = f"{len(known.own)} {'views' if arguments.views else 'panoramas'}"
     description = (
-        f"{len(known.own)} panoramas of {arguments.homes} generated validation homes, all furniture levels; confidence "
+        f"{queries} of {arguments.homes} generated validation homes, all furniture levels; confidence "
         f"besides on the same disturbed, and on {len(known.mismatched)} photographs of others or of no room"
     )
-    bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description)
+    bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description, views=arguments.views)
     print_json(bundle.manifest.metrics)
 
 

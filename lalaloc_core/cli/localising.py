@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lalaloc_core.cli.answer_files import add_file_options, check_file_options, write_files
 from lalaloc_core.cli.arguments import heading, positive, tolerance
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
@@ -20,33 +21,39 @@ from lalaloc_core.localise.bundle import Bundle, default_bundle
 if TYPE_CHECKING:
     from lalaloc_core.draw.answer import DrawnAnswer
     from lalaloc_core.floorplan import FloorPlan
+    from lalaloc_core.photograph import StatedView
 
 _GRID_STEP_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The answer for one photograph."""
+    """The answer for one photograph, or the error if it has none."""
 
     photograph: Path
-    drawn: DrawnAnswer
+    content: bytes
+    drawn: DrawnAnswer | None
     document: dict[str, Any]
 
 
 def add_commands(commands: Any) -> None:
     """Add this command to the parser."""
-    localise = commands.add_parser("localise", help="localise 360° photographs in a plan, without a service")
+    localise = commands.add_parser("localise", help="localise photographs in a plan, without a service")
     localise.add_argument(
         "plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md"
     )
     localise.add_argument(
-        "photographs", type=Path, nargs="+", metavar="PHOTO", help="panoramas of the full sphere, twice as wide as high"
+        "photographs",
+        type=Path,
+        nargs="+",
+        metavar="PHOTO",
+        help="full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md)",
     )
     localise.add_argument(
         "--heading",
         type=heading,
         metavar="DEG",
-        help="azimuth of the photographs' centre columns, clockwise from the plan's +y (default: the photographs' "
+        help="azimuth of the photographs' centres, clockwise from the plan's +y (default: the photographs' "
         "compass if the plan has north_deg, otherwise estimated)",
     )
     localise.add_argument(
@@ -61,6 +68,7 @@ def add_commands(commands: Any) -> None:
         metavar="M",
         help="metres above the floor (default: the plan's, otherwise estimated)",
     )
+    add_camera_options(localise)
     localise.add_argument(
         "--out",
         type=Path,
@@ -74,6 +82,7 @@ def add_commands(commands: Any) -> None:
         help="content of --out: the plan with the posterior, the photograph with the predicted layout, or both "
         "(default: %(default)s)",
     )
+    add_file_options(localise)
     localise.add_argument("--json", action="store_true", help="print JSON: a list with one answer per photograph")
     localise.add_argument(
         "--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)"
@@ -91,64 +100,97 @@ def _localise(arguments: argparse.Namespace) -> None:
         check_picture_name(arguments.out)
     plan = read_plan(arguments.plan, arguments).plan()
     _check_height(arguments.camera_height, plan)
-    contents = [_content(path) for path in arguments.photographs]
-    found = []
-    for number, answer in enumerate(_answers(arguments, plan, contents)):
-        found.append(answer)
+    check_file_options(arguments, plan)
+    stated, several = stated_view(arguments), len(arguments.photographs) > 1
+    documents, rows, places = [], [], []
+    for number, answer in enumerate(_answers(arguments, plan, stated)):
+        documents.append(answer.document)
+        if answer.drawn is None:
+            print(f"error: {answer.document['error']}", file=sys.stderr)
+            continue
         for warning in answer.document["warnings"]:
             print(f"warning: {answer.photograph}: {warning}", file=sys.stderr)
+        rows.append(_row(answer.photograph, answer.drawn))
+        places.append((answer.photograph.stem, answer.drawn.camera))
         if arguments.out is not None:
-            out = arguments.out if len(contents) == 1 else arguments.out.with_stem(f"{arguments.out.stem}-{number}")
-            shown = None if arguments.picture == "plan" else _pixels(answer.photograph, contents[number])
-            title = answer.photograph.name if len(contents) > 1 else None
+            out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
+            shown = None if arguments.picture == "plan" else _pixels(answer.drawn, answer.content, stated)
+            title = answer.photograph.name if several else None
             write_picture(draw_answer(answer.drawn, shown, arguments.picture, title=title), out)
+    write_files(arguments, plan, documents, places)
     if arguments.json:
-        print_json([answer.document for answer in found])
+        print_json(documents)
     else:
-        print_table(_HEAD, [_row(answer) for answer in found])
+        print_table(_HEAD, rows)
+    if len(rows) < len(documents):
+        failed = len(documents) - len(rows)
+        raise InvalidPanoramaError(f"{failed} of {len(documents)} photographs were not localised; see the errors above")
 
 
-def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[bytes]) -> Iterator[_Found]:
-    """Yield the answers in the order of the photographs, with a progress bar on a terminal."""
+def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedView) -> Iterator[_Found]:
+    """Yield the answers in the order of the photographs, with a progress bar on a terminal.
+
+    Raises:
+        InvalidPanoramaError: the only photograph is invalid; one of several becomes an answer with an error.
+    """
     from tqdm import tqdm
 
     from lalaloc_core.draw.answer import drawn_answer
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-    from lalaloc_core.localise.encoders import Encoders
+    from lalaloc_core.localise.information import advice_for, information_bits
+    from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
     from lalaloc_core.localise.pipeline import localise
     from lalaloc_core.localise.retrieval import build_grid
     from lalaloc_core.localise.stated_camera import known_heading, stated_height
-    from lalaloc_core.panorama.images import open_panorama
+    from lalaloc_core.photograph import open_view
 
     bundle = Bundle.open(arguments.bundle)
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
-    height, model = stated_height(plan, arguments.camera_height), bundle.manifest.confidence
+    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
+    encoders, manifest = encoder.networks, bundle.manifest
+    height = stated_height(plan, arguments.camera_height)
     # Models that compare only latents need a pose grid per camera height.
     grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
     grid = build_grid(
         plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m, latents=not encoders.predicts_profile
     )
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
-    for path, content in zip(paths, contents, strict=True):
-        with _named(path):
-            manifest = encoders.manifest
-            panorama = open_panorama(content, height=manifest.image_height, width=manifest.image_width)
-        compass, tolerance_deg = panorama.compass_heading, arguments.heading_tolerance or 0.0
-        known = known_heading(plan.north, arguments.heading, tolerance_deg, compass)
-        query = encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
+    for path in paths:
+        content = b""
+        try:
+            content = content_of(path)
+            with named(path):
+                view = open_view(
+                    content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
+                )
+                encoder.check(view)
+        except InvalidPanoramaError as error:
+            if len(arguments.photographs) == 1:
+                raise
+            yield _Found(path, content, None, {"photograph": str(path), "error": str(error)})
+            continue
+        tolerance_deg = arguments.heading_tolerance or 0.0
+        known = known_heading(plan.north, arguments.heading, tolerance_deg, view.compass_heading)
+        query = encoder.query(view, known.heading, height, heading_tolerance=known.tolerance)
         found = localise(plan, grid, encoders, query, refiner=refiner)
-        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source])
+        model = manifest.confidence_for(view=query.is_view)
+        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source], view=view)
         confidence = found.confidence(model)
+        sure = found.posterior.position if confidence is None else confidence.position
+        advice = advice_for([view.azimuths], sure)
         source = "searched" if found.heading_contradicted else known.source
         warnings = ["the photograph contradicts the heading, which was estimated instead"]
+        warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
         details = {
             "stage": found.stage,
             "heading_source": source,
             "heading_confidence": None if confidence is None else confidence.heading,
-            "warnings": warnings if found.heading_contradicted else [],
+            "probability_elsewhere": None if confidence is None else confidence.elsewhere,
+            "warnings": warnings if advice is None else [*warnings, advice],
+            "view": view_document(view)
+            | {"information_bits": information_bits(plan, grid.poses, found.posterior.pose)},
             "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
         }
-        yield _Found(path, drawn, _document(path, drawn) | details)
+        yield _Found(path, content, drawn, _document(path, drawn) | details)
 
 
 def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
@@ -183,13 +225,13 @@ _HEAD = ("photograph", "room", "x m", "y m", "heading °", "95 % within", "camer
 _SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
 
-def _row(found: _Found) -> tuple[str, ...]:
+def _row(photograph: Path, drawn: DrawnAnswer) -> tuple[str, ...]:
     from lalaloc_core.draw.answer import ellipse_m
 
-    drawn, camera = found.drawn, found.drawn.camera
+    camera = drawn.camera
     within = "-" if camera.covariance_m2 is None else f"{100 * ellipse_m(camera.covariance_m2)[0]:.0f} cm"
     return (
-        str(found.photograph),
+        str(photograph),
         drawn.plan.rooms[drawn.room_index].name,
         f"{camera.x_m:.2f}",
         f"{camera.y_m:.2f}",
@@ -200,30 +242,17 @@ def _row(found: _Found) -> tuple[str, ...]:
     )
 
 
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InvalidPanoramaError(f"'{path}' cannot be read: {error.strerror}") from error
-
-
-def _pixels(path: Path, content: bytes) -> Any:
+def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedView) -> Any:
     """Read the photograph in the size of the picture."""
     from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
-    from lalaloc_core.panorama.images import read_panorama
+    from lalaloc_core.photograph.view import open_picture, open_view
 
+    if drawn.view is not None:
+        return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
-    with _named(path):
-        return read_panorama(content, height=height, width=width)
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Name the photograph in errors."""
-    try:
-        yield
-    except InvalidPanoramaError as error:
-        raise InvalidPanoramaError(f"'{path}': {error}") from error
+    view = open_view(content, sphere_size=(height, width), stated=stated)
+    assert view.panorama is not None
+    return view.panorama.pixels
 
 
 def _check_height(height_m: float | None, plan: FloorPlan) -> None:

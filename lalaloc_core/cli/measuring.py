@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.cli.arguments import count, processes
+from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.annotated import GALLERIES
@@ -19,6 +19,10 @@ _GROUPS = (
     "rendering",
     "service",
     "accuracy",
+    "views",
+    "turns",
+    "localisability",
+    "uninformative",
     "evidence",
     "azimuths",
     "terms",
@@ -58,6 +62,9 @@ def add_commands(commands: Any) -> None:
         choices=range(1, GALLERIES + 1),
         default=GALLERIES,
         help="number of plans to locate every photograph in (default: %(default)s)",
+    )
+    photographs.add_argument(
+        "--view", type=positive, action="append", default=[], metavar="DEG", help="also views of this field; repeatable"
     )
     photographs.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
     photographs.add_argument(
@@ -119,6 +126,7 @@ def _photographs(arguments: argparse.Namespace) -> None:
         arguments.out,
         galleries=arguments.galleries,
         workers=arguments.workers,
+        views_deg=arguments.view,
         command=shlex.join(["lalaloc", *sys.argv[1:]]),
     )
     print(results.markdown())

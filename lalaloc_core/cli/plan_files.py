@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 
 if TYPE_CHECKING:
-    from lalaloc_core.importers import ImportedPlan
+    from lalaloc_core.importers import ImportedPlan, Trace
 
 # Options of an import, as `importers.ImportOptions.from_text` expects them.
 _OPTIONS = {
@@ -35,21 +35,29 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f"--{name}", help=meaning)
 
 
-def read_plans(file: Path, arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
-    """Read the plans in a file, one for each level.
+def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = None) -> tuple[ImportedPlan, ...]:
+    """Read the plans in a file, one for each level; `trace` receives what is read from a drawing.
 
     Raises:
         InvalidFloorPlanError: the file cannot be read or is not a plan.
     """
-    from lalaloc_core.importers import ImportOptions, import_plans
+    from lalaloc_core.importers import ImportOptions, building_name, import_plans
 
     values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
     options = ImportOptions.from_text({name: value for name, value in values.items() if value is not None})
+    return import_plans(_content(file), options, building=building_name(file.name), trace=trace)
+
+
+def _content(file: Path) -> bytes:
+    """Return the bytes of a plan file; of the YAML file of a ROS map, an archive with its picture."""
+    if file.suffix.lower() in (".yaml", ".yml"):
+        from lalaloc_core.importers.formats.ros import map_files, pack
+
+        return pack(map_files(file))
     try:
-        content = file.read_bytes()
+        return file.read_bytes()
     except OSError as error:
         raise InvalidFloorPlanError(f"'{file}' cannot be read: {error.strerror}") from error
-    return import_plans(content, options)
 
 
 def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
@@ -64,7 +72,7 @@ def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
     return plan
 
 
-def write_picture(svg: str, out: Path) -> None:
+def write_picture(svg: str, out: Path, option: str = "--out") -> None:
     """Write a drawing as SVG or PNG, by the file's suffix.
 
     Raises:
@@ -72,18 +80,18 @@ def write_picture(svg: str, out: Path) -> None:
     """
     from lalaloc_core.draw import rasterise
 
-    check_picture_name(out)
+    check_picture_name(out, option)
     try:
         out.write_bytes(rasterise(svg) if out.suffix.lower() == ".png" else svg.encode())
     except OSError as error:
         raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
 
 
-def check_picture_name(out: Path) -> None:
+def check_picture_name(out: Path, option: str = "--out") -> None:
     """Refuse a picture file with another suffix than .svg or .png.
 
     Raises:
         InvalidInputError: another suffix.
     """
     if out.suffix.lower() not in (".svg", ".png"):
-        raise InvalidInputError(f"the picture's file is '{out.name}'; it must end in .png or .svg (--out)")
+        raise InvalidInputError(f"the picture's file is '{out.name}'; it must end in .png or .svg ({option})")

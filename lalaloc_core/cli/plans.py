@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
-from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
+from lalaloc_core.localise.bundle import default_bundle
+
+if TYPE_CHECKING:
+    from lalaloc_core.floorplan import FloorPlan
+    from lalaloc_core.importers import ImportedPlan
 
 
 def add_commands(commands: Any) -> None:
@@ -18,15 +26,31 @@ def add_commands(commands: Any) -> None:
     plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/how-to/import-a-plan.md)")
     actions = plan.add_subparsers(required=True, metavar="ACTION")
     importing = actions.add_parser("import", help="convert a file of any supported format to a plan, with a report")
-    importing.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
+    importing.add_argument("-o", "--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
+    importing.add_argument(
+        "--all-levels", action="store_true", help="write a plan of every level with rooms to the folder --out"
+    )
+    importing.add_argument(
+        "--debug", type=Path, metavar="PICTURE", help="draw what was read from a drawing or picture, .png or .svg"
+    )
     check = actions.add_parser("check", help="print the warnings of a plan")
     check.add_argument("--json", action="store_true", help="print JSON")
+    check.add_argument(
+        "--localisability", action="store_true", help="also predict which photographs of the plan will be found"
+    )
+    check.add_argument(
+        "--picture", type=Path, metavar="FILE", help="map of that probability, .png or .svg; needs --localisability"
+    )
+    check.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
     draw = actions.add_parser("draw", help="draw a plan as PNG or SVG")
     draw.add_argument("--out", type=Path, required=True, metavar="FILE", help="picture to write, .png or .svg")
     export = actions.add_parser("export", help="write a plan in another format")
-    export.add_argument("--format", required=True, help="native, geojson, imdf, dxf or svg")
+    export.add_argument("--format", required=True, help="native, geojson, imdf, dxf, svg or ros")
     export.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write")
     export.add_argument("--anchor", help="latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf")
+    export.add_argument(
+        "--like", type=Path, metavar="YAML", help="map whose origin, resolution and size the export has, for ros"
+    )
     for action, run in ((importing, _import), (check, _check), (draw, _draw), (export, _export)):
         action.add_argument("file", type=Path, help="floor plan, in any supported format")
         add_plan_options(action)
@@ -34,22 +58,69 @@ def add_commands(commands: Any) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    plans = read_plans(arguments.file, arguments)
+    if arguments.all_levels and arguments.out is None:
+        raise InvalidInputError("--all-levels needs a folder for the plans; add --out FOLDER")
+    plans = _read_traced(arguments) if arguments.debug else read_plans(arguments.file, arguments)
+    # Write before printing: a reader such as `head` may close the pipe.
+    written = [] if arguments.out is None else _write_plans(plans, _files(plans, arguments))
     for plan in plans:
         heading = "" if plan.level is None else f"level '{plan.level.name}': "
         print(f"{heading}{json.dumps(plan.report.to_dict(), ensure_ascii=False, indent=1)}", file=sys.stderr)
     if arguments.out is None:
         print_json(plans[0].document if len(plans) == 1 else [plan.document for plan in plans])
-        return
-    for number, plan in enumerate(plans):
-        out = arguments.out if len(plans) == 1 else arguments.out.with_stem(f"{arguments.out.stem}-{number}")
-        out.write_text(json.dumps(plan.document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    for out in written:
         print(out)
 
 
+def _read_traced(arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
+    """Read the plans in a file, and draw what was read, also of a file that is refused."""
+    from lalaloc_core.draw.trace import trace_svg
+    from lalaloc_core.importers import Trace
+
+    check_picture_name(arguments.debug, "--debug")
+    trace = Trace()
+    try:
+        return read_plans(arguments.file, arguments, trace)
+    finally:
+        write_picture(trace_svg(trace, arguments.file.name), arguments.debug, "--debug")
+        print(f"drawn: {arguments.debug}", file=sys.stderr)
+
+
+def _files(plans: Sequence[ImportedPlan], arguments: argparse.Namespace) -> list[Path]:
+    """Return the file of each plan: `--out`, else numbered files beside it or files in it, named by their levels."""
+    out = arguments.out
+    if arguments.all_levels:
+        names = [_file_name(arguments.file.stem if plan.level is None else plan.level.title) for plan in plans]
+        doubles = {name for name, count in Counter(names).items() if count > 1}
+        return [
+            out / (f"{name}-{number}.json" if name in doubles else f"{name}.json") for number, name in enumerate(names)
+        ]
+    return [out] if len(plans) == 1 else [out.with_stem(f"{out.stem}-{number}") for number in range(len(plans))]
+
+
+def _file_name(text: str) -> str:
+    """Return a text as the stem of a file's name: "Level 1/A" is "level-1-a"."""
+    return re.sub(r"[^\w-]+", "-", text.casefold()).strip("-") or "level"
+
+
+def _write_plans(plans: Sequence[ImportedPlan], files: Sequence[Path]) -> Sequence[Path]:
+    try:
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        for file, plan in zip(files, plans, strict=True):
+            file.write_text(json.dumps(plan.document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InvalidInputError(f"'{error.filename}' cannot be written: {error.strerror}") from error
+    return files
+
+
 def _check(arguments: argparse.Namespace) -> None:
+    if arguments.picture is not None and not arguments.localisability:
+        raise InvalidInputError("--picture draws the localisability; add --localisability")
     messages, plans = [], []
-    for imported in read_plans(arguments.file, arguments):
+    imports = read_plans(arguments.file, arguments)
+    if arguments.picture is not None and len(imports) > 1:
+        raise InvalidInputError(f"--picture draws one plan and the file has {len(imports)} levels; add --level")
+    for imported in imports:
         plan = imported.plan()
         warnings = [*imported.report.warnings, *imported.report.unsure, *plan.warnings]
         messages += warnings
@@ -57,6 +128,11 @@ def _check(arguments: argparse.Namespace) -> None:
         plans.append({"name": plan.name, **summary, "warnings": warnings})
         if not arguments.json:
             print(f"'{plan.name}': {len(plan.rooms)} rooms, {plan.area_m2:.1f} m², {len(plan.openings)} openings")
+        if arguments.localisability:
+            report, lines = _localisability(plan, arguments)
+            plans[-1]["localisability"] = report
+            if not arguments.json:
+                print("\n".join(lines))
     if arguments.json:
         print_json(plans)
         return
@@ -64,11 +140,27 @@ def _check(arguments: argparse.Namespace) -> None:
         print(f"- {message}")
 
 
+def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """Return the report of a plan's localisability, and its summary; draw it on request."""
+    from lalaloc_core.draw.localisability import localisability_svg
+    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.localise.localisability import localisability
+    from lalaloc_core.localise.localisability_report import report_of, summary_of
+
+    if arguments.picture is not None:
+        check_picture_name(arguments.picture, "--picture")
+    found = localisability(plan, Bundle.open(arguments.bundle).manifest)
+    if arguments.picture is not None:
+        write_picture(localisability_svg(plan, found), arguments.picture, "--picture")
+    return report_of(plan, found), summary_of(plan, found)
+
+
 def _draw(arguments: argparse.Namespace) -> None:
     from lalaloc_core.draw.plan import plan_svg
 
     check_picture_name(arguments.out)
-    write_picture(plan_svg(read_plan(arguments.file, arguments).plan()), arguments.out)
+    imported = read_plan(arguments.file, arguments)
+    write_picture(plan_svg(imported.plan(), no_room=imported.report.no_room), arguments.out)
     print(arguments.out)
 
 
@@ -77,7 +169,15 @@ def _export(arguments: argparse.Namespace) -> None:
 
     plan = read_plan(arguments.file, arguments)
     anchor = plan.anchor if arguments.anchor is None else _anchor(arguments.anchor)
-    arguments.out.write_bytes(export_plan(plan.plan(), arguments.format, anchor))
+    if arguments.like is None:
+        content = export_plan(plan.plan(), arguments.format, anchor)
+    elif arguments.format != "ros":
+        raise InvalidInputError(f"--like is for --format ros; the format is '{arguments.format}'")
+    else:
+        from lalaloc_core.importers.formats.ros import map_files, read_frame, write
+
+        content = write(plan.plan().to_dict(), anchor, read_frame(map_files(arguments.like)))
+    arguments.out.write_bytes(content)
     print(arguments.out)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from PIL import Image
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
-from lalaloc_core.draw.outline import LayoutOutline, layout_outline
+from lalaloc_core.draw.outline import LayoutOutline, ViewOutline, layout_outline, outline_in_view
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
@@ -21,13 +21,14 @@ from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.posterior import probability_map
+from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, probability_map
 from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.photograph import View
 
 Picture = Literal["both", "plan", "photograph"]
 
 _WIDTH, _PAD = 1600.0, 36.0
-# Size of the drawn photograph; a photograph of this size is not scaled.
+# Size of a drawn sphere, and largest of other photographs; photographs that fit it are not scaled.
 PHOTOGRAPH_SIZE = (1528, 764)
 _HEADER, _KEY, _LEGEND = 104.0, 52.0, 400.0
 # Minimum and maximum height of the plan's drawing.
@@ -58,6 +59,7 @@ class DrawnAnswer:
         heading_source: origin of the heading, one or two words.
         confidence: probability that the position is correct; None if unknown.
         heat: map of the posterior; None leaves the floors white.
+        view: the photograph; None for a full sphere.
     """
 
     plan: FloorPlan
@@ -68,21 +70,30 @@ class DrawnAnswer:
     confidence: float | None
     rivals: tuple[DrawnCandidate, ...] = ()
     heat: HeatMap | None = None
+    view: View | None = None
 
     @property
-    def outline(self) -> LayoutOutline:
+    def outline(self) -> LayoutOutline | ViewOutline:
         """The layout as seen from the predicted pose."""
         position_m = np.array([self.camera.x_m, self.camera.y_m])
         heading = heading_from_degrees(self.camera.heading_deg or 0.0)
-        return layout_outline(self.plan, position_m, self.room_index, heading, self.camera_height_m)
+        outline = layout_outline(self.plan, position_m, self.room_index, heading, self.camera_height_m)
+        return outline if self.view is None else outline_in_view(outline, self.view)
 
 
 def drawn_answer(
-    plan: FloorPlan, grid: PoseGrid, found: Localisation, model: ConfidenceModel | None, heading_source: str
+    plan: FloorPlan,
+    grid: PoseGrid,
+    found: Localisation,
+    model: ConfidenceModel | None,
+    heading_source: str,
+    *,
+    view: View | None = None,
 ) -> DrawnAnswer:
     """Collect the contents of the picture of a localisation.
 
     `heading_source` states the origin of the heading in one or two words. Without a model, probabilities are left out.
+    `view` is the decoded photograph; None stands for a full sphere.
     """
     confidence = found.confidence(model)
     best, *rival_candidates = found.candidates
@@ -114,6 +125,7 @@ def drawn_answer(
         confidence=None if confidence is None else confidence.position,
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
+        view=None if view is None or view.panorama is not None else view,
     )
 
 
@@ -127,7 +139,8 @@ def draw_answer(
 ) -> str:
     """Draw an answer as an SVG document, 1600 pixels wide.
 
-    The photograph is a levelled full sphere from `panorama.images.open_panorama`, required unless `picture` is "plan".
+    The photograph is a levelled full sphere from `panorama.images.open_panorama`, or that of `answer.view` from
+    `photograph.view.open_picture`; it is required unless `picture` is "plan".
     The default title is the room. `rooms` is a cached result of `draw_rooms` for the plan.
     """
     room = answer.plan.rooms[answer.room_index].name
@@ -136,8 +149,10 @@ def draw_answer(
     if picture != "plan":
         if photograph is None:
             raise ValueError(f"photograph is None; picture='{picture}' needs it")
-        (width, height), outline = PHOTOGRAPH_SIZE, answer.outline
-        parts.append(photograph_part(jpeg(_sized(photograph)), "jpeg", outline, (_PAD, y, width, height)))
+        shown, outline = _sized(photograph, is_sphere=answer.view is None), answer.outline
+        height, width = shown.shape[:2]
+        x = _PAD + 0.5 * (PHOTOGRAPH_SIZE[0] - width)
+        parts.append(photograph_part(jpeg(shown), "jpeg", outline, (x, y, width, height)))
         y += height
         parts.append(photograph_key(outline, _PAD, y + 32))
         y += _KEY
@@ -187,7 +202,7 @@ def _marks(answer: DrawnAnswer) -> str:
     extent = extent_m(answer.plan)
     size = extent / 60.0
     parts = []
-    for number, rival in reversed(list(enumerate(_shown(answer.rivals), start=2))):
+    for number, rival in reversed(list(enumerate(_shown(answer), start=2))):
         parts.append(
             f'<g class="rival" transform="translate({rival.x_m:.4f} {-rival.y_m:.4f})">'
             f'<circle r="{0.9 * size:.4f}" fill="#fff" stroke="{FOUND}" stroke-width="{0.16 * size:.4f}"/>'
@@ -210,9 +225,9 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
         major, minor = ellipse_m(answer.camera.covariance_m2)
         row += 28
         parts.append(words(x + 32, row, f"95 % within ± {_length(major)} by ± {_length(minor)}", 16, fill=MUTED))
-    rivals = _shown(answer.rivals)
+    rivals = _shown(answer)
     row += 48
-    parts.append(words(x, row, "Other candidates" if rivals else "No other candidate", 18, more='font-weight="bold"'))
+    parts.append(words(x, row, "Other places" if rivals else "No other place", 18, more='font-weight="bold"'))
     for number, rival in enumerate(rivals, start=2):
         row += 34
         share = "" if rival.probability is None else f"{100 * rival.probability:.1f} %"
@@ -228,14 +243,33 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
     return "".join(parts)
 
 
-def _sized(photograph: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    if photograph.shape[1::-1] == PHOTOGRAPH_SIZE:
+def _sized(photograph: UInt8[np.ndarray, "h w 3"], *, is_sphere: bool) -> UInt8[np.ndarray, "h2 w2 3"]:
+    height, width = photograph.shape[:2]
+    size = PHOTOGRAPH_SIZE
+    if not is_sphere:
+        share = min(size[0] / width, size[1] / height)
+        size = round(share * width), round(share * height)
+    if (width, height) == size:
         return photograph
-    return np.asarray(Image.fromarray(photograph).resize(PHOTOGRAPH_SIZE, Image.Resampling.BICUBIC))
+    return np.asarray(Image.fromarray(photograph).resize(size, Image.Resampling.BICUBIC))
 
 
-def _shown(rivals: Sequence[DrawnCandidate]) -> list[DrawnCandidate]:
-    return [rival for rival in rivals if rival.probability is None or rival.probability >= _MIN_PROBABILITY]
+def _shown(answer: DrawnAnswer) -> list[DrawnCandidate]:
+    """Return the other places; candidates within 1 m of the answer or of a better one are the same place."""
+    places: list[DrawnCandidate] = []
+    for rival in answer.rivals:
+        if _distance_m(rival, answer.camera) < RIGHT_WITHIN_M:
+            continue
+        near = next((i for i, place in enumerate(places) if _distance_m(rival, place) < RIGHT_WITHIN_M), None)
+        if near is None:
+            places.append(rival)
+        elif rival.probability is not None:
+            places[near] = replace(places[near], probability=(places[near].probability or 0.0) + rival.probability)
+    return [place for place in places if place.probability is None or place.probability >= _MIN_PROBABILITY]
+
+
+def _distance_m(first: DrawnCandidate, second: DrawnCandidate | Marker) -> float:
+    return math.hypot(first.x_m - second.x_m, first.y_m - second.y_m)
 
 
 def _length(metres: float) -> str:

@@ -1,4 +1,4 @@
-"""Outline of a layout in a panorama: floor and ceiling lines, corners, doors and windows.
+"""Outline of a layout in a photograph: floor and ceiling lines, corners, doors and windows.
 
 Computed in closed form from the pose, the camera height and the room's walls.
 """
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
+from lalaloc_core.photograph import View
 from lalaloc_core.render.profile import nearest_walls
 
 _COLUMNS = 1024
@@ -27,6 +28,9 @@ _STRAIGHT = math.radians(8.0)
 _POINTS_PER_OPENING = 33
 # A point farther than the wall by this share is hidden.
 _HIDDEN = 2e-3
+
+# Largest angle (radians) between points of a line in a view.
+_VIEW_STEP = math.radians(0.5)
 
 Line = Float[np.ndarray, "_ 2"]
 
@@ -52,6 +56,51 @@ class LayoutOutline:
     ceiling: Line
     corners: Float[np.ndarray, "k 2 2"]
     openings: tuple[OpeningOutline, ...]
+
+    @property
+    def edges(self) -> list[Line]:
+        """All lines of the walls."""
+        return [self.floor, self.ceiling, *self.corners]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOutline:
+    """Lines of a layout in a view, as shares (x, y) of the picture's width and height, y pointing down.
+
+    Attributes:
+        edges: visible parts of the walls' lines.
+        openings: visible parts of the lines around openings, which need not be closed.
+    """
+
+    edges: list[Line]
+    openings: tuple[OpeningOutline, ...]
+
+
+def outline_in_view(outline: LayoutOutline, view: View) -> ViewOutline:
+    """Return the parts of an outline that a photograph with a camera shows."""
+    return ViewOutline(
+        [part for line in outline.edges for part in _seen_parts(line, view)],
+        tuple(
+            OpeningOutline(opening.kind, part)
+            for opening in outline.openings
+            for part in _seen_parts(opening.line, view)
+        ),
+    )
+
+
+def _seen_parts(line: Line, view: View) -> list[Line]:
+    """Return the visible parts of a line in a panorama, as lines in a view."""
+    direction = (line - 0.5) * (TWO_PI, -math.pi)
+    steps = np.ceil(np.abs(np.diff(direction, axis=0)).max(axis=1) / _VIEW_STEP).clip(1).astype(int)
+    place = np.append(np.concatenate([start + np.arange(n) / n for start, n in enumerate(steps)]), len(steps))
+    whole = np.arange(len(direction))
+    azimuth, elevation = (np.interp(place, whole, values) for values in direction.T)
+    rays = np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
+    )
+    shares, seen = view.project(rays)
+    runs = np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen)) + 1)
+    return [shares[run] for run in runs if len(run) > 1 and seen[run[0]]]
 
 
 def layout_outline(

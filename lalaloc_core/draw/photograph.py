@@ -10,11 +10,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from lalaloc_core.draw.canvas import INK, Box, Number, document, image, path, pixels, png, words
-from lalaloc_core.draw.outline import LayoutOutline
+from lalaloc_core.draw.outline import LayoutOutline, ViewOutline
+from lalaloc_core.draw.palette import ON_PHOTOGRAPH
 
-# Distinct for colour-blind readers, on bright walls and dark furniture.
-WALL_COLOUR = "#ffb000"
-OPENING_COLOURS = {"door": "#dc267f", "window": "#4f7dff", "passage": "#ffffff"}
+WALL_COLOUR = ON_PHOTOGRAPH["wall"]
+# In the order of the legend.
+_KINDS = ("door", "window", "passage")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +42,17 @@ def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> 
 
 
 def wall_stroke(
-    outline: LayoutOutline,
+    outline: LayoutOutline | ViewOutline,
     size: tuple[int, int],
     colour: str = WALL_COLOUR,
     width: float = 2.0,
     edge_width: float = 3.0,
 ) -> Stroke:
     """Return floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
-    return Stroke(
-        [line * size for line in (outline.floor, outline.ceiling, *outline.corners)], colour, width, edge_width
-    )
+    return Stroke([line * size for line in outline.edges], colour, width, edge_width)
 
 
-def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box) -> str:
+def photograph_part(content: bytes, kind: str, outline: LayoutOutline | ViewOutline, box: Box) -> str:
     """Draw a photograph with a layout over it as a part of a larger drawing.
 
     `content` is the encoded picture, of kind "jpeg" or "png", with as many pixels as the box; `box` is x, y, width and
@@ -66,7 +65,7 @@ def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box)
     # Unscaled pixels need no smoothing, which takes a second.
     parts = [image(content, kind, (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')]
     for opening in outline.openings:
-        d, colour = path([opening.line * size]), OPENING_COLOURS[opening.kind]
+        d, colour = path([opening.line * size]), ON_PHOTOGRAPH[opening.kind]
         parts.append(
             f'<path class="{opening.kind}" d="{d}" fill="{colour}" fill-opacity="0.18" stroke="{INK}" '
             f'stroke-width="{1.6 * line:.2f}" stroke-linejoin="round"/>'
@@ -76,13 +75,13 @@ def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box)
     return f'<g class="photograph" transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
 
 
-def photograph_key(outline: LayoutOutline, x: Number, y: Number) -> str:
+def photograph_key(outline: LayoutOutline | ViewOutline, x: Number, y: Number) -> str:
     """Draw the legend of the lines in a photograph; `y` is the base line of its text."""
-    kinds = sorted({opening.kind for opening in outline.openings}, key=list(OPENING_COLOURS).index)
+    kinds = sorted({opening.kind for opening in outline.openings}, key=_KINDS.index)
     parts = []
     for name, colour in (
         ("walls of the plan", WALL_COLOUR),
-        *((kind + "s", OPENING_COLOURS[kind]) for kind in kinds),
+        *((kind + "s", ON_PHOTOGRAPH[kind]) for kind in kinds),
     ):
         parts.append(
             f'<rect x="{x:.1f}" y="{y - 13:.1f}" width="26" height="13" rx="3" fill="{colour}" stroke="{INK}"/>'

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 
-from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, Box, xml_text
+from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, PAPER, Box, xml_text
+from lalaloc_core.draw.palette import ON_PAPER
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.floorplan.rooms import interior_point
 
@@ -18,15 +20,18 @@ Bounds = tuple[float, float, float, float]
 
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
-# Colours of the line on the wall, and of the gap through it.
-_OPENING_COLOURS = {"door": "#b5651d", "window": "#2b7fc9", "passage": "#8c939c"}
+# Colours of the gap through the wall.
 _GAP_COLOURS = {"door": "#f6dfc6", "window": "#cde6fb", "passage": "#ffffff"}
+# Areas inside walls that became no room: reddish purple of Okabe and Ito's palette.
+_NO_ROOM = "#cc79a7"
 # Thickness of drawn walls outside each floor; walls between rooms meet.
 _WALL_M = 0.12
 # Placeholder for a heat map in the result of `draw_rooms`.
 HEAT_PLACE = "<!--heat-->"
 # Largest length of the scale bar, as a share of the drawing's width.
 _BAR_SHARE = 0.2
+# Largest width of the legend of openings, as a share of the drawing's.
+_KEY_SHARE = 0.6
 # Radius, in standard deviations, that holds 95 % of a 2-D normal distribution: sqrt(-2 log 0.05).
 ELLIPSE_STDS = 2.4477
 # Share of the drawing for the scale bar's label, drawing size per camera radius, and reach of the wedge in radii.
@@ -43,14 +48,27 @@ class Marker:
     covariance_m2: tuple[float, float, float] | None = None
 
 
-def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None = None) -> str:
+def plan_svg(
+    plan: FloorPlan,
+    marker: Marker | None = None,
+    *,
+    rooms: str | None = None,
+    no_room: Sequence[Sequence[Sequence[float]]] = (),
+) -> str:
     """Draw the plan with names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
     The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
-    is drawn at (x, -y). `rooms` is a cached result of `draw_rooms` for the plan.
+    is drawn at (x, -y). `rooms` is a cached result of `draw_rooms` for the plan; for `no_room` see there.
     """
-    head, tail = svg_around(plan.name, plan.bounds_m, marker)
-    return head + (draw_rooms(plan) if rooms is None else rooms).replace(HEAT_PLACE, "") + tail
+    head, tail = svg_around(plan.name, bounds_with(plan.bounds_m, no_room), marker)
+    return head + (draw_rooms(plan, no_room) if rooms is None else rooms).replace(HEAT_PLACE, "") + tail
+
+
+def bounds_with(bounds_m: Bounds, no_room: Sequence[Sequence[Sequence[float]]]) -> Bounds:
+    """Return the bounds of a plan and of the areas that became no room."""
+    x, y = zip(*(point for outline in no_room for point in outline), strict=True) if no_room else ((), ())
+    x_min, y_min, x_max, y_max = bounds_m
+    return min((x_min, *x)), min((y_min, *y)), max((x_max, *x)), max((y_max, *y))
 
 
 def svg_around(name: str, bounds_m: Bounds, marker: Marker | None = None) -> tuple[str, str]:
@@ -61,6 +79,7 @@ def svg_around(name: str, bounds_m: Bounds, marker: Marker | None = None) -> tup
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * scale:.0f}" height="{height * scale:.0f}" '
         f'viewBox="{left:.3f} {top:.3f} {width:.3f} {height:.3f}" font-family="{FONT_FAMILY}" text-anchor="middle">\n'
         f"<title>{xml_text(name)}</title>\n"
+        f'<rect x="{left:.3f}" y="{top:.3f}" width="{width:.3f}" height="{height:.3f}" fill="{PAPER}"/>\n'
     )
     camera = "" if marker is None else f"\n{draw_camera(marker, max(_size_m(bounds_m)))}"
     return head, f"{_scale_bar(bounds_m)}{camera}\n</svg>\n"
@@ -109,8 +128,11 @@ def floor_path(plan: FloorPlan) -> str:
     return "".join("M" + "L".join(f"{x:.3f} {-y:.3f}" for x, y in ring) + "Z" for ring in rings)
 
 
-def draw_rooms(plan: FloorPlan) -> str:
-    """Draw outlines, openings, names and areas of all rooms: the slow part of a drawing, independent of cameras."""
+def draw_rooms(plan: FloorPlan, no_room: Sequence[Sequence[Sequence[float]]] = ()) -> str:
+    """Draw outlines, openings, names, areas and the legend of openings: all that is slow and independent of cameras.
+
+    `no_room` has outlines (m) of areas inside walls that became no room; they are marked.
+    """
     extent = max(_size_m(plan.bounds_m))
     wall = 2.0 * max(_WALL_M, extent / 400.0)
     lines = [
@@ -126,6 +148,8 @@ def draw_rooms(plan: FloorPlan) -> str:
         f'<g fill="{INK}" stroke="#fff" stroke-linejoin="round" paint-order="stroke">',
         *(_label(room, extent) for room in plan.rooms),
         "</g>",
+        *(_mark_no_room(np.array(outline), extent) for outline in no_room),
+        _key(plan),
     ]
     return "\n".join(lines)
 
@@ -201,7 +225,7 @@ def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
         # A passage has no leaf: the gap shows between the dashes.
         parts.append(f'<path {stroke} stroke="{_GAP_COLOURS[kind]}"/>')
         dashes = f' stroke-dasharray="{extent_m / 75:.4f}"'
-    parts.append(f'<path class="{kind}" {stroke} stroke="{_OPENING_COLOURS[kind]}"{dashes}/>')
+    parts.append(f'<path class="{kind}" {stroke} stroke="{ON_PAPER[kind]}"{dashes}/>')
     return "".join(parts)
 
 
@@ -217,6 +241,16 @@ def _beyond_m(plan: FloorPlan, face: OpeningFace, own_m: Float[np.ndarray, "2 2"
 def _piece_m(room: Room, wall: int, start: float, end: float) -> Float[np.ndarray, "2 2"]:
     ends = room.walls_m[wall].reshape(2, 2)
     return ends[0] + np.array([[start], [end]]) * (ends[1] - ends[0])
+
+
+def _mark_no_room(outline_m: Float[np.ndarray, "n 2"], extent_m: float) -> str:
+    x, y = interior_point(shapely.Polygon(outline_m).buffer(0))[0]
+    size = extent_m / 50.0
+    return (
+        f'<g class="no-room"><polygon points="{_points(outline_m)}" fill="{_NO_ROOM}" fill-opacity="0.25" '
+        f'stroke="{_NO_ROOM}" stroke-width="{extent_m / 400:.4f}" stroke-dasharray="{extent_m / 100:.4f}"/>'
+        f'<text x="{x:.3f}" y="{-y:.3f}" font-size="{size:.4f}" fill="{INK}">no room</text></g>'
+    )
 
 
 def _points(ring_m: Float[np.ndarray, "n 2"]) -> str:
@@ -247,6 +281,28 @@ def _scale_bar(bounds_m: Bounds) -> str:
         f'<text x="{x_min:.3f}" y="{y + extent_m / 40:.3f}" font-size="{size:.4f}" text-anchor="start">{length:g} m'
         "</text></g>"
     )
+
+
+def _key(plan: FloorPlan) -> str:
+    """Draw the legend of the plan's openings below its right corner."""
+    kinds = [kind for kind in _GAP_COLOURS if any(opening.kind == kind for opening in plan.openings)]
+    if not kinds:
+        return ""
+    width_m, height_m = _size_m(plan.bounds_m)
+    # Widths in font sizes: a line and its gap, and the letters.
+    widths = [2.6 + 0.62 * len(kind) for kind in kinds]
+    size = min(max(width_m, height_m) / 50.0, _KEY_SHARE * width_m / sum(widths))
+    x, y = plan.bounds_m[2] - size * sum(widths), -plan.bounds_m[1] + _MARGIN_M
+    parts = []
+    for kind, width in zip(kinds, widths, strict=True):
+        dashes = f' stroke-dasharray="{0.4 * size:.4f}"' if kind == "passage" else ""
+        parts.append(
+            f'<path d="M{x:.3f} {y:.3f}h{1.4 * size:.4f}" stroke="{ON_PAPER[kind]}" '
+            f'stroke-width="{0.3 * size:.4f}"{dashes}/>'
+            f'<text x="{x + 1.8 * size:.3f}" y="{y + 0.36 * size:.3f}" font-size="{size:.4f}">{kind}</text>'
+        )
+        x += size * width
+    return f'<g class="key" fill="{INK}" text-anchor="start">{"".join(parts)}</g>'
 
 
 def _ellipse(covariance_m2: tuple[float, float, float] | None, extent: float) -> str:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import StageScores, score
+from lalaloc_core.learn.data.views import Stated
 from lalaloc_core.localise.bundle import Bundle
 
 # Limits for minor figures, and for the comparison of matching costs, which repeats its queries six times.
@@ -24,7 +28,8 @@ class Benchmark:
     """Queries for the model.
 
     `heldout` homes are out-of-distribution ones; `copies` makes plans of four copies of a home that differ in their
-    doors; a `minor` benchmark needs fewer homes. `settings` are those of method "lalaloc".
+    doors; a `minor` benchmark needs fewer homes. `view_deg` is the field of view of the photographs, None for spheres,
+    and `stated` what is known of it. `settings` are those of method "lalaloc".
     """
 
     kind: QueryKind = "panorama"
@@ -32,6 +37,8 @@ class Benchmark:
     heading_known: bool = True
     heldout: bool = False
     copies: bool = False
+    view_deg: float | None = None
+    stated: Stated = "field"
     settings: Mapping[str, Any] = field(default_factory=dict)
     minor: bool = False
 
@@ -46,11 +53,30 @@ _BENCHMARKS = {
     "heldout_empty": Benchmark(heldout=True, furniture="empty", minor=True),
 }
 
+_VIEW_BENCHMARKS = {
+    "view_60_unknown_heading": Benchmark(view_deg=60.0, heading_known=False, minor=True),
+    "view_80_unknown_heading": Benchmark(view_deg=80.0, heading_known=False, minor=True),
+    "view_80_known_tilt": Benchmark(view_deg=80.0, heading_known=False, stated="tilt", minor=True),
+    "view_80_unknown_field": Benchmark(view_deg=80.0, heading_known=False, stated="nothing", minor=True),
+    "view_80_heading_within_10_deg": Benchmark(view_deg=80.0, settings={"heading_error_deg": 10.0}, minor=True),
+    "view_106_unknown_heading": Benchmark(view_deg=106.0, heading_known=False, minor=True),
+    "heldout_view_80_unknown_heading": Benchmark(view_deg=80.0, heading_known=False, heldout=True, minor=True),
+    "heldout_view_106_unknown_heading": Benchmark(view_deg=106.0, heading_known=False, heldout=True, minor=True),
+}
+
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Measure accuracy in generated test homes, 4 queries each; in at most 100 unfurnished and heldout ones."""
     return {
         name: summarise(run_benchmark(bundle, benchmark, homes, textures)) for name, benchmark in _BENCHMARKS.items()
+    }
+
+
+def bench_views(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Measure accuracy of views in at most 100 furnished test and out-of-distribution homes, 4 queries each."""
+    return {
+        name: summarise(run_benchmark(bundle, benchmark, homes, textures))
+        for name, benchmark in _VIEW_BENCHMARKS.items()
     }
 
 
@@ -91,6 +117,7 @@ def run_benchmark(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Pa
         split="test",
         settings=dict(benchmark.settings),
         generated=generated,
+        views=None if benchmark.view_deg is None else {"field_deg": benchmark.view_deg, "stated": benchmark.stated},
         bundle=str(bundle.folder),
         furniture=benchmark.furniture if benchmark.kind == "panorama" else None,
         heading_known=benchmark.heading_known,
@@ -112,12 +139,21 @@ def summarise(predictions: list[Prediction]) -> dict[str, Any]:
         "n": scores.n,
         **figures(scores.final),
         "within_1m_interval": [interval.low, interval.high],
+        "within_1m_30deg": scores.final.within_1m_30deg.value,
+        "among_5": float(np.mean([is_among(prediction, 5) for prediction in predictions])),
         "retrieval": figures(scores.stages["retrieval"]),
         "correct_room": scores.final.correct_room.value,
         "heading_within_2deg": scores.final.heading_within_2deg.value,
         "median_ms": scores.median_ms,
         "expected_calibration_error": scores.calibration_error,
     }
+
+
+def is_among(prediction: Prediction, count: int) -> bool:
+    """Return whether one of the first candidates is within 1 m of the truth."""
+    truth = prediction.truth
+    poses = [candidate.pose for candidate in prediction.candidates[:count]]
+    return any(math.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < 1.0 for pose in poses)
 
 
 # Settings of method "lalaloc" by row. Terms that a plan or a model lacks have no effect.

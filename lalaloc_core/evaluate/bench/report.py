@@ -13,10 +13,14 @@ from lalaloc_core.evaluate.bench.accuracy import (
     bench_evidence,
     bench_heights,
     bench_terms,
+    bench_views,
 )
 from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
+from lalaloc_core.evaluate.bench.localisability import bench_localisability
 from lalaloc_core.evaluate.bench.service import bench_service
 from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
+from lalaloc_core.evaluate.bench.turns import bench_turns
+from lalaloc_core.evaluate.bench.uninformative import bench_uninformative
 from lalaloc_core.localise.bundle import Bundle
 
 
@@ -30,6 +34,10 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "rendering": lambda: bench_rendering(bundle),
         "service": lambda: bench_service(bundle, textures),
         "accuracy": lambda: bench_accuracy(bundle, homes, textures),
+        "views": lambda: bench_views(bundle, homes, textures),
+        "turns": lambda: bench_turns(bundle, homes, textures),
+        "localisability": lambda: bench_localisability(bundle, homes, textures),
+        "uninformative": lambda: bench_uninformative(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),
         "azimuths": lambda: bench_azimuths(bundle, homes, textures),
         "terms": lambda: bench_terms(bundle, homes, textures),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import socket
 import statistics
@@ -21,13 +22,17 @@ from PIL import Image
 
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.photograph.cameras import Perspective
 
 _REQUESTS = 40
 _STARTUP_SECONDS = 60.0
 _SMALL_PROCESS_MB = 50.0
+# Width and height (pixels) and horizontal field of view (degrees) of a phone's photographs, and how many are made.
+_PHONE_SIZE, _PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
 
 
 def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
@@ -35,37 +40,59 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
     home = home_of_area(100.0)
     shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
     materials = MaterialLibrary.create(np.random.default_rng(1), textures)
-    pictures = [_jpeg(image) for image in PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()]
+    images = PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()
+    pictures = [_jpeg(image) for image in images]
     with running_service(bundle.folder) as (client, process):
         plan_id = _upload(client, home.plan)
         report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
-        for name, known in (("known_heading", True), ("unknown_heading", False)):
-            responses = []
-            for index, (shot, picture) in enumerate([(shots[0], pictures[0]), *zip(shots, pictures, strict=True)]):
-                data = {"floorplan_id": plan_id, "camera_height_m": f"{shot.home.plan.camera_height_m}"}
-                if known:
-                    data["heading_deg"] = f"{np.degrees(shot.heading):.3f}"
-                begin = time.perf_counter()
-                response = client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
-                response.raise_for_status()
-                # The first request is a warm-up.
-                if index:
-                    responses.append(((time.perf_counter() - begin) * 1e3, response.json()))
-            times = [milliseconds for milliseconds, _ in responses]
-            report[name] = {
-                "p50_ms": statistics.median(times),
-                "p95_ms": float(np.quantile(times, 0.95)),
-                "stages": sorted({answer["stage"] for _, answer in responses}),
-                "median_stage_ms": {
-                    stage: statistics.median(answer["timings_ms"][stage] for _, answer in responses)
-                    for stage in responses[0][1]["timings_ms"]
-                },
-            }
+        heights = [{"camera_height_m": f"{shot.home.plan.camera_height_m}"} for shot in shots]
+        headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
+        rows = {
+            "known_heading": [
+                (file, {**height, **heading}) for file, height, heading in zip(pictures, heights, headings, strict=True)
+            ],
+            "unknown_heading": list(zip(pictures, heights, strict=True)),
+        }
+        if bundle.manifest.view is not None:
+            views = [_phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
+            lens = {"hfov_deg": f"{_PHONE_FIELD_DEG:g}"}
+            rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]
+        for name, requests in rows.items():
+            report[name] = _latency(client, plan_id, requests)
         report["service_resident_mb"] = resident_mb(process.pid)
         sizes = [resident_mb(pid) for pid in children_of(process.pid)]
         # The smaller child is Python's resource tracker.
         report["workers_resident_mb"] = [size for size in sizes if size > _SMALL_PROCESS_MB]
     return report
+
+
+def _latency(client: httpx.Client, plan_id: str, requests: list[tuple[bytes, dict[str, str]]]) -> dict[str, Any]:
+    """Send photographs with their fields one after another; the first is sent twice, as a warm-up."""
+    responses = []
+    for index, (photograph, fields) in enumerate([requests[0], *requests]):
+        begin = time.perf_counter()
+        data, files = {"floorplan_id": plan_id, **fields}, {"photo": ("p.jpg", photograph, "image/jpeg")}
+        response = client.post("/localise", data=data, files=files).raise_for_status()
+        if index:
+            responses.append(((time.perf_counter() - begin) * 1e3, response.json()))
+    times = [milliseconds for milliseconds, _ in responses]
+    return {
+        "p50_ms": statistics.median(times),
+        "p95_ms": float(np.quantile(times, 0.95)),
+        "stages": sorted({answer["stage"] for _, answer in responses}),
+        "median_stage_ms": {
+            stage: statistics.median(answer["timings_ms"][stage] for _, answer in responses)
+            for stage in responses[0][1]["timings_ms"]
+        },
+    }
+
+
+def _phone_photograph(sphere: np.ndarray) -> bytes:
+    """Return a part of a sphere as a JPEG of 12 megapixels, with the noise that makes such files 4 MB."""
+    camera = Perspective.of_hfov(*_PHONE_SIZE, math.radians(_PHONE_FIELD_DEG))
+    view = cut_view(sphere, camera, azimuth=0.0, pitch=0.0, roll=0.0)
+    noise = np.random.default_rng(0).normal(0.0, 4.0, view.shape)
+    return _jpeg((view + noise).clip(0.0, 255.0).astype(np.uint8))
 
 
 @contextmanager

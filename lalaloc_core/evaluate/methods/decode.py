@@ -49,7 +49,12 @@ class VdrDecode:
         with clock.stage("decode"):
             start = found.candidates[0]
             job = refinement_job(
-                plan, query, [start], grid.camera_height_m, encoders.manifest.evidence, self._config.matching
+                plan,
+                query,
+                [start],
+                grid.camera_height_m,
+                encoders.manifest.evidence_for(view=query.is_view),
+                self._config.matching,
             )
             result = self._aligner.refine(replace(job, targets=self.decode(job.targets)))
         aligned = replace(

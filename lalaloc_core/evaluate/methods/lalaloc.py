@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import zlib
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -16,11 +17,13 @@ from jaxtyping import UInt8
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.optimise import LpoConfig, PoseRefiner
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.pipeline import (
     LocaliseConfig,
     Refine,
@@ -69,8 +72,12 @@ class LaLaLoc:
         refiner: Refiner | None = None,
         config: LocaliseConfig | None = None,
         stated: StatedHeight = StatedHeight(),
+        photograph_encoder: PhotographEncoder | None = None,
+        heading_error_deg: float = 0.0,
     ) -> None:
         self.encoders = encoders
+        self._photograph_encoder = photograph_encoder
+        self._heading_error = math.radians(heading_error_deg)
         self._stated = stated
         self._refine: Refine = refine
         self._refiner = refiner
@@ -81,9 +88,7 @@ class LaLaLoc:
     def locate(self, question: Question) -> Answer:
         """Encode the query and run the service's search."""
         clock = StageClock()
-        image = read_image(self.encoders, question)
-        with clock.stage("encode"):
-            query = encode(self.encoders, question, image, self._stated)
+        query = self._query(question, clock)
         grid = self.grid(question)
         found = localise(
             question.plan,
@@ -101,7 +106,7 @@ class LaLaLoc:
         }
         # The confidence model is fitted on photographs and the default matching cost.
         calibrated = question.kind == "panorama" and self._config.matching == MatchingConfig()
-        confidence = found.confidence(self.encoders.manifest.confidence) if calibrated else None
+        confidence = found.confidence(self.encoders.manifest.confidence_for(view=query.is_view)) if calibrated else None
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
             candidates=tuple(
@@ -116,6 +121,24 @@ class LaLaLoc:
             camera_height_m=found.camera_height_m,
             timings_ms={**clock.timings_ms, **found.timings_ms},
         )
+
+    def _query(self, question: Question, clock: StageClock) -> Query:
+        """Encode the photograph; a known heading has a uniformly distributed error."""
+        photograph, camera = question.photograph, question.camera
+        if not isinstance(photograph, ViewPhotograph):
+            image = read_image(self.encoders, question)
+            with clock.stage("encode"):
+                return encode(self.encoders, question, image, self._stated)
+        assert self._photograph_encoder is not None, "views need an encoder of photographs"
+        view = photograph.open(patch_size(self.encoders.manifest))
+        heading = None
+        if question.heading_known:
+            rng = np.random.default_rng(zlib.crc32(camera.position_m.tobytes()))
+            heading = camera.heading + float(rng.uniform(-self._heading_error, self._heading_error))
+        with clock.stage("encode"):
+            return self._photograph_encoder.query(
+                view, heading, self._stated.of(question), heading_tolerance=self._heading_error
+            )
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def grid(self, question: Question) -> PoseGrid:

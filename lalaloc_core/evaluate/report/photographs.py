@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from PIL import Image
 
 from lalaloc_core.conventions import OPENING_CLASSES
@@ -25,8 +25,10 @@ from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR
 from lalaloc_core.evaluate.report.sheets import Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.tables import percent
 from lalaloc_core.evaluate.runs.factories import describe_model
+from lalaloc_core.evaluate.runs.foreign import ACCEPTED, foreign_confidences, foreign_plans
 from lalaloc_core.evaluate.runs.galleries import (
     GalleryAnswer,
+    GalleryScores,
     answers_in_galleries,
     describe_answers,
     score_galleries,
@@ -102,29 +104,57 @@ def _bars(classes: Int[np.ndarray, "w"], row: float) -> list[Stroke]:
 
 FIGURES_FILE, SHEET_FILE = "photographs.json", "photographs.png"
 _HEADINGS = {"known": True, "unknown": False}
+# Views of each photograph, at equal angles.
+_VIEWS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PhotographResults:
     """Results of a model on annotated photographs.
 
-    `read` are predictions of walls and openings; `answers` are by heading, "known" or "unknown".
+    `read` are predictions of walls and openings; `answers` are by heading, "known" or "unknown", and `views` by field
+    of view (degrees) and heading. `foreign` are confidences in plans of other buildings, by heading.
     """
 
     read: Sequence[ReadPhotograph]
     answers: Mapping[str, Sequence[GalleryAnswer]]
+    views: Mapping[str, Mapping[str, Sequence[GalleryAnswer]]] = dataclasses.field(default_factory=dict)
+    foreign: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
     def figures(self) -> dict[str, Any]:
         """Return all figures as plain data; summaries are over the photographs that count."""
         counting = [read.measures for read in self.read if read.photograph.counts]
-        scores = {heading: dataclasses.asdict(score_galleries(results)) for heading, results in self.answers.items()}
+        scores, *views = (
+            {heading: dataclasses.asdict(score_galleries(results)) for heading, results in answers.items()}
+            for answers in (self.answers, *self.views.values())
+        )
         return without_infinity(
             {
                 "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
                 "galleries": scores,
+                "views": dict(zip(self.views, views, strict=True)),
+                "read_as": None if (shares := self._read_as()) is None else shares.tolist(),
+                "foreign_plans": self._accepted(),
                 "photographs": [self._figures(read) for read in self.read],
             }
         )
+
+    def _accepted(self) -> dict[str, dict[str, Any]]:
+        """Return the number of queries in plans of other buildings, and the share that is accepted, by heading."""
+        return {
+            heading: {"n": len(found), "accepted": float(np.mean(np.array(found) > ACCEPTED))}
+            for heading, found in self.foreign.items()
+            if found
+        }
+
+    def _read_as(self) -> Float[np.ndarray, "c c"] | None:
+        """Return for each annotated class (rows) the shares of azimuths by the class that is read; None without."""
+        counts = np.zeros((len(OPENING_CLASSES), len(OPENING_CLASSES)))
+        for read in self.read:
+            if read.photograph.counts and read.class_scores is not None:
+                classes = read.photograph.classes(len(read.class_scores))
+                np.add.at(counts, (classes, read.class_scores.argmax(axis=1)), 1.0)
+        return counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0) if counts.any() else None
 
     def _figures(self, read: ReadPhotograph) -> dict[str, Any]:
         measures, name = read.measures, read.photograph.name
@@ -144,7 +174,7 @@ class PhotographResults:
         }
 
     def markdown(self) -> str:
-        """Return the figures as two Markdown tables: all photographs together, and each photograph."""
+        """Return the figures as Markdown tables: all photographs together, the classes read, and each photograph."""
         counting = [read.measures for read in self.read if read.photograph.counts]
         azimuths = summarise_azimuths(counting, OPENING_CLASSES)
         within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
@@ -156,17 +186,21 @@ class PhotographResults:
             ("error relative to the predicted scale", _number(azimuths.scale_ratio)),
             ("openings, balanced accuracy", _classes(azimuths.classes)),
         ]
-        for heading, results in self.answers.items():
-            scores = score_galleries(results)
-            rows += [
-                (f"galleries, heading {heading}: located", f"{percent(scores.located)} of {scores.galleries}"),
-                ("… located, heading error above 10°", percent(scores.turned)),
-                ("… right room", percent(scores.right_room)),
-                ("… right room among the first three candidates", percent(scores.among_3)),
-                ("… expected calibration error of confidence", _number(scores.calibration_error)),
-            ]
+        for what, answers in (
+            ("galleries", self.answers),
+            *((f"views of {deg}°", of) for deg, of in self.views.items()),
+        ):
+            for heading, results in answers.items():
+                rows += _gallery_rows(f"{what}, heading {heading}", score_galleries(results))
+        for heading, found in self._accepted().items():
+            name = f"plans of other buildings, heading {heading}: confidence above {ACCEPTED:g}"
+            rows.append((name, f"{percent(found['accepted'])} of {found['n']}"))
         columns = ["photograph", "quality", "median", "90 %", "bias", "by scale", *self.answers]
-        return _table(["figure", "measured"], rows) + "\n" + _table(columns, [self._cells(read) for read in self.read])
+        tables = [_table(["figure", "measured"], rows)]
+        if (shares := self._read_as()) is not None:
+            kinds = [(name, *map(percent, row)) for name, row in zip(OPENING_CLASSES, shares.tolist(), strict=True)]
+            tables.append(_table(["annotated, read as", *OPENING_CLASSES], kinds))
+        return "\n".join([*tables, _table(columns, [self._cells(read) for read in self.read])])
 
     def _cells(self, read: ReadPhotograph) -> list[str]:
         measures, name = read.measures, read.photograph.name
@@ -176,11 +210,19 @@ class PhotographResults:
 
 
 def evaluate_photographs(
-    data: Path, bundle: Path, out: Path, *, galleries: int, workers: int | None, command: str = ""
+    data: Path,
+    bundle: Path,
+    out: Path,
+    *,
+    galleries: int,
+    workers: int | None,
+    views_deg: Sequence[float] = (),
+    command: str = "",
 ) -> PhotographResults:
     """Evaluate a model on annotated photographs and write the results to a folder; existing gallery runs resume.
 
-    `galleries` is the number of galleries of every photograph, for each heading; `workers` is as in `run_evaluation`,
+    `galleries` is the number of galleries of every photograph, for each heading; `views_deg` are fields of view in
+    which eight views of each photograph are localised in its galleries as well; `workers` is as in `run_evaluation`,
     and `command` repeats the evaluation.
 
     Raises:
@@ -196,28 +238,56 @@ def evaluate_photographs(
             "at least one must be 'fair' or 'good'"
         )
     read = read_photographs(Encoders(Bundle.open(bundle), threads=1), dataset.photographs)
-    answers = {}
-    for heading, known in _HEADINGS.items():
+
+    def located(field_deg: float | None, heading: str, known: bool) -> list[GalleryAnswer]:
+        name = heading if field_deg is None else f"view-{field_deg:g}-{heading}"
+        per_camera = 1 if field_deg is None else _VIEWS
         info = RunInfo(
-            label=f"photographs in galleries, heading {heading}",
+            label=f"photographs in galleries, {name}",
             method="lalaloc",
             kind="panorama",
             dataset=dataset.description,
             split="test",
             data=str(data),
+            views=None if field_deg is None else {"field_deg": field_deg, "per_camera": per_camera},
             heading_known=known,
-            limit=len(dataset.keys(galleries)),
+            limit=per_camera * len(dataset.keys(galleries)),
             bundle=str(bundle),
             model=describe_model(bundle),
             command=command,
         )
-        predictions = run_evaluation(RunFolder(out / heading), info, workers=workers)
-        answers[heading] = answers_in_galleries(predictions, dataset.photographs)
-    results = PhotographResults(read=read, answers=answers)
+        predictions = run_evaluation(RunFolder(out / name), info, workers=workers)
+        return answers_in_galleries(predictions, dataset.photographs)
+
+    answers, *views = (
+        {heading: located(field_deg, heading, known) for heading, known in _HEADINGS.items()}
+        for field_deg in (None, *views_deg)
+    )
+    by_field = {f"{field_deg:g}": of for field_deg, of in zip(views_deg, views, strict=True)}
+    opened, counting = Bundle.open(bundle), [photograph for photograph in dataset.photographs if photograph.counts]
+    plans = foreign_plans()
+    foreign = {
+        heading: foreign_confidences(opened, counting, plans, heading_known=known)
+        for heading, known in _HEADINGS.items()
+    }
+    results = PhotographResults(read=read, answers=answers, views=by_field, foreign=foreign)
     figures = {"command": command, "model": describe_model(bundle), **results.figures()}
     atomic_write(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
     draw_photographs(f"{len(read)} photographs, model {bundle}", read, answers).save(out / SHEET_FILE)
     return results
+
+
+def _gallery_rows(what: str, scores: GalleryScores) -> list[tuple[str, str]]:
+    return [
+        (f"{what}: located", f"{percent(scores.located)} of {scores.galleries}"),
+        ("… located, heading error above 10°", percent(scores.turned)),
+        ("… right room", percent(scores.right_room)),
+        (
+            "… right room among the first three, five candidates",
+            f"{percent(scores.among_3)}, {percent(scores.among_5)}",
+        ),
+        ("… expected calibration error of confidence", _number(scores.calibration_error)),
+    ]
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

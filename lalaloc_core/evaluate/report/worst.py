@@ -231,7 +231,7 @@ class _QueryAnalyser:
             query = self._encode(self._encoders, scene, camera)
             floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
             strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
-            weights = self._encoders.manifest.evidence
+            weights = self._encoders.manifest.evidence_for(view=query.is_view)
             fit["true_cost"] = _cost(query, scene, prediction.truth, weights)
             fit["found_cost"] = None if found is None else _cost(query, scene, found, weights)
             fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)

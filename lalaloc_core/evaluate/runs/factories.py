@@ -21,13 +21,15 @@ from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
 from lalaloc_core.learn.data.synthetic.disturbed import DisturbedScenes
+from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.synthetic.mismatched import MismatchedScenes
+from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M
-from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
 from lalaloc_core.nets import load_decoder
 
@@ -44,6 +46,7 @@ class LaLaLocSettings:
         heading_doubt: assumed probability that a known heading is wrong.
         camera_height: whether the camera's height is stated, with `camera_height_std_m`, or unknown.
         camera_height_error_m: error added to the stated height.
+        heading_error_deg: largest error of the known heading of views, which is searched within it.
     """
 
     refine: Refine = "lpo"
@@ -60,6 +63,7 @@ class LaLaLocSettings:
     camera_height: Literal["stated", "unknown"] = "stated"
     camera_height_std_m: float = DEFAULT_STD_M
     camera_height_error_m: float = 0.0
+    heading_error_deg: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +87,11 @@ def build_dataset(info: RunInfo) -> Dataset:
     Raises:
         DatasetError: its folder does not exist or holds no data set.
     """
+    spheres = _spheres(info)
+    return spheres if info.views is None else ViewScenes(spheres, **info.views)
+
+
+def _spheres(info: RunInfo) -> Dataset:
     if info.data is not None:
         return open_dataset(Path(info.data), info.data_format)
     arguments: dict[str, Any] = dict(info.generated or {})
@@ -95,11 +104,14 @@ def build_dataset(info: RunInfo) -> Dataset:
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     homes = GeneratedScenes(**arguments)
-    if generator == "copies":
-        return CopiedScenes(homes)
-    if generator == "disturbed":
-        return DisturbedScenes(homes)
-    return MismatchedScenes(homes) if generator == "mismatched" else homes
+    derived = {
+        "copies": CopiedScenes,
+        "disturbed": DisturbedScenes,
+        "foreign": ForeignScenes,
+        "mismatched": MismatchedScenes,
+        "unopened": UnopenedScenes,
+    }
+    return derived[generator](homes) if generator in derived else homes
 
 
 def build_method(info: RunInfo) -> Method:
@@ -120,7 +132,8 @@ def build_method(info: RunInfo) -> Method:
     if info.method == "icp":
         return Icp()
     bundle = require_bundle(info)
-    encoders = Encoders(bundle, threads=1)
+    photographs = PhotographEncoder(bundle, threads=1)
+    encoders = photographs.networks
     # Tensors of a few poses are too small for several threads.
     torch.set_num_threads(1)
     if info.method == "explicit":
@@ -128,10 +141,10 @@ def build_method(info: RunInfo) -> Method:
     if info.method == "decode":
         return VdrDecode(encoders, load_decoder(bundle))
     assert isinstance(settings, LaLaLocSettings)
-    return _lalaloc(bundle, encoders, settings)
+    return _lalaloc(bundle, photographs, settings)
 
 
-def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> LaLaLoc:
+def _lalaloc(bundle: Bundle, photographs: PhotographEncoder, settings: LaLaLocSettings) -> LaLaLoc:
     refiner = None
     if settings.refine == "lpo":
         refiner = local_refiner(bundle, LpoConfig(method=settings.optimiser))
@@ -154,7 +167,15 @@ def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> L
         error_m=settings.camera_height_error_m,
         std_m=settings.camera_height_std_m,
     )
-    return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config, stated=stated)
+    return LaLaLoc(
+        photographs.networks,
+        refine=settings.refine,
+        refiner=refiner,
+        config=config,
+        stated=stated,
+        photograph_encoder=photographs,
+        heading_error_deg=settings.heading_error_deg,
+    )
 
 
 def _settings(kind: type[_Settings], info: RunInfo) -> _Settings:

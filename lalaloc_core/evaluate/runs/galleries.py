@@ -56,7 +56,7 @@ class GalleryScores:
     Attributes:
         located: share with the right room and position.
         turned: share with the right position and a wrong heading.
-        among_3: share with the right room among the first three candidates.
+        among_3, among_5: share with the right room among the first three, five candidates.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         by_photograph: share of each photograph's galleries in which it is located.
     """
@@ -67,6 +67,7 @@ class GalleryScores:
     turned: float
     right_room: float
     among_3: float
+    among_5: float
     calibration_error: float | None
     by_photograph: Mapping[str, float]
 
@@ -74,7 +75,7 @@ class GalleryScores:
 def answers_in_galleries(
     predictions: Sequence[Prediction], photographs: Sequence[AnnotatedPhotograph]
 ) -> list[GalleryAnswer]:
-    """Return one result for every gallery of every photograph, in order."""
+    """Return one result for every gallery of every photograph, or of each of its views, in order."""
     by_name = {photograph.name: photograph for photograph in photographs}
     errors_m = np.nan_to_num(position_errors_m(predictions), nan=np.inf)
     headings_deg = heading_errors_deg(predictions)
@@ -98,7 +99,7 @@ def answers_in_galleries(
             within_1m=bool(error_m < 1.0),
             confidence=prediction.confidence,
         )
-        slot = key.photograph, key.gallery
+        slot = prediction.camera, key.gallery
         if slot not in best or answer.merit > best[slot].merit:
             best[slot] = answer
     return list(best.values())
@@ -118,12 +119,18 @@ def score_galleries(answers: Sequence[GalleryAnswer]) -> GalleryScores:
         located=float(np.mean([answer.located for answer in answers])),
         turned=float(np.mean([answer.turned for answer in answers])),
         right_room=float(np.mean([answer.right_room for answer in answers])),
-        among_3=float(np.mean([answer.rank is not None and answer.rank <= 3 for answer in answers])),
+        among_3=_among(answers, 3),
+        among_5=_among(answers, 5),
         calibration_error=error,
         by_photograph={
             name: float(np.mean([answer.located for answer in answers if answer.photograph == name])) for name in names
         },
     )
+
+
+def _among(answers: Sequence[GalleryAnswer], count: int) -> float:
+    """Return the share with the right room among so many candidates."""
+    return float(np.mean([answer.rank is not None and answer.rank <= count for answer in answers]))
 
 
 def describe_answers(answers: Sequence[GalleryAnswer], photograph: str) -> str:

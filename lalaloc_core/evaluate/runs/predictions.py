@@ -107,6 +107,7 @@ class RunInfo:
         data: folder of the data set; None for generated homes.
         data_format: one of `DATASET_FORMATS`; None to detect it.
         generated: arguments of the generator if `data` is None.
+        views: arguments of `ViewScenes`, which cuts views of the photographs; None for whole spheres.
         furniture, lighting: appearance of the photographs; None if the data set has no such choice.
         bundle: folder of the model; None for methods without one.
         skipped: skipped scenes and cameras, with reasons.
@@ -121,6 +122,7 @@ class RunInfo:
     data: str | None = None
     data_format: str | None = None
     generated: dict[str, Any] | None = None
+    views: dict[str, Any] | None = None
     furniture: str | None = None
     lighting: str | None = None
     heading_known: bool = True

@@ -1,7 +1,7 @@
-"""Scores of predictions: the paper's metrics (section 5), each with a 95 % bootstrap interval.
+"""Scores of predictions: the paper's metrics (section 5), each with a 95 % interval.
 
 A query without an answer is a miss in every share and has an infinite error in every median. The bootstrap resamples
-scenes, not queries, because queries of one scene are correlated.
+scenes, not queries, because queries of one scene are correlated. Intervals of shares are at least as wide as Wilson's.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import copy
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import binomtest
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
@@ -29,11 +30,13 @@ from lalaloc_core.files import atomic_write
 _RESAMPLES = 1000
 _COVERAGE = 0.95
 RELIABILITY_BINS = 10
+# Fewer queries say too little for an interval to be printed.
+MIN_QUERIES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Value and its 95 % bootstrap interval; infinite if half of the queries have no answer."""
+    """Value and its 95 % interval; infinite if half of the queries have no answer."""
 
     value: float
     low: float
@@ -49,6 +52,7 @@ class StageScores:
     within_5cm: Estimate
     within_10cm: Estimate
     within_1m: Estimate
+    within_1m_30deg: Estimate
     correct_room: Estimate
     median_heading_error_deg: Estimate
     heading_within_2deg: Estimate
@@ -209,11 +213,17 @@ class _Bootstrap:
         part._weights = weights[weights.any(axis=1)]
         return part
 
-    def mean(self, values: Float[np.ndarray, "n"] | Bool[np.ndarray, "n"]) -> Estimate:
-        """Return the mean, such as a share."""
+    def share(self, holds: Bool[np.ndarray, "n"]) -> Estimate:
+        """Return the share of queries for which something holds.
+
+        Its interval covers those of the bootstrap and of Wilson (Probable Inference, 1927): resampling two hits never
+        gives a miss, and Wilson's interval takes queries of one scene for independent.
+        """
         total = self._weights.sum(axis=1)
-        resampled = (self._weights @ values.astype(float))[total > 0.0] / total[total > 0.0]
-        return self._estimate(float(values.mean()), resampled)
+        resampled = (self._weights @ holds.astype(float))[total > 0.0] / total[total > 0.0]
+        found = self._estimate(float(holds.mean()), resampled)
+        wilson = binomtest(int(holds.sum()), len(holds)).proportion_ci(_COVERAGE, method="wilson")
+        return replace(found, low=min(found.low, float(wilson.low)), high=max(found.high, float(wilson.high)))
 
     def median(self, values: Float[np.ndarray, "n"]) -> Estimate:
         """Return the median; values can be infinite."""
@@ -240,13 +250,14 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
     rooms = [pose is not None and pose.room_index == truth.room_index for pose, truth in pairs]
     return StageScores(
         median_cm=_centimetres(bootstrap.median(error)),
-        within_1cm=bootstrap.mean(error < 0.01),
-        within_5cm=bootstrap.mean(error < 0.05),
-        within_10cm=bootstrap.mean(error < 0.10),
-        within_1m=bootstrap.mean(error < 1.0),
-        correct_room=bootstrap.mean(np.array(rooms)),
+        within_1cm=bootstrap.share(error < 0.01),
+        within_5cm=bootstrap.share(error < 0.05),
+        within_10cm=bootstrap.share(error < 0.10),
+        within_1m=bootstrap.share(error < 1.0),
+        within_1m_30deg=bootstrap.share((error < 1.0) & (heading < 30.0)),
+        correct_room=bootstrap.share(np.array(rooms)),
         median_heading_error_deg=bootstrap.median(heading),
-        heading_within_2deg=bootstrap.mean(heading < 2.0),
+        heading_within_2deg=bootstrap.share(heading < 2.0),
     )
 
 
@@ -258,8 +269,8 @@ def _slices(bootstrap: _Bootstrap, predictions: Sequence[Prediction]) -> dict[st
         part, error_m = bootstrap.among(holds), error[holds]
         slices[fact] = SliceScores(
             n=len(error_m),
-            within_1m=part.mean(error_m < 1.0),
-            within_10cm=part.mean(error_m < 0.10),
+            within_1m=part.share(error_m < 1.0),
+            within_10cm=part.share(error_m < 0.10),
             median_cm=_centimetres(part.median(error_m)),
         )
     return dict(sorted(slices.items(), key=lambda item: item[1].within_1m.value))
@@ -277,7 +288,7 @@ def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
     """Return the recall; a query without retrieval is a miss. None if no query passed retrieval."""
     if all(hit is None for hit in hits):
         return None
-    return bootstrap.mean(np.array([bool(hit) for hit in hits]))
+    return bootstrap.share(np.array([bool(hit) for hit in hits]))
 
 
 def _timings(predictions: Sequence[Prediction], summary: Callable[[list[float]], Any]) -> dict[str, float]:

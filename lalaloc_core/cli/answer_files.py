@@ -1,0 +1,137 @@
+"""Files with the answers for many photographs: CSV, GeoJSON and a map."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lalaloc_core.cli.plan_files import check_picture_name, write_picture
+from lalaloc_core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from lalaloc_core.draw.plan import Marker
+    from lalaloc_core.floorplan import FloorPlan
+
+_COLUMNS = ("photograph", "room", "x_m", "y_m", "heading_deg", "within_95_m", "confidence", "error")
+# A spreadsheet takes a text that begins with one of these for a formula.
+_FORMULA = tuple("=+@\t\r")
+
+
+def add_file_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the files."""
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a table with a row per photograph")
+    parser.add_argument(
+        "--geojson", type=Path, metavar="FILE", help="write the places on Earth, for a plan with an anchor"
+    )
+    parser.add_argument("--map", type=Path, metavar="FILE", help="draw all places on the plan, .png or .svg")
+
+
+def check_file_options(arguments: argparse.Namespace, plan: FloorPlan) -> None:
+    """Refuse files that could not be written, before the work begins.
+
+    Raises:
+        InvalidInputError: the map is neither PNG nor SVG, or the plan has no place on Earth.
+    """
+    if arguments.map is not None:
+        check_picture_name(arguments.map, "--map")
+    if arguments.geojson is not None and plan.anchor is None:
+        raise InvalidInputError(
+            "--geojson needs places on Earth, which this plan has not: give it an anchor "
+            "(docs/reference/plan-format.md), or use --csv"
+        )
+
+
+def write_files(
+    arguments: argparse.Namespace,
+    plan: FloorPlan,
+    answers: Sequence[dict[str, Any]],
+    places: Sequence[tuple[str, Marker]],
+) -> None:
+    """Write the files that the arguments name.
+
+    Args:
+        arguments: those of `add_file_options`.
+        plan: the plan.
+        answers: documents of the answers; one that failed has `photograph` and `error` alone.
+        places: name and camera of the photographs that were found, for the map.
+
+    Raises:
+        InvalidInputError: a file cannot be written.
+    """
+    from lalaloc_core.draw.places import draw_places
+
+    if arguments.csv is not None:
+        _write(arguments.csv, _csv(answers))
+    if arguments.geojson is not None:
+        _write(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
+    if arguments.map is not None:
+        write_picture(draw_places(plan, places), arguments.map, "--map")
+
+
+def _csv(answers: Sequence[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(_COLUMNS)
+    for answer in answers:
+        writer.writerow([_unread(answer["photograph"]), *_cells(answer), _unread(answer.get("error", ""))])
+    return text.getvalue()
+
+
+def _cells(answer: dict[str, Any]) -> list[str]:
+    from lalaloc_core.draw.answer import ellipse_m
+
+    if "error" in answer:
+        return [""] * (len(_COLUMNS) - 2)
+    covariance, confidence = answer["covariance_m2"], answer["confidence"]
+    within = ""
+    if covariance is not None:
+        (xx, xy), (_, yy) = covariance
+        within = f"{ellipse_m((xx, xy, yy))[0]:.3f}"
+    return [
+        _unread(answer["room"]),
+        f"{answer['position']['x_m']:.3f}",
+        f"{answer['position']['y_m']:.3f}",
+        f"{answer['heading_deg']:.1f}",
+        within,
+        "" if confidence is None else f"{confidence:.4f}",
+    ]
+
+
+def _unread(text: str) -> str:
+    """Return text that a spreadsheet does not read as a formula."""
+    return f"'{text}" if text.startswith(_FORMULA) else text
+
+
+def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the places as a GeoJSON FeatureCollection (RFC 7946)."""
+    assert plan.anchor is not None
+    features = []
+    for answer in answers:
+        if "error" in answer:
+            continue
+        place = answer["position"]["x_m"], answer["position"]["y_m"]
+        ((longitude, latitude),) = plan.anchor.to_earth(np.array([place])).tolist()
+        properties = {name: answer[name] for name in ("photograph", "room", "confidence")}
+        azimuth_deg = plan.anchor.true_azimuth_deg(place, answer["heading_deg"])
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": [round(longitude, 8), round(latitude, 8)]},
+                "properties": properties | {"azimuth_deg": round(azimuth_deg, 2)},
+            }
+        )
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8", newline="")
+    except OSError as error:
+        raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error

@@ -1,0 +1,228 @@
+"""`lalaloc track`: follow a camera through a folder of photographs, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lalaloc_core.cli.arguments import heading, positive
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
+from lalaloc_core.cli.printing import print_json, print_table
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.bundle import Bundle, default_bundle
+
+if TYPE_CHECKING:
+    from lalaloc_core.floorplan import FloorPlan
+    from lalaloc_core.localise.tracking.filter import Tracked
+    from lalaloc_core.localise.tracking.trajectories import Trajectory
+    from lalaloc_core.photograph import StatedView
+
+_GRID_STEP_M = 0.5
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})
+_HEAD = ("photograph", "mode", "room", "x m", "y m", "heading °", "probability")
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The answer for one photograph, and what was assumed about it."""
+
+    path: Path
+    time_s: float
+    view: dict[str, Any]
+    tracked: Tracked
+
+
+def add_commands(commands: Any) -> None:
+    """Add this command to the parser."""
+    track = commands.add_parser("track", help="follow a camera through a folder of photographs, without a service")
+    track.add_argument("plan", type=Path, metavar="PLAN", help="a floor plan, as for `lalaloc localise`")
+    track.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="photographs named by their time in seconds, such as 12.50.jpg"
+    )
+    track.add_argument(
+        "--odometry",
+        type=Path,
+        metavar="FILE",
+        help="poses of the robot: TUM lines, or CSV with time_s, x_m, y_m and yaw_deg, counter-clockwise from +x",
+    )
+    track.add_argument(
+        "--mount",
+        type=heading,
+        default=0.0,
+        metavar="DEG",
+        help="azimuth of the photographs' centre relative to the odometry's x, clockwise (default: 0)",
+    )
+    track.add_argument("--camera-height", type=positive, metavar="M", help="metres above the floor")
+    add_camera_options(track)
+    track.add_argument("--trajectory", type=Path, metavar="FILE", help="TUM file of the poses in the plan to write")
+    track.add_argument("--out", type=Path, metavar="FILE", help="picture of the path to write, .png or .svg")
+    track.add_argument("--json", action="store_true", help="print JSON: a list with one pose per photograph")
+    track.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)")
+    add_plan_options(track)
+    track.set_defaults(run=_track)
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.localise.tracking.trajectories import read_trajectory, tum_line
+
+    if arguments.out is not None:
+        check_picture_name(arguments.out)
+    plan = read_plan(arguments.plan, arguments).plan()
+    stated = stated_view(arguments)
+    photographs = _photographs(arguments.folder)
+    trajectory = None if arguments.odometry is None else read_trajectory(_text(arguments.odometry))
+    found = _followed(arguments, plan, photographs, trajectory, stated)
+    if arguments.trajectory is not None:
+        poses = [(answer, answer.tracked.pose) for answer in found]
+        lines = [
+            tum_line(answer.time_s, pose.position_m, _height_m(answer.tracked), pose.heading) for answer, pose in poses
+        ]
+        _write(arguments.trajectory, "\n".join(lines) + "\n")
+    if arguments.out is not None:
+        write_picture(_picture(plan, [answer.tracked for answer in found]), arguments.out)
+    if arguments.json:
+        print_json([_document(answer, plan) for answer in found])
+    else:
+        print_table(_HEAD, [_row(answer, plan) for answer in found])
+
+
+def _photographs(folder: Path) -> list[tuple[float, Path]]:
+    """Return times (s) and files of photographs, by rising time.
+
+    Raises:
+        InvalidInputError: there are none, or a name is no time.
+    """
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+    except OSError as error:
+        raise InvalidInputError(f"'{folder}' cannot be read: {error.strerror}") from error
+    if not files:
+        raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(_SUFFIXES))})")
+    found = []
+    for path in files:
+        try:
+            found.append((float(path.stem), path))
+        except ValueError as error:
+            raise InvalidInputError(f"'{path.name}' is not named by a time in seconds, such as 12.50.jpg") from error
+    if not all(math.isfinite(time_s) for time_s, _ in found):
+        raise InvalidInputError(f"a photograph of '{folder}' is named by a time that is not finite")
+    return sorted(found)
+
+
+def _followed(
+    arguments: argparse.Namespace,
+    plan: FloorPlan,
+    photographs: list[tuple[float, Path]],
+    trajectory: Trajectory | None,
+    stated: StatedView,
+) -> list[_Found]:
+    """Return the answer of each photograph, with a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+    from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+    from lalaloc_core.localise.pipeline import run_steps
+    from lalaloc_core.localise.retrieval import build_grid
+    from lalaloc_core.localise.stated_camera import known_heading, stated_height
+    from lalaloc_core.localise.tracking import TrackState
+    from lalaloc_core.localise.tracking.filter import track_steps
+    from lalaloc_core.localise.tracking.motion import WalkGraph
+    from lalaloc_core.localise.tracking.trajectories import OdometryErrors
+    from lalaloc_core.photograph import open_view
+
+    bundle = Bundle.open(arguments.bundle)
+    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
+    encoders, manifest = encoder.networks, bundle.manifest
+    sphere, patch = sphere_size(manifest), patch_size(manifest)
+    height = stated_height(plan, arguments.camera_height)
+    grid = build_grid(
+        plan,
+        encoders,
+        step_m=_GRID_STEP_M,
+        camera_height_m=height.height_m,
+        latents=not encoders.predicts_profile,
+    )
+    graph, errors, mount = WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m), OdometryErrors(), arguments.mount
+    state, before_s = None, None
+    found: list[_Found] = []
+    for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
+        content = content_of(path)
+        with named(path):
+            view = open_view(content, sphere_size=sphere, stated=stated, patch_size=patch)
+            query = encoder.query(view, None, height)
+        state = state or TrackState.first(len(grid.poses), len(query.roll))
+        motion = None
+        if trajectory is not None and before_s is not None:
+            motion = trajectory.motion(before_s, time_s, errors, math.radians(mount))
+        known = known_heading(plan.north, None, 0.0, view.compass_heading)
+        steps = track_steps(plan, grid, graph, encoders, state, query, motion, known_heading=known)
+        answer = run_steps(steps, refiner)
+        contradictions = [f"the photographs contradict {name} of the odometry" for name in answer.contradicted]
+        for warning in (*view.warnings, *contradictions):
+            print(f"warning: {path}: {warning}", file=sys.stderr)
+        found.append(_Found(path, time_s, view_document(view), answer))
+        state, before_s = answer.state, time_s
+    return found
+
+
+def _height_m(answer: Tracked) -> float:
+    return answer.query.camera_height.height_m * math.exp(answer.candidates[0].height_offset)
+
+
+def _picture(plan: FloorPlan, found: list[Tracked]) -> str:
+    import numpy as np
+
+    from lalaloc_core.draw.path import DrawnPath, draw_path
+
+    position_m = np.stack([answer.pose.position_m for answer in found])
+    is_sure = [answer.pose.mode == "tracking" for answer in found]
+    return draw_path(plan, DrawnPath(position_m, is_sure, math.degrees(found[-1].pose.heading)))
+
+
+def _document(answer: _Found, plan: FloorPlan) -> dict[str, Any]:
+    """Return an answer as JSON, with the field names of the API."""
+    pose = answer.tracked.pose
+    return {
+        "photograph": str(answer.path),
+        "number": pose.number,
+        "mode": pose.mode,
+        "position": {"x_m": pose.x_m, "y_m": pose.y_m},
+        "heading_deg": math.degrees(pose.heading) % 360.0,
+        "room": plan.rooms[pose.room_index].name,
+        "room_id": plan.rooms[pose.room_index].id,
+        "probability": pose.probability,
+        "motion_contradicted": list(answer.tracked.contradicted),
+        "view": answer.view,
+    }
+
+
+def _row(answer: _Found, plan: FloorPlan) -> tuple[str, ...]:
+    pose = answer.tracked.pose
+    return (
+        answer.path.name,
+        pose.mode,
+        plan.rooms[pose.room_index].name,
+        f"{pose.x_m:.2f}",
+        f"{pose.y_m:.2f}",
+        f"{math.degrees(pose.heading) % 360.0:.1f}",
+        f"{100.0 * pose.probability:.1f} %",
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"'{path}' cannot be read as text: {error}") from error
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
