@@ -22,3 +22,9 @@ Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, 
 `cores.py` (division of the cores), `threads.py`, `bounded_cache.py`, `stored_plan.py`, `uploaded_file.py`, and the
 command lines `cli.py`, `openapi.py`, `__main__.py`.
 """
+
+import os
+
+# Queries are computed side by side, and the threads of a matrix product spin after it, which took 0.7 of a core from
+# other queries. OpenBLAS reads this when numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

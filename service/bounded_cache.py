@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cachetools import Cache, LRUCache
 
+from service.single_flight import SingleFlight
+
 K = TypeVar("K")
 V = TypeVar("V")
+M = TypeVar("M")
 
 
 class _CountingLruCache(LRUCache[K, V]):
@@ -33,6 +36,7 @@ class BoundedCache(Generic[K, V]):
     def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:
         self._values: _CountingLruCache[K, V] = _CountingLruCache(limit_bytes, size)
         self._lock = threading.Lock()
+        self._making = SingleFlight[K, Any]()
 
     @property
     def bytes(self) -> int:
@@ -52,6 +56,22 @@ class BoundedCache(Generic[K, V]):
             if self._values.getsizeof(value) <= self._values.maxsize:
                 self._values[key] = value
             return self._values.evictions - before
+
+    def get_or_make(self, key: K, make: Callable[[], M]) -> V | M:
+        """Return a value; if it is missing, make and store it, once for all threads that ask meanwhile.
+
+        `make` may return None, which is not stored.
+        """
+
+        def made() -> Any:
+            # Another thread may have made it since.
+            value: Any = self.get(key)
+            if value is None and (value := make()) is not None:
+                self.put(key, value)
+            return value
+
+        value = self.get(key)
+        return self._making.run(key, made) if value is None else value
 
     def drop(self, unwanted: Callable[[K, V], bool]) -> None:
         """Remove the values that `unwanted` selects."""

@@ -8,6 +8,11 @@ LaLaLocError
     ├── UnknownVenueError           no venue with this id
     ├── UnknownRevisionError        no such revision of the floor plan
     ├── UnknownAnswerError          no kept answer with this id
+    ├── UnknownSessionError         no session with this id, or an expired one
+    ├── SessionBusyError            a photograph of the session is in progress
+    ├── SessionOutdatedError        the plan or the model of the session has changed
+    ├── PhotographOutOfOrderError   the photograph is not the next one of the session
+    ├── TooManySessionsError        the tenant's quota of sessions is used up
     ├── UnanchoredPlanError         the floor plan has no anchor
     ├── NoPlanNearbyError           no anchored floor plan near the given place
     ├── UploadTooLargeError         the body exceeds its size limit
@@ -109,6 +114,48 @@ class UnknownAnswerError(ServiceError):
         )
 
 
+class UnknownSessionError(ServiceError):
+    """No session has this id."""
+
+    def __init__(self, session_id: str) -> None:
+        super().__init__(
+            f"session '{session_id[:64]}' does not exist; sessions expire (session_ttl_s) and are deleted with their "
+            "floor plan"
+        )
+
+
+class SessionBusyError(ServiceError):
+    """Another photograph of the session is in progress."""
+
+    retry_after_s = 1
+
+    def __init__(self, session_id: str) -> None:
+        super().__init__(
+            f"session '{session_id}' has a photograph in progress; send the next one after the answer to it"
+        )
+
+
+class SessionOutdatedError(ServiceError):
+    """The plan or the model has changed since the session began."""
+
+    def __init__(self, session_id: str, reason: str) -> None:
+        super().__init__(f"session '{session_id}' cannot go on: {reason}; begin a new session")
+
+
+class PhotographOutOfOrderError(ServiceError):
+    """The photograph is not the next one of its session."""
+
+    def __init__(self, session_id: str, number: int, expected: int) -> None:
+        super().__init__(f"number is {number}; the next photograph of session '{session_id}' is number {expected}")
+
+
+class TooManySessionsError(ServiceError):
+    """The tenant's quota of sessions is used up."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} sessions are open; the limit is {limit} (LALALOC_MAX_SESSIONS): delete some")
+
+
 class UnanchoredPlanError(ServiceError):
     """The floor plan has no anchor, and the requested answer needs latitude and longitude."""
 
@@ -170,9 +217,10 @@ class UnsupportedEncodingError(UnsupportedMediaError):
 class PlanTooLargeError(ServiceError):
     """The plan's pose grid would exceed the limit of poses."""
 
-    def __init__(self, estimate: int, limit: int, step_m: float) -> None:
+    def __init__(self, estimate: int, limit: int, step_m: float, level: str | None = None) -> None:
+        of_level = "" if level is None else f" of level '{level}'"
         super().__init__(
-            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m; the limit is {limit} "
+            f"the plan{of_level} needs about {estimate} grid poses at a step of {step_m:g} m; the limit is {limit} "
             "(max_grid_poses); check that the coordinates are in metres"
         )
 

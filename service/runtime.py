@@ -8,14 +8,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-import numpy as np
 from fastapi import Request
 from sqlalchemy.engine import make_url
 
 from lalaloc_core import __version__
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from service.conversion import Converter, RenditionCache
 from service.cores import usable_cores
 from service.grids import GridProvider, Sweeper
@@ -27,6 +25,8 @@ from service.query import (
     LocaliserBackend,
     LpoPool,
     OptimiserBackend,
+    SessionTracker,
+    TrackerBackend,
     VenueLocaliser,
     VenueLocaliserBackend,
     VenuePlans,
@@ -38,6 +38,7 @@ from service.storage import PlanLookup, Store, open_store
 from service.storage.records import DEFAULT_TENANT
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
+from service.tenancy.cpu_accounts import PROBES
 from service.tenancy.fair_share import FairSemaphore, with_headroom
 from service.threads import BoundedReads, Threads
 
@@ -88,6 +89,7 @@ class Runtime:
     converter: Converter
     localiser: LocaliserBackend
     venue_localiser: VenueLocaliserBackend
+    tracker: TrackerBackend
     admission: Admission
     access_control: AccessControl
     events: PlanEvents
@@ -103,35 +105,34 @@ class Runtime:
         return not self.admission.draining and self.optimiser.state.warmed_up and self.decoder.state.warmed_up
 
 
+# Localisers of plans and of venues, and the tracker.
+Localisers = tuple[LocaliserBackend, VenueLocaliserBackend, TrackerBackend]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Backends:
     """Builders of the components that can run in other processes.
 
     Attributes:
         optimiser: builds the pool of LPO workers.
-        encoders: loads the networks and warms them up.
+        encoder: loads the networks and warms them up.
         localisers: builds the localisers; None: this process computes answers.
     """
 
     optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore], OptimiserBackend]
-    encoders: Callable[[Bundle, Settings], Encoders]
-    localisers: Callable[[ModelAnswer, Settings, Telemetry], tuple[LocaliserBackend, VenueLocaliserBackend]] | None = (
-        None
-    )
+    encoder: Callable[[Bundle, Settings], PhotographEncoder]
+    localisers: Callable[[ModelAnswer, Settings, Telemetry], Localisers] | None = None
 
 
-def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
+def warm_encoder(bundle: Bundle, settings: Settings) -> PhotographEncoder:
     """Load the networks and run each once, because the first run allocates memory."""
-    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
-    manifest = encoders.manifest
-    image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
-    encoders.query(image, None, CameraHeight(1.5))
-    encoders.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
-    return encoders
+    encoder = PhotographEncoder(bundle, threads=settings.cores.onnx_threads)
+    encoder.warm_up()
+    return encoder
 
 
 # All components in this process.
-LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoders=warm_encoders)
+LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoder=warm_encoder)
 
 
 def start_runtime(
@@ -157,9 +158,11 @@ def start_runtime(
     store = _closing(cleanup, open_store(settings))
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
     components = _QueryComponents.start(settings, telemetry, cleanup, backends, bundle, store)
-    uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts))
+    # One thread per client beside other clients, because small uploads share the interpreter with queries.
+    uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts, cores=1, rests=True)
+    _closing(cleanup, uploads)
     # As many threads as converter processes. Closed after the converter, because its waiting jobs must end first.
-    file_threads = Threads("lalaloc-files", with_headroom(settings.imports.workers), telemetry.cpu_accounts)
+    file_threads = Threads("lalaloc-files", with_headroom(settings.imports.workers), telemetry.cpu_accounts, rests=True)
     file_uploads = _closing(cleanup, file_threads)
     converter = _closing(cleanup, Converter(settings, telemetry))
     # A file can take its worker longer than the service may take to stop.
@@ -173,7 +176,7 @@ def start_runtime(
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
     venue_localiser = components.venue_localiser(localiser, _closing(cleanup, components.venue_plans()))
     if backends.localisers is None:
-        localisers = localiser, venue_localiser
+        localisers: Localisers = localiser, venue_localiser, components.tracker(localiser)
     else:
         localisers = backends.localisers(localiser.model, settings, telemetry)
     renditions = RenditionCache(
@@ -198,6 +201,7 @@ def start_runtime(
         converter=converter,
         localiser=localisers[0],
         venue_localiser=localisers[1],
+        tracker=localisers[2],
         admission=components.admission,
         access_control=access_control,
         events=_plan_events(store, grids, components.admission, event_reads, settings),
@@ -217,7 +221,7 @@ class _QueryComponents:
     telemetry: Telemetry
     bundle: Bundle
     store: Store
-    encoders: Encoders
+    encoder: PhotographEncoder
     grids: GridProvider
     optimiser: OptimiserBackend
     decoder: Decoder
@@ -244,14 +248,14 @@ class _QueryComponents:
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry, permits))
         decoder.start()
-        encoders = backends.encoders(bundle, settings)
+        encoder = backends.encoder(bundle, settings)
         return cls(
             settings=settings,
             telemetry=telemetry,
             bundle=bundle,
             store=store,
-            encoders=encoders,
-            grids=_closing(cleanup, GridProvider(store, encoders, bundle.sha256, settings, telemetry, permits)),
+            encoder=encoder,
+            grids=_closing(cleanup, GridProvider(store, encoder.networks, bundle.sha256, settings, telemetry, permits)),
             optimiser=optimiser,
             decoder=decoder,
             admission=_admission(settings, telemetry, store),
@@ -264,7 +268,7 @@ class _QueryComponents:
         return Localiser(
             settings=self.settings,
             bundle=self.bundle,
-            encoders=self.encoders,
+            encoder=self.encoder,
             grids=self.grids,
             optimiser=self.optimiser,
             decoder=self.decoder,
@@ -272,6 +276,17 @@ class _QueryComponents:
             reads=self.reads,
             telemetry=self.telemetry,
             permits=self.permits,
+        )
+
+    def tracker(self, localiser: Localiser) -> SessionTracker:
+        """Build the tracker of sessions."""
+        return SessionTracker(
+            settings=self.settings,
+            bundle=self.bundle,
+            encoder=self.encoder,
+            localiser=localiser,
+            decoder=self.decoder,
+            queries=self.admission.queries,
         )
 
     def venue_plans(self) -> VenuePlans:
@@ -291,7 +306,7 @@ class _QueryComponents:
         return VenueLocaliser(
             settings=self.settings,
             bundle=self.bundle,
-            encoders=self.encoders,
+            encoder=self.encoder,
             plans=plans,
             localiser=localiser,
             decoder=self.decoder,
@@ -308,7 +323,8 @@ def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
 def _admission(settings: Settings, telemetry: Telemetry, store: Store) -> Admission:
     def by_tenant(values: Mapping[str, float]) -> Mapping[str, float]:
         # Without keys clients are addresses, and all of them are one tenant.
-        return values if settings.access.api_keys else {DEFAULT_TENANT: sum(values.values())}
+        tenants = {client: value for client, value in values.items() if client != PROBES}
+        return tenants if settings.access.api_keys else {DEFAULT_TENANT: sum(tenants.values())}
 
     limits = store.tenant_limits
     telemetry.cpu_accounts.share = lambda client: limits.of(client).cpu_share or 1.0

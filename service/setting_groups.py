@@ -9,7 +9,9 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lalaloc_core.floorplan import DEFAULT_LIMITS as _PLAN
 from lalaloc_core.floorplan import PlanLimits
+from lalaloc_core.importers import DEFAULT_IMPORT_LIMITS as _IMPORT
 from lalaloc_core.importers import ImportLimits
 from lalaloc_core.panorama.images import PanoramaLimits
 from service.setting_types import Area, Count, HostNames, Metres, Origins, PortMapping, Seconds
@@ -235,7 +237,9 @@ class RequestSettings(SettingGroup):
         default=16, ge=0, description="Queries that wait for a slot; further ones get 503 before their upload is read."
     )
     max_reads: Count = Field(default=64, description="Read-only requests in progress; further ones get 503.")
-    max_streams: Count = Field(default=64, description="Open event streams; further ones get 503.")
+    max_streams: Count = Field(
+        default=64, description="Open event streams and WebSockets of sessions; further ones get 503."
+    )
     max_connections: Count = Field(
         default=1024, description="Open connections, including idle ones; further ones get 503."
     )
@@ -286,8 +290,8 @@ class StorageSettings(SettingGroup):
     max_stored_bytes: Count | None = Field(
         default=None,
         description="Stored bytes per tenant: floor plans with their revisions and files, pose grids, venues, kept "
-        "answers, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. Default: 10 GiB, "
-        "with SQLite at most half of its volume.",
+        "answers, sessions, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. "
+        "Default: 10 GiB, with SQLite at most half of its volume.",
     )
     max_idempotency_bytes: int = Field(
         default=64 * 2**20,
@@ -320,6 +324,15 @@ class StorageSettings(SettingGroup):
         description="Lifetime of kept answers, which a link reopens; panoramas are never kept. 0: no answers are kept.",
     )
     max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is deleted first.")
+    session_ttl_s: float = Field(
+        default=3600.0,
+        ge=1.0,
+        le=366 * 86400.0,
+        description="Lifetime of a session of a tracked camera after its last photograph.",
+    )
+    max_sessions: Count = Field(
+        default=1000, description="Sessions of tracked cameras per tenant; further ones get 507."
+    )
 
 
 class PlanSettings(SettingGroup):
@@ -329,29 +342,35 @@ class PlanSettings(SettingGroup):
     max_revisions: int = Field(
         default=10, ge=2, description="Revisions kept per floor plan; the oldest is deleted first."
     )
-    max_plan_bytes: Count = Field(default=40 * 2**20, description="Size of a plan file, in any format.")
+    max_plan_bytes: Count = Field(default=_IMPORT.max_plan_bytes, description="Size of a plan file, in any format.")
     max_unpacked_bytes: Count = Field(
-        default=200_000_000, description="Unpacked size of an archive, or of a compressed part of a plan file."
+        default=_IMPORT.max_unpacked_bytes,
+        description="Unpacked size of an archive, or of a compressed part of a plan file.",
     )
     max_entities: Count = Field(
-        default=300_000, description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
+        default=_IMPORT.max_entities,
+        description="Drawing entities (lines, polygons, texts) of a plan file, vertices included.",
     )
-    max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a floor plan picture.")
+    max_plan_pixels: Count = Field(default=_IMPORT.max_plan_pixels, description="Pixels of a floor plan picture.")
     max_import_s: Seconds = Field(
-        default=30.0,
+        default=_IMPORT.max_import_s,
         description="Timeout for reading a plan file. The process is replaced 10 s later. Including the wait for a "
         "process, an upload can take twice this time.",
     )
-    max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
-    max_vertices: int = Field(default=200, ge=3, description="Vertices per room.")
-    max_plan_vertices: int = Field(default=100_000, ge=3, description="Vertices of all rooms of a floor plan.")
-    max_extent_m: Metres = Field(default=1000.0, description="Width or height of a floor plan.")
-    max_area_m2: Area = Field(default=200_000.0, description="Floor area of all rooms of a floor plan.")
+    max_rooms: Count = Field(default=_PLAN.max_rooms, description="Rooms per floor plan.")
+    max_vertices: int = Field(default=_PLAN.max_vertices_per_room, ge=3, description="Vertices per room.")
+    max_plan_vertices: int = Field(
+        default=_PLAN.max_plan_vertices, ge=3, description="Vertices of all rooms of a floor plan."
+    )
+    max_extent_m: Metres = Field(default=_PLAN.max_extent_m, description="Width or height of a floor plan.")
+    max_area_m2: Area = Field(default=_PLAN.max_area_m2, description="Floor area of all rooms of a floor plan.")
     max_bounds_area_m2: Area = Field(
-        default=500_000.0,
+        default=_PLAN.max_bounds_area_m2,
         description="Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.",
     )
-    max_openings: int = Field(default=20_000, ge=0, description="Doors, windows and passages of a floor plan.")
+    max_openings: int = Field(
+        default=_PLAN.max_openings, ge=0, description="Doors, windows and passages of a floor plan."
+    )
     max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
     max_venue_bytes: Count = Field(default=4 * 2**20, description="Size of a venue document.")

@@ -14,8 +14,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ExportFormat
 
-# Files made from a plan: its description (a part of the answer to GET), its walls, its rooms as SVG, its mesh, exports.
-RenditionKind = Literal["description", "layout", "drawing", "mesh"] | ExportFormat
+# Files made from a plan: description (a part of the answer to GET), walls, rooms as SVG without and with the areas that
+# became no room, mesh, exports.
+RenditionKind = Literal["description", "layout", "drawing", "preview", "mesh"] | ExportFormat
 # Characters or bytes of a document beyond which worker processes parse it.
 LARGE = 256 * 1024
 # Rooms, openings or faces per piece of a packed plan: less than a millisecond of the interpreter.

@@ -24,14 +24,24 @@ class Threads:
         count: number of threads.
         accounts: CPU time of the clients; calls are charged to theirs.
         permits: permits to compute, of which each call holds one; None: calls need none.
+        cores: limits the threads of a client beside other clients, see `FairSemaphore`.
+        rests: the calls count for `CpuAccounts.rest_s`.
     """
 
     def __init__(
-        self, name: str, count: int, accounts: CpuAccounts | None = None, permits: FairSemaphore | None = None
+        self,
+        name: str,
+        count: int,
+        accounts: CpuAccounts | None = None,
+        permits: FairSemaphore | None = None,
+        cores: int | None = None,
+        *,
+        rests: bool = False,
     ) -> None:
+        self._rests = rests
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
         self._accounts = accounts or CpuAccounts()
-        self._semaphore = FairSemaphore(count, self._accounts)
+        self._semaphore = FairSemaphore(count, self._accounts, cores=cores)
         self._permits = permits
 
     async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -53,7 +63,7 @@ class Threads:
         return await asyncio.wrap_future(future)
 
     def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        with self._accounts.charged(client):
+        with self._accounts.charged(client, rests=self._rests):
             return work(*args, **kwargs)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
@@ -66,7 +76,7 @@ class Threads:
 
 
 class BoundedReads:
-    """Reads of the store with a timeout, which also applies while the store hangs.
+    """Reads of the store with a timeout, which also applies while the store hangs; shared fairly between tenants.
 
     Args:
         threads: number of threads.
@@ -78,31 +88,34 @@ class BoundedReads:
         self._threads = Threads("lalaloc-reads", threads)
         self._max_pending = max_pending
         self._wait_s = wait_s
-        self._begun: set[Future[Any]] = set()
+        self._begun: set[asyncio.Future[Any]] = set()
 
-    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a read and return its result.
+    async def run(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run a read for a tenant and return its result; one that has begun is never cancelled.
 
         Raises:
             StoreUnavailableError: timeout, or too many reads are pending.
         """
         if len(self._begun) >= self._max_pending:
             raise StoreUnavailableError()
-        future = self._threads.submit(work, *args, **kwargs)
-        self._begun.add(future)
+        begun = asyncio.ensure_future(self._threads.run(tenant, work, *args, **kwargs))
+        self._begun.add(begun)
         # The callback also retrieves errors after the timeout.
-        loop_future = asyncio.wrap_future(future)
-        loop_future.add_done_callback(lambda done: self._end(future, done))
-        done, _ = await asyncio.wait({loop_future}, timeout=self._wait_s)
+        begun.add_done_callback(self._end)
+        done, _ = await asyncio.wait({begun}, timeout=self._wait_s)
         if not done:
             raise StoreUnavailableError()
-        return loop_future.result()
+        return begun.result()
+
+    async def process(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run work on what was read, which does not touch the store and has no timeout."""
+        return await self._threads.run(tenant, work, *args, **kwargs)
 
     def close(self) -> None:
         """Drop waiting reads and abandon hanging ones."""
         self._threads.close(wait=False)
 
-    def _end(self, future: Future[Any], done: asyncio.Future[Any]) -> None:
-        self._begun.discard(future)
+    def _end(self, done: asyncio.Future[Any]) -> None:
+        self._begun.discard(done)
         if not done.cancelled():
             done.exception()

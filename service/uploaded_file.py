@@ -12,9 +12,14 @@ _CHUNK_BYTES = 2**20
 
 
 class UploadedFile:
-    """Content of an uploaded file, out of memory until it is read. Thread-safe; it is pickled as `bytes`."""
+    """Content of an uploaded file, out of memory until it is read. Thread-safe; it is pickled as `bytes`.
 
-    def __init__(self, file: IO[bytes]) -> None:
+    Attributes:
+        name: name of the file, if the client sent one.
+    """
+
+    def __init__(self, file: IO[bytes], name: str | None = None) -> None:
+        self.name = name
         self._file = file
         self._lock = threading.Lock()
         self._size = file.seek(0, io.SEEK_END)

@@ -5,7 +5,7 @@ Begin with `converter.py`, the pool of workers. `files.py` imports small native 
 """
 
 from service.conversion.converter import Converter
-from service.conversion.files import PlanFile, convert, seems_native
+from service.conversion.files import PlanFile, convert, convert_levels, seems_native
 from service.conversion.rendition_cache import RenditionCache
 
-__all__ = ["Converter", "PlanFile", "RenditionCache", "convert", "seems_native"]
+__all__ = ["Converter", "PlanFile", "RenditionCache", "convert", "convert_levels", "seems_native"]

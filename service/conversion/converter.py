@@ -68,12 +68,27 @@ class Converter:
             return PoolState(workers=self._settings.imports.workers, ready=0, warmed_up=False, fault=None)
         return pool.state
 
-    def read(self, content: bytes, options: ImportOptions, client: str) -> Imported:
+    def read(
+        self,
+        content: bytes,
+        options: ImportOptions,
+        client: str,
+        *,
+        every_level: bool = False,
+        building: str | None = None,
+    ) -> tuple[Imported, ...]:
         """Import a plan file. Blocks for up to twice `max_import_s`.
+
+        Args:
+            content: the file.
+            options: options of the import.
+            client: client of the upload.
+            every_level: return the plans of all levels, lowest first.
+            building: name for the plans of several levels, see `import_plans`.
 
         Raises:
             InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.
-            SeveralLevelsError: the file has several storeys and no `level` is set.
+            SeveralLevelsError: the file has several storeys, without `level` or `every_level`.
             MissingExtraError: a library of its format is not installed.
             OverloadedError: the queue is full.
             DeadlineExceededError: the import did not finish in time.
@@ -82,9 +97,8 @@ class Converter:
         """
         limit_s = self._settings.plans.import_deadline_s
         try:
-            future = self._running_pool().submit(
-                ImportJob(content, options, self._settings.grids.grid_step_m), limit_s, client
-            )
+            job = ImportJob(content, options, self._settings.grids.grid_step_m, every_level, building)
+            future = self._running_pool().submit(job, limit_s, client)
             done, _ = wait([future], limit_s)
             if not done:
                 future.cancel()
@@ -94,7 +108,7 @@ class Converter:
             self._raise_lost(error)
         if isinstance(result, ConversionRefusal):
             raise result.error()
-        assert isinstance(result, Imported)
+        assert isinstance(result, tuple)
         return result
 
     def parse(self, document: PlanDocument) -> FloorPlan | None:

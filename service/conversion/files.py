@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportOptions, detect_format, detect_media_type, import_if_native, is_json
+from lalaloc_core.importers import ImportOptions, Level, detect_format, detect_media_type, import_if_native, is_json
 from service.conversion.converter import Converter
 from service.settings import Settings
 from service.stored_plan import LARGE, PlanDocument, Rendition
 from service.tenancy.fair_share import FairSemaphore
 from service.uploaded_file import UploadedFile
-from service.workers.convert import report_of
+from service.workers.convert import Imported, report_of
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class PlanFile:
 
     Attributes:
         plan: plan, validated under the service's limits.
+        level: level of the plan, if the file has levels.
         report: report of the import as JSON text.
         media_type: media type of the file, detected from its content.
         document: stored form of the plan; None if it is to be made.
@@ -35,6 +36,7 @@ class PlanFile:
     plan: FloorPlan
     report: str
     media_type: str
+    level: Level | None = None
     document: PlanDocument | None = None
     description: Rendition | None = None
 
@@ -56,7 +58,7 @@ def convert(
     client: str,
     permits: FairSemaphore,
 ) -> PlanFile:
-    """Convert an uploaded file to a plan. Blocks.
+    """Convert an uploaded file to its only plan. Blocks.
 
     Args:
         content: the file.
@@ -75,6 +77,46 @@ def convert(
         ConverterNotReadyError: no worker is running.
         StoppingError: the service is shutting down.
     """
+    if (native := _convert_native(content, options, settings, client, permits)) is not None:
+        return native
+    (imported,) = converter.read(content, options, client)
+    return _plan_file(imported, client, permits)
+
+
+def convert_levels(
+    content: bytes,
+    options: ImportOptions,
+    building: str,
+    converter: Converter,
+    settings: Settings,
+    client: str,
+    permits: FairSemaphore,
+) -> list[PlanFile]:
+    """Convert an uploaded file to the plans of its levels, lowest first. Blocks.
+
+    Args:
+        content: the file.
+        options: options of the import.
+        building: name for the plans of several levels, unless the options have one.
+        converter: as for `convert`; so are the other arguments.
+        settings: the settings.
+        client: client of the upload.
+        permits: permits to compute in this process.
+
+    Raises:
+        InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
+        MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `convert`.
+    """
+    if (native := _convert_native(content, options, settings, client, permits)) is not None:
+        return [native]
+    levels = converter.read(content, options, client, every_level=True, building=building)
+    return [_plan_file(imported, client, permits) for imported in levels]
+
+
+def _convert_native(
+    content: bytes, options: ImportOptions, settings: Settings, client: str, permits: FairSemaphore
+) -> PlanFile | None:
+    """Convert a small native plan; None leaves other files, of formats that are supported, to the workers."""
     if not content.strip():
         raise InvalidFloorPlanError("the body is empty; send a plan file")
     limits = settings.plans.import_limits
@@ -86,7 +128,10 @@ def convert(
     elif not is_json(content):
         # Reject unsupported formats before they take a worker.
         detect_format(content, limits)
-    result = converter.read(content, options, client)
+    return None
+
+
+def _plan_file(imported: Imported, client: str, permits: FairSemaphore) -> PlanFile:
     with permits.hold(client):
-        plan = result.plan.plan()
-    return PlanFile(plan, result.report, result.media_type, result.document, result.description)
+        plan = imported.plan.plan()
+    return PlanFile(plan, imported.report, imported.media_type, imported.level, imported.document, imported.description)

@@ -135,7 +135,8 @@ class RenditionCache:
         stored = None if job.abandoned else self._plans.stored(revision_id)
         if stored is None:
             raise UnknownFloorPlanError(plan_id)
-        if len(stored.document.document) <= _SMALL:
+        # The cells of a map are many even if the plan is small.
+        if len(stored.document.document) <= _SMALL and kind != "ros":
             return make_rendition(stored, kind, self._step_m)
         begun = self._converter.begin_rendition(RenditionJob(stored, kind, self._step_m), client)
         if job.abandoned:

@@ -73,15 +73,15 @@ def embed(
         return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
 
 
-def check_size(plan: FloorPlan, settings: Settings) -> None:
-    """Check the estimated number of poses of a plan.
+def check_size(plan: FloorPlan, settings: Settings, level: str | None = None) -> None:
+    """Check the estimated number of poses of a plan; the error names its level.
 
     Raises:
         PlanTooLargeError: the estimate exceeds the limit.
     """
     estimate = grid_size(plan, settings.grids.grid_step_m)
     if estimate > settings.grids.max_grid_poses:
-        raise PlanTooLargeError(estimate, settings.grids.max_grid_poses, settings.grids.grid_step_m)
+        raise PlanTooLargeError(estimate, settings.grids.max_grid_poses, settings.grids.grid_step_m, level)
 
 
 def grid_bytes(grid: PoseGrid) -> int:

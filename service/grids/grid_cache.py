@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 from lalaloc_core.localise.poses import PoseGrid
 from service.bounded_cache import BoundedCache
 from service.grids.embedding import grid_bytes
@@ -19,7 +17,6 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
         super().__init__(limit_bytes, grid_bytes)
         self._store = store
         self._telemetry = telemetry
-        self._loading = threading.Lock()
 
     def cached(self, key: GridKey) -> PoseGrid | None:
         """Return a grid from memory."""
@@ -41,14 +38,8 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
         return self.load(key)
 
     def load(self, key: GridKey) -> PoseGrid | None:
-        """Return a grid as `find` does, without metrics; one at a time, so that queries for one plan read it once."""
-        with self._loading:
-            grid = self.get(key)
-            if grid is None:
-                grid = self._store.grids.get(key)
-                if grid is not None:
-                    self.put(key, grid)
-            return grid
+        """Return a grid as `find` does, without metrics."""
+        return self.get_or_make(key, lambda: self._store.grids.get(key))
 
     def put(self, key: GridKey, value: PoseGrid) -> int:
         """Keep a grid; see `BoundedCache.put`."""

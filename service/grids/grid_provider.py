@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -140,13 +141,13 @@ class GridProvider:
             for summary, place, job in zip(plans, places, jobs, strict=True)
         ]
 
-    def check_size(self, plan: FloorPlan) -> None:
-        """Check the estimated number of poses of a plan.
+    def check_size(self, plan: FloorPlan, level: str | None = None) -> None:
+        """Check the estimated number of poses of a plan; the error names its level.
 
         Raises:
             PlanTooLargeError: the estimate exceeds the limit.
         """
-        check_size(plan, self._settings)
+        check_size(plan, self._settings, level)
 
     def prepare(self, plan: FloorPlan, client: str) -> ComputedGrid | None:
         """Compute the own grid of a client's small plan at once; None leaves it to the background."""
@@ -168,6 +169,12 @@ class GridProvider:
             # The background will fail as well, and store the error with the plan.
             logging.getLogger(LOGGER_NAME).exception("pose grid failed")
             return None
+
+    def prepare_all(self, plans: Sequence[FloorPlan], client: str) -> list[ComputedGrid | None]:
+        """Compute the own grids of a client's plans at once if they are small together, as `prepare` does for one."""
+        if sum(self._estimate(plan) for plan in plans) > self._settings.grids.inline_grid_poses:
+            return [None] * len(plans)
+        return [self.prepare(plan, client) for plan in plans]
 
     def expected_bytes(self, plan: FloorPlan) -> int:
         """Estimate the stored bytes of a plan's own grid."""

@@ -77,7 +77,7 @@ class Sweeper:
                     self._store.tenant_limits.refresh()
                     self._measure()
                     self.sweep()
-                    self._store.give_back()
+                    self._store.give_back(self._stop.is_set)
                 # A backlog, as after a new model, continues as soon as the queued grids are done.
                 if due or (more and self._grids.pending == 0):
                     more = self._grids.queue_missing()
@@ -85,6 +85,7 @@ class Sweeper:
                     purge_at = monotonic() + _PURGE_EVERY_S
                     self._store.idempotency_keys.purge()
                     self._store.answers.purge(kept_s=self._keep_answers_s)
+                    self._store.sessions.purge()
                     self._store.quota.recount()
             except StoreUnavailableError:
                 continue

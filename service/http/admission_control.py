@@ -26,7 +26,7 @@ EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose"})
-_STREAMS = "/events"
+_STREAMS, _PHOTOGRAPHS = "/events", "/photographs"
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
@@ -36,6 +36,11 @@ _MAX_RETRY_AFTER_S = 30
 def is_read(method: str, path: str) -> bool:
     """Return True for a read-only request other than an event stream."""
     return method in _READING and not path.endswith(_STREAMS)
+
+
+def is_query(path: str) -> bool:
+    """Return True for requests that localise photographs."""
+    return path in _QUERIES or path.endswith(_PHOTOGRAPHS)
 
 
 def is_stream(method: str, path: str) -> bool:
@@ -173,7 +178,7 @@ class AdmissionLimits:
         queries: queries that are computed or wait for a thread.
         waiting_queries: queries that wait for a slot.
         reads: read-only requests.
-        streams: event streams.
+        streams: event streams, and WebSockets of sessions.
         tenant_bytes: bytes of bodies in progress per client, for clients without a limit of their own.
         total_bytes: bytes of bodies in progress.
         deadline_s: timeout of every request except streams; other timeouts normally end a request earlier.
@@ -235,8 +240,9 @@ class Admission:
             return limits.tenant_bytes if own is None else own
 
         self.bytes_in_flight = BytesInFlight(limits.total_bytes, limit_of)
-        # More reads at a time would only delay queries, because they share one interpreter.
-        self.reading = FairSemaphore(_READS_AT_A_TIME, telemetry.cpu_accounts)
+        # More reads at a time would only delay queries, because they share one interpreter. Beside other clients, a
+        # client reads one at a time, so that each of their steps waits for one of its steps.
+        self.reading = FairSemaphore(_READS_AT_A_TIME, telemetry.cpu_accounts, cores=1)
         self.draining = False
         self.stopping = False
         self._at_stop: list[Callable[[], None]] = []
@@ -258,7 +264,9 @@ class Admission:
         )
         telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
-        telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
+        telemetry.gauge(
+            "lalaloc_streams", "Open event streams and WebSockets of sessions.", lambda: self.streams.in_use
+        )
 
     def drain(self) -> None:
         """Announce that the service will stop soon. Safe to call in a signal handler."""
@@ -295,7 +303,7 @@ class Admission:
             slots = self.reads
         else:
             slots = self.requests
-            if path in _QUERIES:
+            if is_query(path):
                 # Refuse before the body is read.
                 self.queries.check(client)
         with slots.hold(client):

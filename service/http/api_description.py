@@ -6,6 +6,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 
 from service.http import admission_control as admission
 from service.http.problems import add_problems
@@ -15,15 +16,22 @@ from service.schemas import (
     PlanEvent,
     PlanPoint,
     Problem,
+    SessionDocument,
     StatedMotion,
     VenueChangeDocument,
     VenueDocument,
 )
 from service.schemas.oscp import OscpRequest
+from service.schemas.photographs import StatedIntrinsics
 from service.security import access_control
 from service.security.permissions import NEEDED
 
 _KEY = "api_key"
+# The first server is the one that sends the description; a client made from the file needs an address.
+_SERVERS = [
+    {"url": "/", "description": "The service that sends this description"},
+    {"url": "http://127.0.0.1:8000", "description": "A service on this machine, with default settings"},
+]
 # Models that only hand-written parts of the description use.
 _BY_HAND = (
     EarthPoint,
@@ -32,16 +40,29 @@ _BY_HAND = (
     PlanEvent,
     PlanPoint,
     Problem,
+    StatedIntrinsics,
+    SessionDocument,
     StatedMotion,
     VenueDocument,
     VenueChangeDocument,
 )
 
 
+def operation_id(route: APIRoute) -> str:
+    """Return the name of a route's function in camel case, such as `createFloorplan`.
+
+    Generated clients name their methods by it, so renaming the function breaks them.
+    """
+    first, *rest = route.name.split("_")
+    return first + "".join(word.title() for word in rest)
+
+
 def describe_api(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document of the app; it is built once."""
     if app.openapi_schema is None:
-        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        document = get_openapi(
+            title=app.title, version=app.version, description=app.description, routes=app.routes, servers=_SERVERS
+        )
         schemas = document["components"]["schemas"]
         for model in _BY_HAND:
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
@@ -53,6 +74,7 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
                 for operation in operations.values():
                     add_problems(operation, *admission.REFUSALS)
         _describe_keys(document)
+        _sort_properties(document)
         app.openapi_schema = document
     return app.openapi_schema
 
@@ -74,3 +96,16 @@ def _describe_keys(document: dict[str, Any]) -> None:
             if needed is not None:
                 operation["security"] = [{_KEY: [needed.value]}]
                 add_problems(operation, *access_control.REFUSALS)
+
+
+def _sort_properties(part: Any) -> None:
+    """Put required properties of all schemas first, since generated constructors take arguments in this order."""
+    if isinstance(part, list):
+        for item in part:
+            _sort_properties(item)
+    elif isinstance(part, dict):
+        properties, required = part.get("properties"), part.get("required")
+        if isinstance(properties, dict) and isinstance(required, list):
+            part["properties"] = dict(sorted(properties.items(), key=lambda item: item[0] not in required))
+        for item in part.values():
+            _sort_properties(item)

@@ -18,7 +18,7 @@ from starlette.responses import Response
 
 from lalaloc_core import __version__
 from service.errors import InvalidRequestError, RevisionMismatchError
-from service.http.parts import PartsResponse
+from service.http.parts import Part, Parts, PartsResponse
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}
@@ -70,10 +70,17 @@ def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None 
 
 
 def tagged_answer(
-    parts: Sequence[bytes | memoryview], media_type: str, etag: str, headers: Mapping[str, str] | None = None
+    parts: Sequence[Part], media_type: str, etag: str, headers: Mapping[str, str] | None = None
 ) -> Response:
     """Return a representation, given in parts, with its tag."""
-    return PartsResponse(parts, media_type, {"ETag": etag, **_CACHED, **(headers or {})})
+    return tagged_stream(parts, sum(map(len, parts)), media_type, etag, headers)
+
+
+def tagged_stream(
+    parts: Parts, size_bytes: int, media_type: str, etag: str, headers: Mapping[str, str] | None = None
+) -> Response:
+    """Return a representation of known size, whose parts can be made while it is sent, with its tag."""
+    return PartsResponse(parts, size_bytes, media_type, {"ETag": etag, **_CACHED, **(headers or {})})
 
 
 def expected_revision(request: Request, resource_id: str, revision_id: str, *, what: str = "floor plan") -> str | None:

@@ -32,6 +32,9 @@ _LAST_BYTES_S = 5.0
 _FINAL = frozenset({"ready", "failed", "deleted"})
 
 
+# The service itself, in the place of a tenant.
+_SERVICE = ""
+
 StillAuthorised = Callable[[], Awaitable[bool]]
 
 
@@ -129,7 +132,7 @@ class PlanEvents:
         while self._subscribers:
             subscribers = list(self._subscribers)
             try:
-                found = await self._reads.run(self._look, {subscriber.plan_id for subscriber in subscribers})
+                found = await self._reads.run(_SERVICE, self._look, {subscriber.plan_id for subscriber in subscribers})
                 for subscriber in subscribers:
                     subscriber.put(found.get(subscriber.plan_id, PlanEvent(status="deleted")))
             except StoreUnavailableError:

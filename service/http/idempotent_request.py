@@ -106,13 +106,13 @@ class IdempotentRequest:
         """
         if self._key is None:
             return await work()
-        waiting = _Waiting()
+        tenant, waiting = self._place[0], _Waiting()
         try:
-            token = await reads.run(self._begin_for, waiting, parts)
+            token = await reads.run(tenant, self._begin_for, waiting, parts)
         except BaseException:
             if (left := waiting.leave()) is not None:
                 with suppress(StoreUnavailableError):
-                    await reads.run(self._abandon, left)
+                    await reads.run(tenant, self._abandon, left)
             raise
         if isinstance(token, Response):
             return token
@@ -121,12 +121,12 @@ class IdempotentRequest:
         except BaseException as error:
             refusal = None
             with suppress(StoreUnavailableError):
-                refusal = await reads.run(self._fail, token, error)
+                refusal = await reads.run(tenant, self._fail, token, error)
             if refusal is None:
                 raise
             return refusal
         with suppress(StoreUnavailableError):
-            await reads.run(self._keep, token, answer)
+            await reads.run(tenant, self._keep, token, answer)
         return answer
 
     def _begin(self, parts: Parts) -> Response | str:

@@ -142,6 +142,7 @@ async def read_parts(
     fields: set[str],
     check: Check = _no_fields,
     repeated: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+    aliases: Mapping[str, str] = MappingProxyType({}),
 ) -> Parts:
     """Read a multipart body.
 
@@ -152,6 +153,7 @@ async def read_parts(
         fields: names of optional fields.
         check: returns (field, message) for invalid values of fields.
         repeated: files that can be repeated, with the smallest and largest number of them.
+        aliases: other names of files, and the names under which they are returned.
 
     Raises:
         UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
@@ -180,7 +182,10 @@ async def read_parts(
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     uploaded = {id(value): _kept(request, value) for _, value in form.multi_items() if isinstance(value, UploadFile)}
-    items = [(name, value if isinstance(value, str) else uploaded[id(value)]) for name, value in form.multi_items()]
+    items = [
+        (aliases.get(name, name), value if isinstance(value, str) else uploaded[id(value)])
+        for name, value in form.multi_items()
+    ]
     return _sort(items, limits, files, fields, check, repeated)
 
 
@@ -253,7 +258,7 @@ def _sort(
 
 def _kept(request: Request, upload: UploadFile) -> UploadedFile:
     """Return an uploaded file, which is deleted at the end of the request."""
-    file = UploadedFile(upload.file)
+    file = UploadedFile(upload.file, upload.filename)
     on_request_end(request.scope, file.close)
     return file
 

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from time import monotonic
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import UInt8
 from ray.exceptions import RayError
 from ray.serve.exceptions import BackPressureError
 from ray.serve.handle import DeploymentHandle
 
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from lalaloc_core.photograph import View
 from service.errors import DeadlineExceededError, OverloadedError
 from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
-from service.query import PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer
+from service.query import PanoramaQuery, PictureRequest, QueryContext, SequenceQuery, TrackOutcome, TrackQuery
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
@@ -34,8 +34,8 @@ _ON_THE_WAY_S = 1.0
 T = TypeVar("T")
 
 
-class RemoteEncoders(Encoders):
-    """Networks with a remote image encoder."""
+class RemotePhotographEncoder(PhotographEncoder):
+    """Networks of which those for photographs are remote."""
 
     def __init__(self, bundle: Bundle, settings: Settings, encoder: DeploymentHandle) -> None:
         super().__init__(bundle, threads=settings.cores.onnx_threads)
@@ -44,19 +44,22 @@ class RemoteEncoders(Encoders):
 
     def query(
         self,
-        image: UInt8[np.ndarray, "h w 3"],
+        view: View,
         heading: float | None,
         camera_height: CameraHeight,
         *,
         heading_tolerance: float = 0.0,
+        others: Sequence[tuple[View, float]] = (),
     ) -> Query:
-        """Compute a query as `Encoders.query` does; blocks, so call it from a thread.
+        """Compute a query as `PhotographEncoder.query` does; blocks, so call it from a thread.
 
         Raises:
+            InvalidPanoramaError: see `PhotographEncoder.query`.
             DeadlineExceededError: no answer in time, or two replicas died.
         """
+        self.check(view)
         for _ in range(_ATTEMPTS):
-            response = self._encoder.query.remote(image, heading, camera_height, heading_tolerance)
+            response = self._encoder.query.remote(view, heading, camera_height, heading_tolerance, others)
             try:
                 return response.result(timeout_s=self._deadline_s)
             except TimeoutError:
@@ -64,7 +67,7 @@ class RemoteEncoders(Encoders):
                 break
             except RayError:
                 continue
-        raise DeadlineExceededError(self._deadline_s, "the panorama was not encoded")
+        raise DeadlineExceededError(self._deadline_s, "the photograph was not encoded")
 
 
 class RemoteOptimiser:
@@ -220,3 +223,16 @@ class RemoteVenueLocaliser(_SearchCaller):
         """See `VenueLocaliser.check_hints`."""
         context = QueryContext.starting(venue.tenant, self._settings.requests.request_deadline_s)
         await self._call("check_hints", venue.id, context, venue.tenant, venue.id, form)
+
+
+class RemoteTracker(_SearchCaller):
+    """Remote `SessionTracker`."""
+
+    async def check(self, record: PlanRecord, document: SessionDocument) -> None:
+        """See `SessionTracker.check`."""
+        context = QueryContext.starting(record.tenant, self._settings.requests.request_deadline_s)
+        await self._call("check_session", record.id, context, record.tenant, record.id, document)
+
+    async def track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+        """See `SessionTracker.track`."""
+        return await self._call("track", record.id, query.context, record.tenant, record.id, query)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import UInt8
 from ray import serve
 from ray.serve.handle import DeploymentHandle
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -16,13 +15,20 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from lalaloc_core.photograph import View
 from service.app import create_app
 from service.errors import UnknownFloorPlanError, UnknownVenueError
 from service.on_ray.outcome import returning_failures
-from service.on_ray.remote import RemoteEncoders, RemoteLocaliser, RemoteOptimiser, RemoteVenueLocaliser
-from service.query import PanoramaQuery, PictureRequest, SequenceQuery
-from service.runtime import Backends, start_runtime, warm_encoders
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer
+from service.on_ray.remote import (
+    RemoteLocaliser,
+    RemoteOptimiser,
+    RemotePhotographEncoder,
+    RemoteTracker,
+    RemoteVenueLocaliser,
+)
+from service.query import PanoramaQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery
+from service.runtime import Backends, Localisers, start_runtime, warm_encoder
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
@@ -30,7 +36,7 @@ from service.workers.lpo import load_refiner
 
 
 class EncoderReplica:
-    """Encoder of panoramas."""
+    """Encoder of photographs."""
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
         """Load the networks.
@@ -38,17 +44,18 @@ class EncoderReplica:
         Raises:
             RuntimeError: this machine has a different bundle.
         """
-        self._encoders = warm_encoders(_same_bundle(settings, model_sha256), settings)
+        self._encoder = warm_encoder(_same_bundle(settings, model_sha256), settings)
 
     def query(
         self,
-        image: UInt8[np.ndarray, "h w 3"],
+        view: View,
         heading: float | None,
         camera_height: CameraHeight,
         heading_tolerance: float,
+        others: Sequence[tuple[View, float]],
     ) -> Query:
-        """See `Encoders.query`."""
-        return self._encoders.query(image, heading, camera_height, heading_tolerance=heading_tolerance)
+        """See `PhotographEncoder.query`."""
+        return self._encoder.query(view, heading, camera_height, heading_tolerance=heading_tolerance, others=others)
 
 
 class LpoReplica:
@@ -73,7 +80,7 @@ class SearchReplica:
         configure_logging(settings.log_level)
         backends = Backends(
             optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(lpo, telemetry),
-            encoders=lambda bundle, settings: RemoteEncoders(bundle, settings, encoder),
+            encoder=lambda bundle, settings: RemotePhotographEncoder(bundle, settings, encoder),
         )
         self._cleanup = ExitStack()
         self._runtime = start_runtime(settings, Telemetry(), self._cleanup, backends)
@@ -112,6 +119,16 @@ class SearchReplica:
         """See `VenueLocaliser.check_hints`."""
         await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
 
+    @returning_failures
+    async def check_session(self, tenant: str, plan_id: str, document: SessionDocument) -> None:
+        """See `SessionTracker.check`."""
+        await self._runtime.tracker.check(await self._plan(tenant, plan_id), document)
+
+    @returning_failures
+    async def track(self, tenant: str, plan_id: str, query: TrackQuery) -> TrackOutcome:
+        """See `SessionTracker.track`."""
+        return await self._runtime.tracker.track(await self._plan(tenant, plan_id), query)
+
     async def revisions(self) -> frozenset[str]:
         """Return the revisions of plans whose pose grids are in memory."""
         return frozenset(self._runtime.grids.revisions())
@@ -125,7 +142,7 @@ class SearchReplica:
         return record
 
     async def _venue(self, tenant: str, venue_id: str) -> VenueRecord:
-        record = await self._runtime.reads.run(self._runtime.store.venues.get, tenant, venue_id)
+        record = await self._runtime.reads.run(tenant, self._runtime.store.venues.get, tenant, venue_id)
         if record is None:
             raise UnknownVenueError(venue_id)
         return record
@@ -146,15 +163,16 @@ class IngressReplica:
         self._search = search
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
-        def localisers(
-            model: ModelAnswer, settings: Settings, telemetry: Telemetry
-        ) -> tuple[RemoteLocaliser, RemoteVenueLocaliser]:
-            plans = RemoteLocaliser(model, self._search, settings, telemetry)
-            return plans, RemoteVenueLocaliser(self._search, settings, telemetry)
+        def localisers(model: ModelAnswer, settings: Settings, telemetry: Telemetry) -> Localisers:
+            return (
+                RemoteLocaliser(model, self._search, settings, telemetry),
+                RemoteVenueLocaliser(self._search, settings, telemetry),
+                RemoteTracker(self._search, settings, telemetry),
+            )
 
         backends = Backends(
             optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(self._lpo, telemetry),
-            encoders=warm_encoders,
+            encoder=warm_encoder,
             localisers=localisers,
         )
         return without_request_id(create_app(self._settings, backends))

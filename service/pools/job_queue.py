@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from time import monotonic
 from typing import Any, Literal
@@ -38,9 +38,14 @@ class JobLostError(Exception):
 
 
 class PendingJob:
-    """Job that waits or runs."""
+    """Job that waits or runs.
 
-    def __init__(self, content: bytes, digest: bytes, deadline: float, client: str = "") -> None:
+    Attributes:
+        content: the pickled job, in parts that are not empty.
+        digest: of the content; equal jobs have equal digests.
+    """
+
+    def __init__(self, content: Sequence[bytes], digest: bytes, deadline: float, client: str = "") -> None:
         self.content = content
         self.digest = digest
         self.deadline = deadline

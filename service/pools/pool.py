@@ -34,6 +34,19 @@ class PoolState:
     fault: str | None
 
 
+class _Parts:
+    """File of a pickled job. Its uploaded file stays one part, as copying it would hold the interpreter's lock."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.digest = hashlib.sha256()
+
+    def write(self, part: bytes) -> None:
+        if part:
+            self.parts.append(part)
+            self.digest.update(part)
+
+
 class WorkerPool(Generic[Job, Result]):
     """Bounded queue in front of supervised workers; safe to use from any thread."""
 
@@ -106,8 +119,9 @@ class WorkerPool(Generic[Job, Result]):
         Raises:
             JobLostError: the job cannot be run in time.
         """
-        content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
-        pending = PendingJob(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, client)
+        content = _Parts()
+        pickle.Pickler(content, protocol=pickle.HIGHEST_PROTOCOL).dump(job)
+        pending = PendingJob(content.parts, content.digest.digest(), monotonic() + timeout_s, client)
         self._queue.put(pending)
         return pending.future
 

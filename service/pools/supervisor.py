@@ -7,7 +7,7 @@ import math
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -264,10 +264,11 @@ class Watchdog:
         self._process.kill()
 
 
-def _send(connection: Connection, content: bytes) -> bool:
-    """Send a job; False if the worker died before it had all of it."""
+def _send(connection: Connection, content: Sequence[bytes]) -> bool:
+    """Send the parts of a job, and an empty one; False if the worker died before it had all of it."""
     try:
-        connection.send_bytes(content)
+        for part in (*content, b""):
+            connection.send_bytes(part)
     except OSError:
         return False
     return True

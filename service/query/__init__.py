@@ -1,10 +1,10 @@
 """Queries: from a decoded request to the answer, in one plan or in all plans of a venue.
 
 Begin with `localiser.py`, whose `_localise` shows the steps in order. `stated_camera.py` reads the fields about the
-camera, `answers.py` composes the answer. `venue_localiser.py` does the same for a venue: `venue_plans.py` chooses the
-plans by the prototypes in `prototype_file.py`, and `venue_hints.py` applies the hints to them. `decoding.py` and
-`lpo_pool.py` are pools of worker processes. `queries.py` has the queries and the interfaces of the components that can
-run in other processes.
+camera, `photographs.py` encodes decoded photographs, `answers.py` composes the answer. `venue_localiser.py` does the
+same for a venue: `venue_plans.py` chooses the plans by the prototypes in `prototype_file.py`, and `venue_hints.py`
+applies the hints to them. `decoding.py` and `lpo_pool.py` are pools of worker processes. `queries.py` has the queries
+and the interfaces of the components that can run in other processes. `tracking.py` follows the cameras of sessions.
 """
 
 from service.query.decoding import Decoder
@@ -17,8 +17,12 @@ from service.query.queries import (
     PictureRequest,
     QueryContext,
     SequenceQuery,
+    TrackerBackend,
+    TrackOutcome,
+    TrackQuery,
     VenueLocaliserBackend,
 )
+from service.query.tracking import SessionTracker
 from service.query.venue_localiser import VenueLocaliser
 from service.query.venue_plans import VenuePlans
 
@@ -32,6 +36,10 @@ __all__ = [
     "PictureRequest",
     "QueryContext",
     "SequenceQuery",
+    "SessionTracker",
+    "TrackOutcome",
+    "TrackQuery",
+    "TrackerBackend",
     "VenueLocaliser",
     "VenueLocaliserBackend",
     "VenuePlans",

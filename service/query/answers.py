@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel
+from lalaloc_core.localise.bundle import Bundle, Manifest
+from lalaloc_core.localise.confidence import Confidence
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
@@ -30,6 +31,7 @@ from service.schemas import (
     SequencePoseAnswer,
     TimingsAnswer,
 )
+from service.schemas.photographs import ViewAnswer
 from service.storage.records import PlanRecord
 
 # Smaller probabilities are rounded to 0 in the answer.
@@ -75,8 +77,9 @@ def compose_answer(
     bundle: Bundle,
     warnings: Sequence[str] = (),
     share: float = 1.0,
+    view: Callable[[Localisation, Confidence | None], ViewAnswer],
 ) -> LocaliseAnswer:
-    """Compose the answer to a query about one panorama.
+    """Compose the answer to a query about one photograph.
 
     Args:
         found: result of the search.
@@ -86,8 +89,9 @@ def compose_answer(
         bundle: the model.
         warnings: warnings besides the one about the heading.
         share: probability that the camera is in one of the searched plans.
+        view: composes the part about the photograph, given the result and its confidence.
     """
-    model = bundle.manifest.confidence
+    model = bundle.manifest.confidence_for(view=found.query.is_view)
     final, uncertainty = found.best[found.stage], None
     if model is not None and final.information is not None:
         placed = locate(final)
@@ -109,6 +113,7 @@ def compose_answer(
         room_id=best.room_id,
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
+        probability_elsewhere=None if confidence is None else confidence.elsewhere,
         warnings=[*heading_warnings(found, known), *warnings],
         covariance_m2=None if uncertainty is None else uncertainty.position_m2.tolist(),
         heading_std_deg=None
@@ -120,6 +125,7 @@ def compose_answer(
         camera_height_m=found.camera_height_m,
         candidates=candidates,
         geopose=best.geopose,
+        view=view(found, confidence),
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=model_answer(bundle),
     )
@@ -166,15 +172,15 @@ def compose_sequence_answer(
     answers: Sequence[LocaliseAnswer],
     found: SequenceLocalisation,
     motions: Sequence[Motion],
-    model: ConfidenceModel | None,
+    manifest: Manifest,
 ) -> SequenceAnswer:
-    """Compose the answer to a query about several panoramas.
+    """Compose the answer to a query about several photographs.
 
     Args:
-        answers: the answer for each panorama.
+        answers: the answer for each photograph.
         found: result of the joint search.
-        motions: the stated motions between the panoramas.
-        model: the confidence model; None for a bundle without one.
+        motions: the stated motions between the photographs.
+        manifest: of the model.
     """
     first = answers[0]
     return SequenceAnswer(
@@ -184,7 +190,7 @@ def compose_sequence_answer(
             SequencePoseAnswer(**{name: getattr(answer, name) for name in SequencePoseAnswer.model_fields})
             for answer in answers
         ],
-        confidence=found.confidence(model),
+        confidence=found.confidence(manifest),
         warnings=[_motion_warning(index, motions[index]) for index in found.motions_contradicted],
         stage=found.stage,
         camera_height_m=found.camera_height_m,
@@ -201,4 +207,4 @@ def _motion_warning(index: int, motion: Motion) -> str:
         measured.append(f"turn_deg {math.degrees(motion.turn):.4g}")
     if motion.direction is not None:
         measured.append(f"direction_deg {math.degrees(motion.direction):.4g}")
-    return f"motions[{index}] ({', '.join(measured)}) contradicts the panoramas and was ignored"
+    return f"motions[{index}] ({', '.join(measured)}) contradicts the photographs and was ignored"

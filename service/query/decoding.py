@@ -1,4 +1,4 @@
-"""Pool of worker processes, bounded in memory and time, that decode panoramas and rasterise drawings.
+"""Pool of worker processes, bounded in memory and time, that decode photographs and rasterise drawings.
 
 A picture that crashes its worker is tried once more; one that exceeds the time limit is not. Other jobs are not
 affected. No client keeps all workers busy.
@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from time import monotonic
 
+import numpy as np
+from jaxtyping import UInt8
+
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.localise.bundle import Manifest
-from lalaloc_core.panorama.images import Panorama
+from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.photograph import StatedView, View
 from service.errors import (
     DeadlineExceededError,
     DecoderNotReadyError,
@@ -23,9 +27,20 @@ from service.settings import Settings
 from service.telemetry import Telemetry
 from service.tenancy.fair_share import FairSemaphore
 from service.uploaded_file import UploadedFile
-from service.workers.decode import DecodeJob, DecodeRefusal, RasteriseJob, run_decoder
+from service.workers.decode import (
+    DecodeJob,
+    DecodeRefusal,
+    DecodeSizes,
+    Job,
+    RasteriseJob,
+    Result,
+    ShowJob,
+    run_decoder,
+)
 
-# Panoramas that can wait to be decoded.
+# Page about usable photographs, named in refusals.
+_HELP = "docs/how-to/take-photographs.md"
+# Photographs that can wait to be decoded.
 _QUEUE = 32
 
 
@@ -34,14 +49,12 @@ class Decoder:
 
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
         self._settings = settings
-        self._size = manifest.image_height, manifest.image_width
-        self._pool: WorkerPool[DecodeJob | RasteriseJob, Panorama | DecodeRefusal | bytes] = WorkerPool(
+        self._pool: WorkerPool[Job, Result] = WorkerPool(
             WorkerSpec(
                 "decode",
                 run_decoder,
                 (
-                    manifest.image_height,
-                    manifest.image_width,
+                    DecodeSizes(sphere=sphere_size(manifest), patch=patch_size(manifest)),
                     settings.panoramas.panorama_limits,
                     settings.decode.memory_bytes,
                 ),
@@ -55,7 +68,7 @@ class Decoder:
             on_restart=lambda _reason: telemetry.note_restart("decode"),
         )
         telemetry.gauge(
-            "lalaloc_decode_queue_depth", "Panoramas waiting for a decoding worker.", lambda: self._pool.waiting
+            "lalaloc_decode_queue_depth", "Photographs waiting for a decoding worker.", lambda: self._pool.waiting
         )
         telemetry.gauge(
             "lalaloc_decode_workers_ready", "Decoding workers that are ready.", lambda: self._pool.state.ready
@@ -76,28 +89,44 @@ class Decoder:
         return self._pool.state
 
     async def decode(
-        self, content: bytes | UploadedFile, deadline: float, client: str = "", *, size: tuple[int, int] | None = None
-    ) -> Panorama:
-        """Decode an uploaded panorama file.
+        self, content: bytes | UploadedFile, stated: StatedView, deadline: float, client: str = ""
+    ) -> View:
+        """Decode an uploaded photograph for the encoders.
 
         Args:
             content: the file.
+            stated: the request's statements about it.
             deadline: time limit (`monotonic`).
             client: fairness group of the job.
-            size: height and width of the result in pixels; None for the encoder's.
 
         Raises:
-            InvalidPanoramaError: see `open_panorama`; or the file stalled a worker, or crashed two.
-            OverloadedError: too many panoramas wait already.
+            InvalidPanoramaError: see `open_view`; or the file stalled a worker, or crashed two.
+            OverloadedError: too many photographs wait already.
             DeadlineExceededError: the deadline passed.
             DecoderNotReadyError: no worker is running, nor will be by the deadline.
             StoppingError: the service is shutting down.
         """
-        height, width = size or self._size
-        result = await self._run_job(DecodeJob(content, height, width), deadline, client)
-        if isinstance(result, DecodeRefusal):
-            raise InvalidPanoramaError(result.reason)
-        assert isinstance(result, Panorama)
+        result = await self._run_job(DecodeJob(content, stated), deadline, client)
+        assert isinstance(result, View)
+        return result
+
+    async def picture(
+        self,
+        content: bytes | UploadedFile,
+        stated: StatedView,
+        deadline: float,
+        client: str,
+        *,
+        is_sphere: bool,
+        max_size: tuple[int, int],
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Decode a photograph to be shown: upright within `max_size` (width, height), a full sphere level and of it.
+
+        Raises:
+            LaLaLocError: as `decode`.
+        """
+        result = await self._run_job(ShowJob(content, stated, is_sphere, max_size), deadline, client)
+        assert isinstance(result, np.ndarray)
         return result
 
     async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
@@ -111,19 +140,20 @@ class Decoder:
         assert isinstance(result, bytes)
         return result
 
-    async def _run_job(
-        self, job: DecodeJob | RasteriseJob, deadline: float, client: str
-    ) -> Panorama | DecodeRefusal | bytes:
+    async def _run_job(self, job: Job, deadline: float, client: str) -> Result:
         try:
-            return await self._pool.run_job(job, max(deadline - monotonic(), 0.0), client)
+            result = await self._pool.run_job(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
             raise self._error(error, job) from error
+        if isinstance(result, DecodeRefusal):
+            raise InvalidPanoramaError(f"{result.reason}; see {_HELP}")
+        return result
 
     def close(self) -> None:
         """End all workers and wait for them."""
         self._pool.close()
 
-    def _error(self, lost: JobLostError, job: DecodeJob | RasteriseJob) -> Exception:
+    def _error(self, lost: JobLostError, job: Job) -> Exception:
         """Return the service's error for a lost job."""
         if isinstance(job, RasteriseJob) and lost.reason in ("poisoned", "fault"):
             return DrawingFailedError(lost.reason)
@@ -132,14 +162,14 @@ class Decoder:
             return DeadlineExceededError(self._settings.decode.stall_s)
         match lost.reason:
             case "poisoned":
-                return InvalidPanoramaError("the panorama crashed the decoder twice: save it anew, or make it smaller")
+                return InvalidPanoramaError("the photograph crashed the decoder twice: save it anew or smaller")
             case "stalled":
                 return InvalidPanoramaError(
-                    f"decoding the panorama took longer than {self._settings.decode.stall_s:g} s "
+                    f"decoding the photograph took longer than {self._settings.decode.stall_s:g} s "
                     "(LALALOC_DECODE_STALL_S): save it anew, or send a smaller one"
                 )
             case "fault":
-                return InvalidPanoramaError("the panorama file is damaged: save it anew")
+                return InvalidPanoramaError("the photograph is damaged: save it anew")
             case "queue-full":
                 return OverloadedError(_QUEUE)
             case "not-ready":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from time import monotonic
 from typing import Any, TypeVar
@@ -12,18 +12,21 @@ from typing import Any, TypeVar
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step
-from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps, next_step
+from lalaloc_core.localise.poses import PoseGrid, RefinementJob
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import SequenceJob
-from lalaloc_core.localise.sequence.search import localise_sequence_steps
+from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
+from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
 from lalaloc_core.localise.stated_camera import KnownHeading
-from lalaloc_core.panorama.images import Panorama
+from lalaloc_core.photograph import View
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
 from service.query.answers import compose_answer, compose_sequence_answer, locate_in, model_answer, posterior_answer
 from service.query.decoding import Decoder
+from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
 from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_hints
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
@@ -36,6 +39,9 @@ from service.threads import BoundedReads, Threads
 # LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
 _RESERVED_S = 0.25
 
+# Photographs from one spot with known angles are one search, whose stages are those of a sequence.
+_TURN_CONFIG = LocaliseConfig(vdr_candidates=0)
+
 # Names of the heading's sources in pictures.
 _SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
@@ -44,9 +50,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Outcome:
-    """An answer, and the search result and pose grid behind it."""
+    """An answer, and the photograph, search result and pose grid behind it."""
 
     answer: LocaliseAnswer
+    view: View
     found: Localisation
     grid: PoseGrid
 
@@ -59,7 +66,7 @@ class Localiser:
         *,
         settings: Settings,
         bundle: Bundle,
-        encoders: Encoders,
+        encoder: PhotographEncoder,
         grids: GridProvider,
         optimiser: OptimiserBackend,
         decoder: Decoder,
@@ -70,7 +77,7 @@ class Localiser:
     ) -> None:
         self._settings = settings
         self._bundle = bundle
-        self._encoders = encoders
+        self._encoder = encoder
         self._grids = grids
         self._optimiser = optimiser
         self._decoder = decoder
@@ -87,7 +94,7 @@ class Localiser:
         return model_answer(self._bundle)
 
     async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
-        """Localise a panorama in a stored plan.
+        """Localise a photograph in a stored plan.
 
         Raises:
             InvalidPanoramaError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
@@ -120,7 +127,7 @@ class Localiser:
             return outcome.answer, picture
 
     async def localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
-        """Localise several panoramas of one visit jointly; raises the errors of `localise`."""
+        """Localise several photographs of one visit jointly; raises the errors of `localise`."""
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._localise_sequence(record, query)
 
@@ -133,17 +140,18 @@ class Localiser:
         height, hints = stated_height(form, record), stated_hints(form, record.plan)
         # Decode first, so that an unreadable picture is refused without waiting for the plan.
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(query.content, context.deadline, context.client)
-        known = known_heading(form, record.plan.north, panorama, self._settings.panoramas.compass_tolerance_deg)
+            view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
+        known = known_heading(form, record.plan.north, view, self._settings.panoramas.compass_tolerance_deg)
         if not hints.are_none:
             # On a compute thread, because checking many rooms is slow.
             await self.compute(context, partial(hints.check, record.plan))
-        encoded = await self.compute(context, lambda: self.encode([panorama], [known], height, clock))
-        grid = await self._grid(record, height, context)
+        photograph = Photograph(view)
+        encoded = await self.compute(context, partial(encode, self._encoder, [photograph], [known], height, clock))
+        grid = await self.grid(record, height, context)
         steps = localise_steps(
             record.plan,
             grid,
-            self._encoders,
+            self._encoder.networks,
             encoded[0],
             refine=form.refine,
             top_k=form.top_k,
@@ -158,47 +166,122 @@ class Localiser:
             warnings=hint_warnings(hints, found, record.plan),
             timings_ms=self.observe(context, found.stage),
             bundle=self._bundle,
+            view=partial(view_answer, photograph, plan=record.plan, grid=grid),
         )
         if form.include == "posterior":
             answer = answer.model_copy(update={"posterior": posterior_answer(record.plan, grid, found.posterior)})
-        return _Outcome(answer, found, grid)
+        return _Outcome(answer, view, found, grid)
 
     async def _localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
         form, context, clock = query.form, query.context, query.context.clock
         height, plan = stated_height(form, record), record.plan
         compass_deg = self._settings.panoramas.compass_tolerance_deg
-        # Decode one panorama at a time, so that a query occupies one decoder.
+        # Decode one photograph at a time, so that a query occupies one decoder.
         with clock.stage("decode"):
-            panoramas = [
-                await self._decoder.decode(content, context.deadline, context.client) for content in query.contents
+            views = [
+                await self._decoder.decode(content, form.stated_view, context.deadline, context.client)
+                for content in query.contents
             ]
         known = [
-            known_heading(form.heading_of(index), plan.north, panorama, compass_deg)
-            for index, panorama in enumerate(panoramas)
+            known_heading(form.heading_of(index), plan.north, view, compass_deg) for index, view in enumerate(views)
         ]
-        encoded = await self.compute(context, partial(self.encode, panoramas, known, height, clock))
-        grid = await self._grid(record, height, context)
-        motions = form.steps(len(panoramas))
-        steps = localise_sequence_steps(
-            plan, grid, self._encoders, encoded, motions, refine=form.refine, top_k=form.top_k, clock=clock
-        )
-        found = await self.run_search(steps, context)
+        # A sphere shows all that other photographs from its spot could add.
+        one_query = form.motion == "turn" and not any(view.panorama is not None for view in views)
+        turns = form.known_turns
+        if one_query and turns is not None:
+            grid, joint = await self._search_turn(record, query, views, known, turns, height)
+            found = localised_turn(joint, turns)
+        else:
+            grid, found = await self._search_sequence(record, query, views, known, height)
+            if one_query:
+                grid, joint = await self._search_turn(record, query, views, known, found_turns(found), height)
+                found = judged_turn(found, joint)
         timings_ms = self.observe(context, found.stage)
         answers = [
-            compose_answer(picture, locate=locate_in(record), known=heading, timings_ms=timings_ms, bundle=self._bundle)
-            for heading, picture in zip(known, found.pictures, strict=True)
+            compose_answer(
+                picture,
+                locate=locate_in(record),
+                known=heading,
+                timings_ms=timings_ms,
+                bundle=self._bundle,
+                view=partial(view_answer, photograph, plan=plan, grid=grid),
+            )
+            for heading, picture, photograph in zip(
+                known, found.pictures, _photographs(views, found, one_spot=form.motion == "turn"), strict=True
+            )
         ]
-        return compose_sequence_answer(answers, found, motions, self._bundle.manifest.confidence)
+        motions = form.steps(len(views))
+        return compose_sequence_answer(answers, found, motions, self._bundle.manifest)
 
-    async def _grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
+    async def _search_sequence(
+        self,
+        record: PlanRecord,
+        query: SequenceQuery,
+        views: Sequence[View],
+        known: Sequence[KnownHeading],
+        height: CameraHeight,
+    ) -> tuple[PoseGrid, SequenceLocalisation]:
+        """Search the places of photographs that are linked by motions; return the pose grid, too."""
+        form, context, clock = query.form, query.context, query.context.clock
+        photographs = [Photograph(view) for view in views]
+        encoded = await self.compute(context, partial(encode, self._encoder, photographs, known, height, clock))
+        grid = await self.grid(record, height, context)
+        steps = localise_sequence_steps(
+            record.plan,
+            grid,
+            self._encoder.networks,
+            encoded,
+            form.steps(len(views)),
+            refine=form.refine,
+            top_k=form.top_k,
+            clock=clock,
+        )
+        return grid, await self.run_search(steps, context)
+
+    async def _search_turn(
+        self,
+        record: PlanRecord,
+        query: SequenceQuery,
+        views: Sequence[View],
+        known: Sequence[KnownHeading],
+        turns: Sequence[float],
+        height: CameraHeight,
+    ) -> tuple[PoseGrid, Localisation]:
+        """Search the place of photographs from one spot with known headings (radians) minus that of the first.
+
+        They are one query that sees more azimuths, so that overlapping parts count once.
+        """
+        form, context, clock = query.form, query.context, query.context.clock
+        photograph = Photograph(views[0], list(zip(views[1:], turns[1:], strict=True)))
+        stated = (
+            replace(heading, heading=heading.heading - turn)
+            for heading, turn in zip(known, turns, strict=True)
+            if heading.heading is not None
+        )
+        first = [next(stated, known[0])]
+        encoded = await self.compute(context, partial(encode, self._encoder, [photograph], first, height, clock))
+        grid = await self.grid(record, height, context)
+        steps = localise_steps(
+            record.plan,
+            grid,
+            self._encoder.networks,
+            encoded[0],
+            refine=form.refine,
+            top_k=form.top_k,
+            config=_TURN_CONFIG,
+            clock=clock,
+        )
+        return grid, await self.run_search(steps, context)
+
+    async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline."""
         with context.clock.stage("grid"):
-            height_m = grid_height_m(record, height.height_m, latents_alone=not self._encoders.predicts_profile)
+            height_m = grid_height_m(record, height.height_m, latents_alone=not self._encoder.networks.predicts_profile)
             key = self._grids.key(record.revision_id, height_m)
             grid = self._grids.cached(key)
             if grid is None:
                 # Not on the compute threads: a database that does not answer would block them.
-                grid = await self._reads.run(self._grids.find, key)
+                grid = await self._reads.run(record.tenant, self._grids.find, key)
             if grid is not None:
                 return grid
             own_height = height_m == record.plan.camera_height_m
@@ -216,16 +299,22 @@ class Localiser:
     async def _draw(
         self, record: PlanRecord, outcome: _Outcome, query: PanoramaQuery, request: PictureRequest
     ) -> bytes:
-        context, photograph = query.context, None
+        context, photograph, view = query.context, None, outcome.view
         if request.picture != "plan":
             # Decode again, because the encoder's input is too small for a picture.
-            width, height = PHOTOGRAPH_SIZE
-            size = height, width
-            photograph = (await self._decoder.decode(query.content, context.deadline, context.client, size=size)).pixels
+            photograph = await self._decoder.picture(
+                query.content,
+                query.form.stated_view,
+                context.deadline,
+                context.client,
+                is_sphere=view.panorama is not None,
+                max_size=PHOTOGRAPH_SIZE,
+            )
 
         def draw() -> str:
-            model, source = self._bundle.manifest.confidence, _SOURCES[outcome.answer.heading_source]
-            drawn = drawn_answer(record.plan, outcome.grid, outcome.found, model, source)
+            model = self._bundle.manifest.confidence_for(view=outcome.found.query.is_view)
+            source = _SOURCES[outcome.answer.heading_source]
+            drawn = drawn_answer(record.plan, outcome.grid, outcome.found, model, source, view=view)
             return draw_answer(drawn, photograph, request.picture, rooms=request.rooms)
 
         svg = await self.compute(context, draw)
@@ -249,16 +338,6 @@ class Localiser:
         except TimeoutError as error:
             raise DeadlineExceededError(self._settings.requests.request_deadline_s) from error
 
-    def encode(
-        self, panoramas: Sequence[Panorama], known: Sequence[KnownHeading], height: CameraHeight, clock: StageClock
-    ) -> list[Query]:
-        """Encode decoded panoramas, each with its known heading."""
-        with clock.stage("encode"):
-            return [
-                self._encoders.query(panorama.pixels, heading.heading, height, heading_tolerance=heading.tolerance)
-                for panorama, heading in zip(panoramas, known, strict=True)
-            ]
-
     async def run_search(self, steps: Generator[RefinementJob | SequenceJob, Any, T], context: QueryContext) -> T:
         """Run a search on the compute threads; it holds none while LPO refines poses."""
         step = await self.compute(context, partial(next_step, steps, None))
@@ -275,3 +354,17 @@ class Localiser:
             self._telemetry.stage_seconds.labels(name).observe(duration_ms / 1e3)
         self._telemetry.answers.labels(stage).inc()
         return timings_ms
+
+
+def _photographs(views: Sequence[View], found: SequenceLocalisation, *, one_spot: bool) -> list[Photograph]:
+    """Return each photograph of a sequence, together with all others from its spot."""
+    if not one_spot:
+        return [Photograph(view) for view in views]
+    headings = [panorama_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
+    return [
+        Photograph(
+            view,
+            [(other, heading - headings[index]) for other, heading in zip(views, headings, strict=True)],
+        )
+        for index, view in enumerate(views)
+    ]

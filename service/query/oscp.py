@@ -27,28 +27,36 @@ from service.schemas.oscp import (
 
 # Radius (m) for a reading without an accuracy.
 UNKNOWN_ACCURACY_M = 100.0
-_PANORAMAS = {"", "UNKNOWN", "UNKNOWN_CAMERA", "EQUIRECTANGULAR", "SPHERICAL"}
+_UNKNOWN = {"", "UNKNOWN", "UNKNOWN_CAMERA"}
+_SPHERES = {"EQUIRECTANGULAR", "SPHERICAL"}
+# Parameters of camera models, in the protocol's order; f is both fx and fy.
+_CAMERAS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
 _READING = "sensorReadings.cameraReadings.0"
 
 
 def decode_picture(request: OscpRequest) -> bytes:
-    """Return the panorama file of a request.
+    """Return the picture file of a request.
 
     Raises:
-        InvalidRequestError: the reading names no camera of the request, is not a panorama, or is not Base64.
+        InvalidRequestError: the reading names no camera of the request, is a depth map, is not upright, or not Base64.
     """
     reading, faults = request.camera_reading, list[tuple[str, str]]()
     if not any(sensor.id == reading.sensor_id and sensor.type == "camera" for sensor in request.sensors):
         faults.append((f"{_READING}.sensorId", f"is '{reading.sensor_id[:50]}', sensors has no camera with this id"))
     if reading.image_format.upper() == "DEPTH":
-        faults.append((f"{_READING}.imageFormat", "is 'DEPTH', a panorama in colours is needed"))
-    model = "" if reading.params is None else (reading.params.model or "").upper()
-    if model not in _PANORAMAS:
-        fault = f"is '{model[:50]}': the picture must be a full 360° panorama (EQUIRECTANGULAR)"
-        faults.append((f"{_READING}.params.model", fault))
+        faults.append((f"{_READING}.imageFormat", "is 'DEPTH', a photograph in colours is needed"))
     orientation = reading.image_orientation
     if orientation is not None and (orientation.mirrored or orientation.rotation % 360.0):
-        faults.append((f"{_READING}.imageOrientation", "must be neither mirrored nor rotated: send panoramas upright"))
+        faults.append(
+            (f"{_READING}.imageOrientation", "must be neither mirrored nor rotated: send the picture upright")
+        )
     try:
         content = base64.b64decode(reading.image_bytes, validate=True)
     except (binascii.Error, ValueError):
@@ -57,6 +65,33 @@ def decode_picture(request: OscpRequest) -> bytes:
     if faults:
         raise InvalidRequestError(faults)
     return content
+
+
+def camera_fields(request: OscpRequest) -> dict[str, object]:
+    """Return the camera of a request as fields of `LocaliseForm`.
+
+    Raises:
+        InvalidRequestError: the model is unknown, or has another number of parameters.
+    """
+    params = request.camera_reading.params
+    model = "" if params is None else (params.model or "").upper()
+    if model in _UNKNOWN:
+        return {}
+    if model in _SPHERES:
+        return {"projection": "equirectangular"}
+    names = _CAMERAS.get(model)
+    if names is None:
+        known = ", ".join(sorted(_SPHERES | _CAMERAS.keys()))
+        raise InvalidRequestError([(f"{_READING}.params.model", f"is '{model[:50]}'; known models: {known}")])
+    assert params is not None
+    values = params.model_params or []
+    if len(values) != len(names):
+        fault = f"has {len(values)} items, {model} needs {len(names)}: {', '.join(names)}"
+        raise InvalidRequestError([(f"{_READING}.params.modelParams", fault)])
+    stated = dict(zip(names, values, strict=True))
+    if "f" in stated:
+        stated["fx"] = stated["fy"] = stated.pop("f")
+    return {"projection": "fisheye" if model == "OPENCV_FISHEYE" else "perspective", "intrinsics": stated}
 
 
 def without_picture(request: OscpRequest) -> OscpRequest:

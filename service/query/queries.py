@@ -17,8 +17,11 @@ from service.schemas import (
     LocaliseAnswer,
     LocaliseForm,
     ModelAnswer,
+    PhotographForm,
     SequenceAnswer,
     SequenceForm,
+    SessionDocument,
+    StoredPose,
 )
 from service.storage.records import PlanRecord, VenueRecord
 from service.uploaded_file import UploadedFile
@@ -103,6 +106,35 @@ class SequenceQuery:
     context: QueryContext
 
 
+@dataclass(frozen=True, eq=False)
+class TrackQuery:
+    """Photograph of a session.
+
+    Attributes:
+        session_id: id of the session.
+        document: the request that began the session.
+        state: state after the photographs before; None for the first.
+        form: the validated form fields.
+        content: the uploaded picture file.
+        context: client, deadline and clock.
+    """
+
+    session_id: str
+    document: SessionDocument
+    state: bytes | None
+    form: PhotographForm
+    content: bytes | UploadedFile
+    context: QueryContext
+
+
+@dataclass(frozen=True)
+class TrackOutcome:
+    """State of a session after a photograph, and the stored part of its answer."""
+
+    state: bytes
+    stored: StoredPose
+
+
 @dataclass(frozen=True, kw_only=True)
 class PictureRequest:
     """Requested drawing of an answer.
@@ -156,6 +188,18 @@ class VenueLocaliserBackend(Protocol):
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
         """See `VenueLocaliser.check_hints`."""
+        ...
+
+
+class TrackerBackend(Protocol):
+    """Tracking in one plan; `SessionTracker` implements and documents it."""
+
+    async def check(self, record: PlanRecord, document: SessionDocument) -> None:
+        """See `SessionTracker.check`."""
+        ...
+
+    async def track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+        """See `SessionTracker.track`."""
         ...
 
 

@@ -12,26 +12,29 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.hints import HintName, Hints, Near, rooms_named
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.stated_camera import KnownHeading
-from lalaloc_core.panorama.images import Panorama
+from lalaloc_core.photograph import View
 from service.grids import check_height_m
-from service.schemas import LocaliseForm, StatedHeading
+from service.schemas import LocaliseForm, PhotographForm, SessionDocument, StatedHeading
 from service.schemas.query_fields import CameraFields, EarthPoint, HintFields, PlanPoint
 from service.storage.records import PlanRecord
 
 
 def known_heading(
-    form: LocaliseForm | StatedHeading, north: float | None, panorama: Panorama, compass_tolerance_deg: float
+    form: LocaliseForm | StatedHeading | PhotographForm,
+    north: float | None,
+    view: View,
+    compass_tolerance_deg: float,
 ) -> KnownHeading:
-    """Return the heading in the request, else the panorama's compass heading if `north` is known, else none.
+    """Return the heading in the request, else the photograph's compass heading if `north` is known, else none.
 
     Args:
         form: fields of the request.
         north: azimuth of true north (radians) in the plan; None where unknown.
-        panorama: the decoded panorama with its metadata.
+        view: the decoded photograph with its metadata.
         compass_tolerance_deg: tolerance (degrees) of the compass heading.
     """
     return stated_camera.known_heading(
-        north, form.heading_deg, form.heading_tolerance_deg, panorama.compass_heading, compass_tolerance_deg
+        north, form.heading_deg, form.heading_tolerance_deg, view.compass_heading, compass_tolerance_deg
     )
 
 
@@ -46,7 +49,7 @@ def stated_height(form: CameraFields, record: PlanRecord) -> CameraHeight:
     return stated_camera.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
 
 
-def stated_hints(form: HintFields, plan: FloorPlan) -> Hints:
+def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:
     """Return the hints of a request, before `Hints.check`.
 
     Raises:
@@ -56,7 +59,7 @@ def stated_hints(form: HintFields, plan: FloorPlan) -> Hints:
     if form.near is not None and form.radius_m is not None:
         near = _near_in_plan(form.near, form.radius_m, plan)
     rooms = None if form.rooms is None else rooms_named(plan, form.rooms)
-    return Hints(near=near, rooms=rooms, strict=form.strict)
+    return Hints(near=near, rooms=rooms, strict=isinstance(form, HintFields) and form.strict)
 
 
 def _near_in_plan(point: PlanPoint | EarthPoint, radius_m: float, plan: FloorPlan) -> Near:

@@ -18,8 +18,8 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
@@ -31,6 +31,7 @@ from service.query.answers import Place, compose_answer
 from service.query.decoding import Decoder
 from service.query.geopose import plan_anchor
 from service.query.localiser import Localiser
+from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import PanoramaQuery, QueryContext
 from service.query.stated_camera import known_heading
 from service.query.venue_hints import VenueHints
@@ -96,7 +97,7 @@ class VenueLocaliser:
         *,
         settings: Settings,
         bundle: Bundle,
-        encoders: Encoders,
+        encoder: PhotographEncoder,
         plans: VenuePlans,
         localiser: Localiser,
         decoder: Decoder,
@@ -104,26 +105,26 @@ class VenueLocaliser:
     ) -> None:
         self._settings = settings
         self._bundle = bundle
-        self._encoders = encoders
+        self._encoder = encoder
         self._plans = plans
         self._localiser = localiser
         self._decoder = decoder
         self._queries = queries
 
     async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
-        """Localise a panorama in the plans of a venue.
+        """Localise a photograph in the plans of a venue.
 
         Raises:
             VenueUnsearchableError: the venue has no plans, or all of them failed.
             VenueNotReadyError: no plan of the venue was ready by the deadline.
             LaLaLocError: see `Localiser.localise`.
         """
-        return await self._localise(venue, query, partial(self._plans.members, venue.id))
+        return await self._localise(venue, query, partial(self._plans.members, venue.tenant, venue.id))
 
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
-        """Localise a panorama in the tenant's anchored plans within `within_m` of a place on Earth.
+        """Localise a photograph in the tenant's anchored plans within `within_m` of a place on Earth.
 
         Raises:
             NoPlanNearbyError: no such plan exists.
@@ -152,7 +153,7 @@ class VenueLocaliser:
         Raises:
             InvalidHintError: a hint does not match the venue.
         """
-        VenueHints.from_form(form, venue.anchor).check(await self._plans.members(venue.id))
+        VenueHints.from_form(form, venue.anchor).check(await self._plans.members(venue.tenant, venue.id))
 
     async def _localise(self, venue: VenueRecord, query: PanoramaQuery, read_plans: ReadPlans) -> LocaliseAnswer:
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
@@ -164,14 +165,15 @@ class VenueLocaliser:
         form, context, clock = query.form, query.context, query.context.clock
         hints = VenueHints.from_form(form, venue.anchor)
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(query.content, context.deadline, context.client)
+            view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
-        known = known_heading(form, north, panorama, self._settings.panoramas.compass_tolerance_deg)
+        known = known_heading(form, north, view, self._settings.panoramas.compass_tolerance_deg)
         with clock.stage("wait"):
             ready, warnings = await self._ready(venue, read_plans, hints, context)
         height = venue_height(form, ready)
         compute = partial(self._localiser.compute, context)
-        encoded = (await compute(lambda: self._localiser.encode([panorama], [known], height, clock)))[0]
+        photograph = Photograph(view)
+        encoded = (await compute(partial(encode, self._encoder, [photograph], [known], height, clock)))[0]
         with clock.stage("shortlist"):
             searched = await self._searched(
                 venue, ready, encoded, form=form, hints=hints, warnings=warnings, compute=compute
@@ -179,7 +181,7 @@ class VenueLocaliser:
         steps = localise_steps(
             searched.merged.plan,
             searched.merged.grid,
-            self._encoders,
+            self._encoder.networks,
             encoded,
             refine=form.refine,
             top_k=form.top_k,
@@ -199,6 +201,7 @@ class VenueLocaliser:
             timings_ms=timings_ms,
             bundle=self._bundle,
             share=share,
+            view=partial(view_answer, photograph, plan=searched.merged.plan, grid=searched.merged.grid),
         )
         plans = self._plan_probabilities(searched, found, share, probability)
         return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
@@ -246,8 +249,9 @@ class VenueLocaliser:
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
-            known, plan_index = await self._plans.index(possible, compute)
-            weights, log_prior = self._encoders.manifest.evidence, hints.log_prior(known, shares)
+            known, plan_index = await self._plans.index(venue.tenant, possible, compute)
+            weights = self._encoder.networks.manifest.evidence_for(view=query.is_view)
+            log_prior = hints.log_prior(known, shares)
             chosen = await compute(partial(self._plans.choose, known, plan_index, query, weights, log_prior))
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
@@ -284,7 +288,7 @@ class VenueLocaliser:
         self, searched: _Searched, found: Localisation, share: float, probability: Float[np.ndarray, "m"]
     ) -> list[PlanProbability]:
         """Return the searched plans, most probable first; `_Searched.shares` gives `share` and `probability`."""
-        confidence = found.confidence(self._bundle.manifest.confidence, share)
+        confidence = found.confidence(self._bundle.manifest.confidence_for(view=found.query.is_view), share)
         return [
             PlanProbability(
                 floorplan_id=searched.rows[number].plan_id,

@@ -32,6 +32,7 @@ from service.query.prototype_file import BlockKey, PrototypeFile
 from service.schemas import EarthPoint, LocaliseForm
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
+from service.storage.plan_lookup import parsed
 from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord, VenueState
 from service.telemetry import LOGGER_NAME
@@ -127,16 +128,16 @@ class VenuePlans:
         self._file: PrototypeFile | None = None
         self._building = threading.Lock()
 
-    async def members(self, venue_id: str) -> Sequence[Row[Any]]:
+    async def members(self, tenant: str, venue_id: str) -> Sequence[Row[Any]]:
         """Return the current row of every plan of a venue."""
-        return await self._reads.run(self._members, venue_id)
+        return await self._reads.run(tenant, self._members, venue_id)
 
     async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
         """Return rows of the tenant's anchored plans within `within_m` of a place, nearest first."""
         latitude, longitude = place.latitude, place.longitude
         reach_m = within_m + _MAX_REACH_M
         near = self._store.venues.searchable_plans_near
-        rows = await self._reads.run(near, tenant, latitude, longitude, reach_m, *self._grids.model)
+        rows = await self._reads.run(tenant, near, tenant, latitude, longitude, reach_m, *self._grids.model)
         distance_m = distances_m(rows, None, latitude, longitude)
         order = np.argsort(distance_m, kind="stable")
         unique = {rows[int(k)].plan_id: rows[int(k)] for k in order if distance_m[k] <= within_m}
@@ -146,12 +147,15 @@ class VenuePlans:
         """Tell whether the plans are too many, or too large, to search all of them in full."""
         return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > most_poses(query, self._max_poses)
 
-    async def index(self, ready: Sequence[Row[Any]], compute: Compute) -> tuple[Sequence[Row[Any]], PlanIndex]:
+    async def index(
+        self, tenant: str, ready: Sequence[Row[Any]], compute: Compute
+    ) -> tuple[Sequence[Row[Any]], PlanIndex]:
         """Return the index of plans that are ready, and their rows in its order, without plans whose grid was deleted.
 
         Prototypes that are missing, or of an earlier format, are made and stored.
 
         Args:
+            tenant: their owner.
             ready: rows of the plans.
             compute: runs CPU work.
         """
@@ -159,7 +163,7 @@ class VenuePlans:
         indexed = self._indices.get(digest)
         if indexed is None:
             found = await compute(partial(self._in_file, ready))
-            fresh = await self._fetched([row for row in ready if _key(row) not in found])
+            fresh = await self._fetched(tenant, [row for row in ready if _key(row) not in found])
             place = np.array([k for k, row in enumerate(ready) if _key(row) in found or _key(row) in fresh], np.intp)
             if not len(place):
                 # All were deleted or replaced just now; a retry finds the current ones.
@@ -168,7 +172,7 @@ class VenuePlans:
             index = await compute(partial(self._indexed, there, fresh))
             if index is None:
                 # The file has no room for all of them, so this index keeps them in memory.
-                fresh |= await self._fetched([row for row in there if _key(row) not in fresh])
+                fresh |= await self._fetched(tenant, [row for row in there if _key(row) not in fresh])
                 index = await compute(partial(self._in_memory, there, fresh))
             indexed = _Indexed(place, index)
             self._indices.put(digest, indexed)
@@ -200,9 +204,11 @@ class VenuePlans:
         """Return chosen plans with their pose grids, without those that were deleted or replaced meanwhile."""
         loaded = []
         for row in members:
-            record = await self._reads.run(self._store.plans.get_revision, tenant, row.plan_id, row.revision_id)
+            plans = self._store.plans
+            found = await self._reads.run(tenant, plans.find, tenant, row.plan_id, row.revision_id)
+            record = await parsed(found, plans, self._reads)
             key = self._grids.key(row.revision_id, row.camera_height_m)
-            grid = self._grids.cached(key) or await self._reads.run(self._grids.find, key)
+            grid = self._grids.cached(key) or await self._reads.run(tenant, self._grids.find, key)
             if record is not None and grid is not None:
                 loaded.append((row, record, grid))
         return loaded
@@ -226,17 +232,17 @@ class VenuePlans:
         with self._building:
             return self._opened().find(_key(row) for row in ready)
 
-    async def _fetched(self, rows: Sequence[Row[Any]]) -> dict[BlockKey, SortedPrototypes]:
+    async def _fetched(self, tenant: str, rows: Sequence[Row[Any]]) -> dict[BlockKey, SortedPrototypes]:
         """Return prototypes of plans from the database; missing ones are made from the stored grids."""
         fetched: dict[BlockKey, SortedPrototypes] = {}
         for first in range(0, len(rows), _BATCH_SIZE):
             part = rows[first : first + _BATCH_SIZE]
-            stored = await self._reads.run(self._store.grids.prototypes, [row.grid_id for row in part])
+            stored = await self._reads.run(tenant, self._store.grids.prototypes, [row.grid_id for row in part])
             for row in part:
                 prototypes = stored.get(row.grid_id)
                 if prototypes is None:
                     key = self._grids.key(row.revision_id, row.camera_height_m)
-                    prototypes = await self._reads.run(self._grids.make_prototypes, key, row.grid_id)
+                    prototypes = await self._reads.run(tenant, self._grids.make_prototypes, key, row.grid_id)
                 if prototypes is not None:
                     fetched[_key(row)] = prototypes
         return fetched

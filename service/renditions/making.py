@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from lalaloc_core.draw.plan import draw_rooms
+import json
+
+from lalaloc_core.draw.plan import bounds_with, draw_rooms
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from service.errors import DamagedDataError
@@ -32,7 +34,15 @@ def make_rendition(stored: StoredPlan, kind: RenditionKind, step_m: float) -> Re
         )
     if kind == "description":
         return describe(plan, stored, step_m)
+    if kind == "preview":
+        no_room = no_room_of(stored.report)
+        return Rendition(draw_rooms(plan, no_room).encode(), bounds_with(plan.bounds_m, no_room))
     return Rendition(_content(plan, stored, kind), plan.bounds_m)
+
+
+def no_room_of(report: str | None) -> list[list[list[float]]]:
+    """Return the areas that became no room from an import report; none from those of earlier versions."""
+    return [] if report is None else json.loads(report).get("no_room", [])
 
 
 def _content(plan: FloorPlan, stored: StoredPlan, kind: RenditionKind) -> bytes:

@@ -16,6 +16,8 @@ from service.routes import (
     plan_events,
     plan_files,
     plan_layout,
+    session_stream,
+    sessions,
     venues,
 )
 
@@ -30,6 +32,8 @@ ROUTERS = tuple(
         venues,
         localise,
         localise_sequence,
+        sessions,
+        session_stream,
         geopose,
         kept_answers,
         health,

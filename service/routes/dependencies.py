@@ -79,7 +79,7 @@ async def venue_for_query(tenant: str, venue_id: str, runtime: Runtime) -> Venue
         UnknownVenueError: no such venue.
         StoreUnavailableError: the database is away or busy.
     """
-    record = await runtime.reads.run(runtime.store.venues.get, tenant, venue_id) if is_id(venue_id) else None
+    record = await runtime.reads.run(tenant, runtime.store.venues.get, tenant, venue_id) if is_id(venue_id) else None
     if record is None:
         raise UnknownVenueError(venue_id)
     return record

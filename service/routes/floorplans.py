@@ -62,10 +62,10 @@ _MAX_LISTED = 500
 async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Store a floor plan from a plan file.
 
-    The format is detected from the content: JSON in the native format, GeoJSON, an IMDF archive, SVG, DXF, IFC, PDF, or
-    a picture. `import_report` tells how the file was read; a plan read from a picture is a draft, so check it before
-    use. A small plan is `ready` at once; the pose grid of a larger plan is computed in the background (see `status`,
-    `progress` and `/events`).
+    The format is detected from the content: JSON in the native format, GeoJSON, an IMDF archive, OpenStreetMap, a
+    RoomPlan scan, SVG, DXF, IFC, PDF, or a picture. `import_report` tells how the file was read; a plan read from a
+    picture is a draft, so check it before use. A small plan is `ready` at once; the pose grid of a larger plan is
+    computed in the background (see `status`, `progress` and `/events`).
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /floorplans")
     uploaded = await read_upload(request, runtime)

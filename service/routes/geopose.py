@@ -25,6 +25,7 @@ from service.http.request_end import on_request_end
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.query import PanoramaQuery, QueryContext
 from service.query.oscp import (
+    camera_fields,
     compose_oscp_answer,
     decode_picture,
     distance_to_plan_m,
@@ -49,7 +50,7 @@ _MAX_VALUES = 100_000
 
 @router.post(
     "/geopose",
-    summary="Localise a panorama by the OSCP GeoPose protocol",
+    summary="Localise a photograph by the OSCP GeoPose protocol",
     response_model=OscpAnswer,
     openapi_extra={
         "requestBody": {
@@ -78,7 +79,7 @@ async def geopose(
 ) -> Response:
     """Localise a device on Earth, for AR clients of the GeoPose protocol, version 2 (`GeoPoseReq`, `GeoPoseResp`).
 
-    The single camera reading is a panorama. Without `floorplan_id` and `venue_id`, all floor plans with an `anchor`
+    The single camera reading is a photograph. Without `floorplan_id` and `venue_id`, all floor plans with an `anchor`
     within the accuracy of the geolocation reading (100 m if it has none) are searched. With one of them, the reading is
     a hint. The plan, or its venue, needs an `anchor`.
     """
@@ -125,6 +126,7 @@ class _Query:
         self._content = content
         self._context = context
         reading = parsed.geolocation
+        self._camera = camera_fields(parsed)
         self._place = None if reading is None else reading_place(reading)
 
     async def localise(self, floorplan_id: str | None, venue_id: str | None) -> tuple[LocaliseAnswer, list[str]]:
@@ -172,7 +174,7 @@ class _Query:
         return PanoramaQuery(form, self._content, self._context)
 
     def _form(self, **about: str) -> LocaliseForm:
-        form = LocaliseForm.model_validate(about)
+        form = LocaliseForm.model_validate(about | self._camera)
         return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.panoramas.max_top_k)})
 
 

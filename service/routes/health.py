@@ -15,7 +15,7 @@ router = APIRouter(tags=["operations"])
 
 
 @router.get("/healthz", summary="Check liveness")
-async def healthz() -> HealthAnswer:
+async def get_health() -> HealthAnswer:
     """Return `ok` while the process runs."""
     return HealthAnswer(status="ok")
 
@@ -30,7 +30,7 @@ async def healthz() -> HealthAnswer:
         }
     },
 )
-async def readyz(runtime: Annotated[Runtime, Depends(get_runtime)], response: Response) -> ReadyAnswer:
+async def get_readiness(runtime: Annotated[Runtime, Depends(get_runtime)], response: Response) -> ReadyAnswer:
     """Return 200 once the model and all workers are ready, and 503 before that and while the service stops.
 
     Replacing a worker later does not make the service unready: queries wait, or keep the VDR pose.
@@ -54,7 +54,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(get_runtime)], response: Re
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-async def metrics(runtime: Annotated[Runtime, Depends(get_runtime)]) -> Response:
+async def get_metrics(runtime: Annotated[Runtime, Depends(get_runtime)]) -> Response:
     """Return all metrics in Prometheus' text format."""
     # A coroutine, because it takes milliseconds and must work when every thread is busy.
     return Response(runtime.telemetry.render(), media_type=CONTENT_TYPE_LATEST)

@@ -16,7 +16,7 @@ router = APIRouter(tags=["operations"])
 
 
 @router.get("/limits", summary="Get the limits")
-async def limits(runtime: Running) -> LimitsAnswer:
+async def get_limits(runtime: Running) -> LimitsAnswer:
     """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
     # Resolved, because 0 leaves these numbers to the service.
@@ -30,7 +30,7 @@ async def limits(runtime: Running) -> LimitsAnswer:
 
 
 @router.get("/usage", summary="Get the tenant's usage", responses=problem_responses(StoreUnavailableError))
-def usage(runtime: Running, tenant: Tenant, client: Client) -> UsageAnswer:
+def get_usage(runtime: Running, tenant: Tenant, client: Client) -> UsageAnswer:
     """Return what the tenant of the API key uses, with its limits."""
     account = runtime.store.quota.account(tenant)
     stored = StoredBytesAnswer(

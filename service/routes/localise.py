@@ -1,4 +1,4 @@
-"""Queries: localise a panorama in a floor plan or a venue."""
+"""Queries: localise a photograph in a floor plan or a venue."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from service.http.uploads import GEOJSON, JSON, MULTIPART, media_type
 from service.query import PanoramaQuery, PictureRequest
 from service.query.geopose import geojson_feature
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
-from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import add_log_fields
@@ -38,26 +38,26 @@ _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-
 _VARY = {"Vary": "Accept"}
 
 
-_PANORAMA_SCHEMA = {
+_PHOTO_SCHEMA = {
     "type": "string",
     "format": "binary",
-    "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or a "
-    "part of it, described by its photo sphere metadata (GPano in XMP).",
+    "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° panorama, twice as wide as "
+    "high, or a part of it with photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an "
+    "ordinary photograph, a fisheye photograph or a phone's panorama. Its EXIF metadata state the field of view.",
 }
 
 
 @router.post(
     "/localise",
-    summary="Localise a panorama",
+    summary="Localise a photograph",
     response_model=LocaliseAnswer,
-    openapi_extra=body_schema(LocaliseForm, _PANORAMA_SCHEMA),
+    openapi_extra=body_schema(LocaliseForm, _PHOTO_SCHEMA),
     responses={
         200: {
-            "content": {
-                GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
-                _PNG: {"schema": {"type": "string", "format": "binary"}},
-                _SVG: {"schema": {"type": "string"}},
-            }
+            # Pictures are not listed under `content`, which would make the type of an answer in generated clients a
+            # union with strings.
+            "description": f"The answer; with `Accept: {_PNG}` or `Accept: {_SVG}`, its picture.",
+            "content": {GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}}},
         }
     }
     | problem_responses(
@@ -83,7 +83,7 @@ async def localise(
         ),
     ] = None,
 ) -> Response:
-    """Localise a panorama in a stored floor plan, or in the plans of a venue.
+    """Localise a photograph in a stored floor plan, or in the plans of a venue.
 
     With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
     application/geo+json` it is a GeoJSON Feature on Earth, for plans and venues with an `anchor`.
@@ -98,7 +98,7 @@ async def localise(
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
     form, parts, context = await read_query(
-        request, runtime.settings, client, LocaliseForm, "max_panorama_bytes", files={PANORAMA}
+        request, runtime.settings, client, LocaliseForm, "max_panorama_bytes", files={PHOTO}
     )
     if form.venue_id is not None and media in (_PNG, _SVG):
         raise InvalidRequestError(
@@ -106,7 +106,7 @@ async def localise(
         )
 
     async def respond() -> Response:
-        query = PanoramaQuery(form, parts.files[PANORAMA], context)
+        query = PanoramaQuery(form, parts.files[PHOTO], context)
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
@@ -168,7 +168,7 @@ async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
 
     keep = partial(runtime.store.answers.add, limit=runtime.settings.storage.max_kept_answers)
     try:
-        return texts[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
+        return texts[await runtime.reads.run(tenant, keep, tenant, answer.floorplan_id, with_id) or ""]
     except (StoreUnavailableError, StorageQuotaError):
         # The answer is valid although it could not be kept.
         return texts[""]

@@ -1,4 +1,4 @@
-"""Queries with several panoramas of one visit."""
+"""Queries with several photographs of one visit."""
 
 from __future__ import annotations
 
@@ -16,51 +16,52 @@ from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, media_type
 from service.query import SequenceQuery
 from service.query.geopose import geojson_features
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query
-from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.schemas import SequenceAnswer, SequenceForm
 from service.settings import Settings
 from service.telemetry import add_log_fields
 from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
-_MIN_PANORAMAS = 2
-_PANORAMAS_SCHEMA: dict[str, Any] = {
+_MIN_PHOTOGRAPHS = 2
+_PHOTOS_SCHEMA: dict[str, Any] = {
     "type": "array",
     "items": {"type": "string", "format": "binary"},
-    "minItems": _MIN_PANORAMAS,
-    "description": "Panoramas in the order in which they were taken, one part named `panorama` each, as for "
+    "minItems": _MIN_PHOTOGRAPHS,
+    "description": "Photographs in the order in which they were taken, one part named `photo` each, as for "
     "`POST /localise`; limits: `max_sequence_panoramas`, and `max_sequence_bytes` together.",
 }
 
 
 @router.post(
     "/localise/sequence",
-    summary="Localise several panoramas of one visit",
+    summary="Localise several photographs of one visit",
     response_model=SequenceAnswer,
-    openapi_extra=body_schema(SequenceForm, _PANORAMAS_SCHEMA),
+    openapi_extra=body_schema(SequenceForm, _PHOTOS_SCHEMA),
     responses={
         200: {"content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}}}
     }
     | problem_responses(InvalidMotionError, UnanchoredPlanError, *QUERY_ERRORS),
 )
 async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Localise several panoramas of one visit together in a stored floor plan.
+    """Localise several photographs of one visit together in a stored floor plan.
 
-    Measured motions between them resolve places that look alike. With `Accept: application/geo+json` the answer is a
-    GeoJSON FeatureCollection with one Feature per panorama, for plans with an `anchor`. The query waits for a plan that
-    is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls back to the best path on the
-    pose grid, with `"stage": "retrieval"`.
+    Measured motions between them resolve places that look alike. Photographs that were taken while turning on one spot
+    (`motion=turn`) are together as certain as one with a wider field of view; send `relative_heading_deg` if it is
+    known. With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection, one Feature per photograph,
+    for plans with an `anchor`. The query waits for a plan that is still preparing. If pose refinement (`lpo`) is not
+    done in time, the answer falls back to the best path on the pose grid, with `"stage": "retrieval"`.
     """
     settings = runtime.settings
     media = preferred(request, (JSON, GEOJSON))
     check_idempotent_media(request, media)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
     media_type(request, (MULTIPART,))
-    repeated = {PANORAMA: (_MIN_PANORAMAS, settings.panoramas.max_sequence_panoramas)}
+    repeated = {PHOTO: (_MIN_PHOTOGRAPHS, settings.panoramas.max_sequence_panoramas)}
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )
-    query = SequenceQuery(form, _panoramas(parts, form, settings), context)
+    query = SequenceQuery(form, _photographs(parts, form, settings), context)
 
     async def respond() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
@@ -75,14 +76,14 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     return await idempotent.run_async(parts, respond, runtime.reads)
 
 
-def _panoramas(parts: Parts, form: SequenceForm, settings: Settings) -> list[UploadedFile]:
-    """Return the panoramas in order.
+def _photographs(parts: Parts, form: SequenceForm, settings: Settings) -> list[UploadedFile]:
+    """Return the photographs in order.
 
     Raises:
-        UploadTooLargeError: a panorama is larger than allowed.
-        InvalidRequestError: fields that do not fit the number of panoramas.
+        UploadTooLargeError: a photograph is larger than allowed.
+        InvalidRequestError: fields that do not fit the number of photographs.
     """
-    contents = parts.repeated(PANORAMA)
+    contents = parts.repeated(PHOTO)
     largest = max(len(content) for content in contents)
     if largest > settings.panoramas.max_panorama_bytes:
         raise UploadTooLargeError("max_panorama_bytes", settings.panoramas.max_panorama_bytes, largest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -19,7 +19,7 @@ from service.errors import (
     UnanchoredPlanError,
     UnknownFloorPlanError,
 )
-from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer
+from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary
@@ -45,29 +45,28 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
     openapi_extra=_CONDITIONAL,
     responses={
         200: {
-            "content": {
-                JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}},
-                "*/*": {"schema": {"type": "string", "format": "binary"}},
-            }
+            # Bytes, even of a JSON plan: generated clients must not parse what was uploaded.
+            "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}
         },
         **NOT_MODIFIED,
         **_PROBLEMS,
     },
 )
-def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def get_original(
+    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
+) -> Response:
     """Return the uploaded file of the current revision, unchanged, with the media type of its content."""
-    plans = runtime.store.plans
-    current = plan_summary(tenant, floorplan_id, plans)
-    add_log_fields(request, plan=current.id, revision=current.revision_id)
-    digest = plans.original_digest(current.revision_id)
+    plan, originals = await _look(request, tenant, floorplan_id, runtime), runtime.store.originals
+    digest = await run_in_threadpool(originals.digest, plan.revision_id)
     if digest is not None and (answer := not_modified(request, digest_etag(digest))) is not None:
         return answer
-    original = plans.original(tenant, current.id)
+    original = await run_in_threadpool(originals.checked, plan.revision_id)
     if digest is None or original is None:
         raise UnknownFloorPlanError(floorplan_id)
     # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
-    return tagged_answer([original.content], original.media_type, digest_etag(digest), kept)
+    chunks = _chunks(plan, original.size_bytes, request, runtime, client)
+    return tagged_stream(chunks, original.size_bytes, original.media_type, digest_etag(digest), kept)
 
 
 @router.get(
@@ -153,10 +152,10 @@ async def get_preview(
     plan = await _look(request, tenant, floorplan_id, runtime)
     # Defence in depth: the drawing has no scripts.
     policy = {"Content-Security-Policy": "default-src 'none'"}
-    etag = revision_etag(plan.revision_id, "drawing", marker)
+    etag = revision_etag(plan.revision_id, "preview", marker)
     if (answer := not_modified(request, etag, policy)) is not None:
         return answer
-    rooms = await runtime.renditions.get(plan.id, plan.revision_id, "drawing", client)
+    rooms = await runtime.renditions.get(plan.id, plan.revision_id, "preview", client)
     if marker is not None:
         _check_near(marker, rooms.bounds_m)
     head, tail = svg_around(plan.name, rooms.bounds_m, marker)
@@ -180,6 +179,24 @@ async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant
     """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
     plan = await _look(request, tenant, floorplan_id, runtime)
     return await _rendition(request, plan, "mesh", _GLB, runtime, client)
+
+
+async def _chunks(
+    plan: PlanSummary, size_bytes: int, request: Request, runtime: Runtime, client: str
+) -> AsyncIterator[bytes]:
+    """Yield the uploaded file, until the client has gone.
+
+    Raises:
+        UnknownFloorPlanError: the revision was deleted meanwhile, so that the connection ends before the answer.
+    """
+    sent_bytes = number = 0
+    while sent_bytes < size_bytes and not await request.is_disconnected():
+        async with runtime.admission.reading.held(client):
+            chunk = await run_in_threadpool(runtime.store.originals.chunk, plan.revision_id, number)
+        if chunk is None:
+            raise UnknownFloorPlanError(plan.id)
+        yield chunk
+        sent_bytes, number = sent_bytes + len(chunk), number + 1
 
 
 async def _look(request: Request, tenant: str, floorplan_id: str, runtime: Runtime) -> PlanSummary:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fastapi import Request
+from pydantic import BaseModel
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
 from lalaloc_core.importers import ImportOptions
@@ -27,7 +28,7 @@ from service.errors import (
 )
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 from service.runtime import Runtime
-from service.schemas import ImportForm
+from service.schemas import ImportForm, LevelsForm
 from service.threads import Threads
 from service.uploaded_file import UploadedFile
 
@@ -38,6 +39,7 @@ _FILES = (
     "application/geo+json",
     "application/zip",
     "application/pdf",
+    "application/xml",
     "image/svg+xml",
     "image/png",
     "image/jpeg",
@@ -66,13 +68,14 @@ REFUSED_UPLOADS = (
 )
 
 
-def _form_schema() -> dict[str, Any]:
-    schema = ImportForm.model_json_schema()
+def _form_schema(form: type[BaseModel]) -> dict[str, Any]:
+    schema = form.model_json_schema()
     schema["properties"][_FILE] = {
         "type": "string",
         "format": "binary",
-        "description": "GeoJSON, an IMDF archive, SVG, DXF, IFC (also zipped), PDF, PNG, JPEG, or JSON in the native "
-        "format (FloorPlanDocument). The format is detected from the content.",
+        "description": "GeoJSON, an IMDF archive, OpenStreetMap (XML or Overpass JSON), a RoomPlan scan, SVG, DXF, IFC "
+        "(also zipped), PDF, PNG, JPEG, or JSON in the native format (FloorPlanDocument). The format is detected from "
+        "the content.",
     }
     schema["required"] = [_FILE]
     return schema
@@ -83,10 +86,12 @@ UPLOAD_BODY: dict[str, Any] = {
     "required": True,
     "content": {
         JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}},
-        MULTIPART: {"schema": _form_schema()},
+        MULTIPART: {"schema": _form_schema(ImportForm)},
         **dict.fromkeys(_FILES[1:], _BYTES),
     },
 }
+# Form of an operation that takes a file with all its levels.
+LEVELS_FORM: dict[str, Any] = {"schema": _form_schema(LevelsForm)}
 
 
 @dataclass(frozen=True)
@@ -107,8 +112,13 @@ class PlanUpload:
         return runtime.uploads if seems_native(self.file) else runtime.file_uploads
 
 
-async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:
+async def read_upload(request: Request, runtime: Runtime, form: type[BaseModel] = ImportForm) -> PlanUpload:
     """Read the file in a request, with its options.
+
+    Args:
+        request: the request.
+        runtime: the service.
+        form: known options.
 
     Raises:
         UnsupportedMediaError: the media type is not that of a plan file.
@@ -118,7 +128,7 @@ async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:
     limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
     if media_type(request, (MULTIPART, *_FILES)) != MULTIPART:
         return PlanUpload(await read_body(request, limits), ImportOptions(), {})
-    known = set(ImportForm.model_fields)
+    known = set(form.model_fields)
     parts = await read_parts(request, limits, files={_FILE}, fields=known, check=_faults)
     return PlanUpload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
 

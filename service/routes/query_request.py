@@ -1,4 +1,4 @@
-"""Common parts of queries: the multipart form with its panoramas, and the errors."""
+"""Common parts of queries: the multipart form with its photographs, and the errors."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
 from service.http.uploads import JSON, MULTIPART, Parts, Settable, UploadLimits, faults_of, read_parts, validate_fields
 from service.query import QueryContext
 from service.routes.dependencies import IDEMPOTENCY_KEY
-from service.schemas import LocaliseForm, SequenceForm
+from service.schemas import LocaliseForm, PhotographForm, SequenceForm
 from service.settings import Settings
 from service.telemetry import add_log_fields
 
+PHOTO = "photo"
+# Name of the part in versions up to 0.5.
 PANORAMA = "panorama"
-Form = TypeVar("Form", LocaliseForm, SequenceForm)
+Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
 # Errors of a query.
 QUERY_ERRORS: tuple[type[Exception], ...] = (
     InvalidPanoramaError,
@@ -64,13 +66,16 @@ QUERY_ERRORS: tuple[type[Exception], ...] = (
 )
 
 
-def body_schema(form: type[BaseModel], panorama: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the description of a query's body, given its form and the schema of its panoramas."""
+def body_schema(form: type[BaseModel], photo: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the description of a query's body, given its form and the schema of its photographs."""
     schema = form.model_json_schema(ref_template="#/components/schemas/{model}")
     # `http.api_description` adds these schemas.
     schema.pop("$defs", None)
-    schema["properties"][PANORAMA] = dict(panorama)
-    schema["required"] = [*schema.get("required", []), PANORAMA]
+    schema["properties"][PHOTO] = dict(photo)
+    schema["properties"][PANORAMA] = {**photo, "description": f"Earlier name of `{PHOTO}`.", "deprecated": True}
+    # Either name is accepted. Only the current one is described as required, because of alternatives generated clients
+    # make a union of types.
+    schema["required"] = [*schema.get("required", []), PHOTO]
     body = {"required": True, "content": {MULTIPART: {"schema": schema}}}
     return {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]}
 
@@ -124,9 +129,10 @@ async def read_query(
             fields=set(form_type.model_fields),
             check=partial(faults_of, form_type, context=bounds),
             repeated=repeated or {},
+            aliases={PANORAMA: PHOTO},
         )
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)
-    if "top_k" not in form.model_fields_set:
+    if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
         form = form.model_copy(update={"top_k": min(form.top_k, settings.panoramas.max_top_k)})
     return form, parts, context

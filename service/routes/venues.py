@@ -20,6 +20,7 @@ from service.errors import (
     StorageQuotaError,
     StoreFullError,
     StoreUnavailableError,
+    TooManyFloorPlansError,
     TooManyVenuesError,
     UnknownVenueError,
     UnsupportedMediaError,
@@ -31,7 +32,7 @@ from service.http.conditional import expected_revision, not_modified, tagged_ans
 from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
 from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
+from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
@@ -43,9 +44,12 @@ from service.routes.dependencies import (
     Tenant,
     is_id,
 )
+from service.routes.plan_uploads import LEVELS_FORM, REFUSED_UPLOADS, read_upload
 from service.routes.venue_answers import plan_entries, venue_representation, venue_summary
+from service.routes.venue_levels import store_venue_of_levels
 from service.runtime import Runtime
 from service.schemas import (
+    LevelsForm,
     VenueAnchorDocument,
     VenueAnswer,
     VenueChangeDocument,
@@ -81,22 +85,40 @@ def _body(model: type[BaseModel]) -> dict[str, Any]:
     return {"required": True, "content": {JSON: {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}}}
 
 
+_NEW_VENUE = _body(VenueDocument)
+_NEW_VENUE["content"][MULTIPART] = LEVELS_FORM
+
+
 @router.post(
     "",
     status_code=status.HTTP_201_CREATED,
     summary="Create a venue",
     response_model=VenueAnswer,
-    openapi_extra={"requestBody": _body(VenueDocument), "parameters": [IDEMPOTENCY_KEY]},
+    openapi_extra={"requestBody": _NEW_VENUE, "parameters": [IDEMPOTENCY_KEY]},
     responses=problem_responses(
-        *_REFUSED_BODIES, TooManyVenuesError, IdempotencyKeyReusedError, IdempotencyInProgressError
+        *REFUSED_UPLOADS,
+        TooManyFloorPlansError,
+        TooManyVenuesError,
+        IdempotencyKeyReusedError,
+        IdempotencyInProgressError,
     ),
 )
 async def create_venue(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Group stored floor plans, each on a level, so that one query searches all of them.
+    """Group floor plans, each on a level, so that one query searches all of them.
 
-    A plan can belong to several venues. Deleting a plan removes it from its venues.
+    A JSON body lists stored plans. A form has a plan file of any format: every level with rooms becomes a plan, and all
+    of them a venue, or nothing is stored. A plan can belong to several venues. Deleting a plan removes it from its
+    venues.
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /venues")
+    if media_type(request, (JSON, MULTIPART)) == MULTIPART:
+        uploaded = await read_upload(request, runtime, LevelsForm)
+
+        def store_levels(token: str) -> Response:
+            record = store_venue_of_levels(uploaded, runtime, tenant, client, token)
+            return _written(request, record, runtime, status.HTTP_201_CREATED)
+
+        return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store_levels)
     content = await _read(request, runtime)
 
     def store(token: str) -> Response:

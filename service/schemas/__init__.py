@@ -10,6 +10,7 @@ query_fields     form fields that queries share
 localise_query   form of a query
 localise_answer  its answer
 sequence         queries with several panoramas
+sessions         sessions of tracked cameras
 oscp             queries of AR clients
 venues           groups of floor plans
 service_state    limits, health, readiness
@@ -42,7 +43,7 @@ from service.schemas.native_plan import (
     RoomType,
     Segment,
 )
-from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, LevelAnswer
+from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, LevelAnswer, LevelsForm
 from service.schemas.problem_details import Fault, Problem
 from service.schemas.query_fields import EarthPoint, PlanPoint
 from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading, StatedMotion
@@ -55,6 +56,15 @@ from service.schemas.service_state import (
     StoredBytesAnswer,
     StoredBytesByKind,
     UsageAnswer,
+)
+from service.schemas.sessions import (
+    PathPoint,
+    PhotographForm,
+    RivalAnswer,
+    SessionAnswer,
+    SessionDocument,
+    StoredPose,
+    TrackedPoseAnswer,
 )
 from service.schemas.stored_plans import (
     BoundsAnswer,
@@ -102,6 +112,7 @@ __all__ = [
     "LayerAnswer",
     "LayoutAnswer",
     "LevelAnswer",
+    "LevelsForm",
     "LimitsAnswer",
     "LocaliseAnswer",
     "LocaliseForm",
@@ -109,6 +120,8 @@ __all__ = [
     "OpeningDocument",
     "OpeningFaceAnswer",
     "OpeningKind",
+    "PathPoint",
+    "PhotographForm",
     "PlanEvent",
     "PlanPoint",
     "PlanProbability",
@@ -121,6 +134,7 @@ __all__ = [
     "ReadyAnswer",
     "ResponseModel",
     "Ring",
+    "RivalAnswer",
     "RoomAnswer",
     "RoomDocument",
     "RoomLayoutAnswer",
@@ -129,11 +143,15 @@ __all__ = [
     "SequenceAnswer",
     "SequenceForm",
     "SequencePoseAnswer",
+    "SessionAnswer",
+    "SessionDocument",
     "StatedHeading",
     "StatedMotion",
     "StoredBytesAnswer",
     "StoredBytesByKind",
+    "StoredPose",
     "TimingsAnswer",
+    "TrackedPoseAnswer",
     "UsageAnswer",
     "VenueAnchorAnswer",
     "VenueAnchorDocument",

@@ -21,6 +21,8 @@ SquareMetres = Annotated[float, _rounded(3)]
 Variance = Annotated[float, _rounded(6)]
 HeadingDeg = Annotated[float, AfterValidator(lambda value: round(value, 2) % 360.0)]
 Degrees = Annotated[float, Field(ge=0), _rounded(2)]
+# An angle of either sign.
+SignedDegrees = Annotated[float, _rounded(2)]
 Milliseconds = Annotated[float, _rounded(2)]
 # Progress and probabilities, from 0 to 1.
 Share = Annotated[float, Field(ge=0, le=1), _rounded(4)]

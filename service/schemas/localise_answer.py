@@ -1,4 +1,4 @@
-"""Answer to a query: the pose of a panorama, in the plan and on Earth."""
+"""Answer to a query: the pose of a photograph, in the plan and on Earth."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from service.schemas.fields import (
     Variance,
 )
 from service.schemas.localise_query import HEADING_MEANING
+from service.schemas.photographs import ViewAnswer
 
 
 class GeoPosePosition(ResponseModel):
@@ -35,7 +36,7 @@ class GeoPoseAngles(ResponseModel):
     """Rotations about up, north and east in degrees; all are 0 for a level camera facing north."""
 
     yaw: float = Field(gt=-180, le=180, description="Counterclockwise from north, seen from above.")
-    pitch: float = Field(description="Always 0: panoramas are level.")
+    pitch: float = Field(description="Always 0: the pose is that of a level camera.")
     roll: float = Field(description="Always 0.")
 
 
@@ -126,7 +127,7 @@ class ModelAnswer(ResponseModel):
 
 
 class LocaliseAnswer(ResponseModel):
-    """Pose of a panorama."""
+    """Pose of a photograph."""
 
     floorplan_id: str = Field(description="Plan of the position.")
     floorplan_revision: str = Field(description="Revision of the plan that was searched.")
@@ -147,6 +148,12 @@ class LocaliseAnswer(ResponseModel):
     )
     heading_confidence: Share | None = Field(
         description="Probability that the heading is right within 5°; null if `confidence` is null."
+    )
+    probability_elsewhere: Share | None = Field(
+        default=None,
+        description="Probability that the panorama is of none of the places of the plan (of a venue: of the plans that "
+        "were searched). It sums to 1 with the probabilities of the candidates and of all places that are near no "
+        "candidate. Null if `confidence` is null.",
     )
     warnings: list[str] = Field(
         description="Parts of the request that were not followed, such as a hint that the panorama contradicts."
@@ -176,6 +183,11 @@ class LocaliseAnswer(ResponseModel):
     geopose: GeoPose | None = Field(None, description=_GEOPOSE)
     posterior: PosteriorAnswer | None = Field(
         default=None, description="Posterior over all places; null unless requested with `include`."
+    )
+    view: ViewAnswer | None = Field(
+        default=None,
+        description="Assumptions about the photograph, and how much it could tell; null in answers that "
+        "version 0.5 kept.",
     )
     timings_ms: TimingsAnswer
     model: ModelAnswer

@@ -8,13 +8,14 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
 from service.schemas.fields import Finite
+from service.schemas.photographs import ViewFields
 from service.schemas.query_fields import CameraFields, HintFields
 
-HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
+HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
 
 
-class LocaliseForm(CameraFields, HintFields):
-    """Form fields of a query, without the panorama; an empty field counts as left out."""
+class LocaliseForm(CameraFields, HintFields, ViewFields):
+    """Form fields of a query, without the photograph; an empty field counts as left out."""
 
     venue_id: str | None = Field(None, min_length=1, description="Id of a venue, to search all its plans.")
     floorplan_id: str | None = Field(
@@ -27,7 +28,7 @@ class LocaliseForm(CameraFields, HintFields):
         None,
         ge=-360,
         le=360,
-        description=f"The {HEADING_MEANING}. Default: the heading in the panorama's metadata "
+        description=f"The {HEADING_MEANING}. Default: the heading in the photograph's metadata "
         "(`GPano:PoseHeadingDegrees`) if the plan has `north_deg`; else all headings are searched.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
@@ -76,6 +77,7 @@ class LocaliseForm(CameraFields, HintFields):
     @field_validator("heading_tolerance_deg")
     @classmethod
     def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
-        if given.data.get("heading_deg", 0.0) is None:
+        # Generated clients send defaults too.
+        if value > 0.0 and given.data.get("heading_deg", 0.0) is None:
             raise ValueError("needs heading_deg")
         return value

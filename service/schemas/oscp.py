@@ -1,7 +1,7 @@
 """Requests and answers of the GeoPose protocol, version 2, of the Open Spatial Computing Platform (OSCP).
 
 Names are the protocol's. Other members of the protocol, and of later versions of it, are accepted and ignored: privacy
-(panoramas are never kept), sizes (the picture has its own), sequence numbers, rigs.
+(photographs are never kept), sizes (the picture has its own), sequence numbers, rigs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class OscpSensor(_Sent):
 
 
 class OscpImageOrientation(_Sent):
-    """Orientation of the stored picture; a panorama must be upright, or say otherwise in its EXIF data."""
+    """Orientation of the stored picture; it must be upright, or say otherwise in its EXIF data."""
 
     mirrored: bool = False
     rotation: float = 0.0
@@ -38,18 +38,27 @@ class OscpImageOrientation(_Sent):
 class OscpCameraParam(_Sent):
     """Parameters of the camera."""
 
-    model: str | None = Field(None, description="`UNKNOWN`, `EQUIRECTANGULAR` or left out; other models are refused.")
+    model: str | None = Field(
+        None,
+        description="`EQUIRECTANGULAR`, or a camera with `modelParams`: `SIMPLE_PINHOLE` (f, cx, cy), `PINHOLE` (fx, "
+        "fy, cx, cy), `SIMPLE_RADIAL` (f, cx, cy, k1), `RADIAL` (f, cx, cy, k1, k2), `OPENCV` (fx, fy, cx, cy, k1, k2, "
+        "p1, p2) or `OPENCV_FISHEYE` (fx, fy, cx, cy, k1, k2, k3, k4). `UNKNOWN` or left out: as `projection=auto` of "
+        "`POST /localise`.",
+    )
+    model_params: Annotated[list[Annotated[float, Finite]], Field(max_length=12)] | None = Field(
+        None, description="Parameters of `model`, pixels of the upright picture, in the order above."
+    )
 
 
 class OscpCameraReading(_Sent):
-    """Panorama, as in `POST /localise`."""
+    """Photograph, as in `POST /localise`."""
 
     timestamp: Annotated[float, Finite]
     sensor_id: str
     image_format: str = Field(
         description="Such as `JPG`; the actual format is detected from the picture. `DEPTH` is refused."
     )
-    image_bytes: str = Field(min_length=1, description="JPEG, PNG or WebP file in Base64.")
+    image_bytes: str = Field(min_length=1, description="JPEG, PNG, WebP or HEIC file in Base64.")
     image_orientation: OscpImageOrientation | None = None
     params: OscpCameraParam | None = None
 

@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.schemas.fields import ResponseModel
 
 
-class ImportForm(BaseModel):
-    """Form fields beside the plan file; an empty field counts as left out."""
+class _FileOptions(BaseModel):
+    """Options of every import."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -24,7 +24,6 @@ class ImportForm(BaseModel):
     known_distance: str | None = Field(
         None, description="Two points of the drawing and their distance: `x0,y0,x1,y1,metres`."
     )
-    level: str | None = Field(None, description="Name or number of the storey to read, for files with several.")
     layers: str | None = Field(
         None, description="Layers, groups or classes to read, separated by commas; case is ignored."
     )
@@ -35,7 +34,24 @@ class ImportForm(BaseModel):
     ceiling_height_m: float | None = Field(
         None, ge=1, le=20, description="Ceiling height of rooms without one in the file. Default: 2.5 m."
     )
+
+
+class ImportForm(_FileOptions):
+    """Form fields beside the plan file; an empty field counts as left out."""
+
+    level: str | None = Field(None, description="Name or number of the storey to read, for files with several.")
     name: str | None = Field(None, max_length=200, description="Name of the plan.")
+
+
+class LevelsForm(_FileOptions):
+    """Form fields beside a plan file whose levels become a venue; an empty field counts as left out."""
+
+    name: str | None = Field(
+        None,
+        max_length=200,
+        description="Name of the venue, which also begins the names of several plans: `Duplex – Level 1`. Default: the "
+        "name of the file.",
+    )
 
 
 class LayerAnswer(ResponseModel):
@@ -66,3 +82,8 @@ class ImportReport(ResponseModel):
     notes: list[str] = Field(description="Steps taken.")
     warnings: list[str] = Field(description="Likely mistakes, also in the plan's `warnings`.")
     unsure: list[str] = Field(description="Guesses and assumptions.")
+    no_room: list[list[tuple[float, float]]] = Field(
+        default=[],
+        description="Outlines (m) of areas inside the drawn walls of a picture that became no room, the largest first; "
+        "marked in `preview.svg`.",
+    )

@@ -1,9 +1,11 @@
-"""Form fields and answer of a query with several panoramas of one visit."""
+"""Form fields and answer of a query with several photographs of one visit."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
@@ -12,15 +14,20 @@ from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
+from service.schemas.photographs import ViewAnswer, ViewFields
 from service.schemas.query_fields import CameraFields
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
 AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
 _UNKNOWN = Motion()
+# Phones move about the person who turns.
+_ON_THE_SPOT_STD_M = 0.15
+# Deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
+_EXACT_DEG = 5.0
 
 
 class StatedMotion(BaseModel):
-    """Measured motion from one panorama to the next; leave out what was not measured."""
+    """Measured motion from one photograph to the next; leave out what was not measured."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -38,14 +45,14 @@ class StatedMotion(BaseModel):
         description="Standard deviation of `distance_m`.",
     )
     turn_deg: Angle | None = Field(
-        None, description="Heading of the second panorama minus that of the first, clockwise seen from above."
+        None, description="Heading of the second photograph minus that of the first, clockwise seen from above."
     )
     turn_std_deg: AngleStd = Field(
         round(math.degrees(_UNKNOWN.turn_std), 6), description="Standard deviation of `turn_deg`."
     )
     direction_deg: Angle | None = Field(
         None,
-        description="Azimuth from the first place to the second minus the heading of the first panorama. Needs "
+        description="Azimuth from the first place to the second minus the heading of the first photograph. Needs "
         "`distance_m`.",
     )
     direction_std_deg: AngleStd = Field(
@@ -73,25 +80,42 @@ class StatedMotion(BaseModel):
 
 
 class StatedHeading(BaseModel):
-    """Given heading of one panorama."""
+    """Given heading of one photograph."""
 
     heading_deg: float | None
     heading_tolerance_deg: float
 
 
-class SequenceForm(CameraFields):
-    """Form fields of a query with several panoramas; an empty field counts as left out."""
+class SequenceForm(CameraFields, ViewFields):
+    """Form fields of a query with several photographs; an empty field counts as left out.
+
+    The fields about the camera hold for all photographs.
+    """
 
     floorplan_id: str = Field(min_length=1, description="Id of the floor plan.")
+    motion: Literal["walk", "turn"] = Field(
+        "walk",
+        description="`walk`: each photograph has a place of its own, see `motions`. `turn`: all were taken from one "
+        "spot, see `relative_heading_deg`.",
+    )
+    relative_heading_deg: list[Angle | None] | None = Field(
+        None,
+        description="For `turn`: headings of all photographs relative to each other, clockwise seen from above, as a "
+        "JSON array with one angle per photograph, such as `[0, 62, 118]` by a gyroscope. Null, or no list: unknown, "
+        "and searched.",
+    )
+    relative_heading_std_deg: AngleStd = Field(
+        2.0, description="Standard deviation of the angle between two photographs by `relative_heading_deg`."
+    )
     motions: list[StatedMotion | None] | None = Field(
         None,
-        description="Motions between successive panoramas as a JSON array, one fewer than panoramas; null for a motion "
-        "that was not measured. Without motions, the panoramas share the plan and the camera height only.",
+        description="Motions between successive photographs as a JSON array, one fewer than photographs; null for a "
+        "motion that was not measured. Without motions, the photographs share the plan and the camera height only.",
     )
     headings_deg: list[Angle | None] | None = Field(
         None,
-        description="Headings of all panoramas as a JSON array, null for an unknown heading; see `heading_deg` of "
-        "`POST /localise`. Default: the headings in the panoramas' metadata, else unknown.",
+        description="Headings of all photographs as a JSON array, null for an unknown heading; see `heading_deg` of "
+        "`POST /localise`. Default: the headings in the photographs' metadata, else unknown.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
         0.0, ge=0, le=45, description="Tolerance of `headings_deg`. Needs `headings_deg`."
@@ -100,7 +124,7 @@ class SequenceForm(CameraFields):
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
     )
 
-    @field_validator("motions", "headings_deg", mode="before")
+    @field_validator("motions", "headings_deg", "relative_heading_deg", mode="before")
     @classmethod
     def _parse_array(cls, value: object) -> object:
         if not isinstance(value, str):
@@ -113,7 +137,7 @@ class SequenceForm(CameraFields):
             raise ValueError("not a JSON array")
         return found
 
-    @field_validator("heading_tolerance_deg", mode="before")
+    @field_validator("heading_tolerance_deg", "relative_heading_std_deg", mode="before")
     @classmethod
     def _reject_underscores(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
@@ -123,32 +147,70 @@ class SequenceForm(CameraFields):
     @field_validator("heading_tolerance_deg")
     @classmethod
     def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
-        if given.data.get("headings_deg", ()) is None:
+        if value > 0.0 and given.data.get("headings_deg", ()) is None:
             raise ValueError("needs headings_deg")
         return value
 
-    def faults(self, panoramas: int) -> list[tuple[str, str]]:
-        """Return (field, message) for fields that do not fit the number of panoramas."""
-        wanted = {"motions": (self.motions, panoramas - 1), "headings_deg": (self.headings_deg, panoramas)}
+    @field_validator("relative_heading_deg")
+    @classmethod
+    def _check_relative(cls, value: object, given: ValidationInfo) -> object:
+        if value is not None and given.data.get("motion") == "walk":
+            raise ValueError("needs motion=turn")
+        return value
+
+    @field_validator("motions")
+    @classmethod
+    def _check_motions(cls, value: object, given: ValidationInfo) -> object:
+        if value is not None and given.data.get("motion") == "turn":
+            raise ValueError("does not go with motion=turn; send relative_heading_deg")
+        return value
+
+    def faults(self, photographs: int) -> list[tuple[str, str]]:
+        """Return (field, message) for fields that do not fit the number of photographs."""
+        wanted = {
+            "motions": (self.motions, photographs - 1),
+            "headings_deg": (self.headings_deg, photographs),
+            "relative_heading_deg": (self.relative_heading_deg, photographs),
+        }
         return [
-            (name, f"has {len(given)} items, {panoramas} panoramas need {count}")
+            (name, f"has {len(given)} items, {photographs} photographs need {count}")
             for name, (given, count) in wanted.items()
             if given is not None and len(given) != count
         ]
 
-    def steps(self, panoramas: int) -> list[Motion]:
-        """Return the motions between the panoramas, unknown ones included."""
-        given = self.motions or [None] * (panoramas - 1)
+    def steps(self, photographs: int) -> list[Motion]:
+        """Return the motions between the photographs, unknown ones included."""
+        if self.motion == "turn":
+            relative = self.relative_heading_deg or [None] * photographs
+            return [self._turn(*pair) for pair in itertools.pairwise(relative)]
+        given = self.motions or [None] * (photographs - 1)
         return [_UNKNOWN if motion is None else motion.motion for motion in given]
 
+    @property
+    def known_turns(self) -> list[float] | None:
+        """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
+        given = [] if self.motion == "walk" else self.relative_heading_deg or []
+        known = [angle for angle in given if angle is not None]
+        if not known or len(known) < len(given) or self.relative_heading_std_deg > _EXACT_DEG:
+            return None
+        return [math.radians(angle - known[0]) for angle in known]
+
+    def _turn(self, first_deg: float | None, second_deg: float | None) -> Motion:
+        """Return the motion between two photographs from one spot."""
+        on_the_spot = Motion(distance_m=0.0, distance_std_m=_ON_THE_SPOT_STD_M)
+        if first_deg is None or second_deg is None:
+            return on_the_spot
+        std = math.radians(self.relative_heading_std_deg)
+        return replace(on_the_spot, turn=math.radians(second_deg - first_deg), turn_std=std)
+
     def heading_of(self, index: int) -> StatedHeading:
-        """Return the given heading of a panorama."""
+        """Return the given heading of a photograph."""
         heading_deg = None if self.headings_deg is None else self.headings_deg[index]
         return StatedHeading(heading_deg=heading_deg, heading_tolerance_deg=self.heading_tolerance_deg)
 
 
 class SequencePoseAnswer(ResponseModel):
-    """Pose of one panorama, from all panoramas together; fields as in the answer of `POST /localise`."""
+    """Pose of one photograph, from all photographs together; fields as in the answer of `POST /localise`."""
 
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360)
@@ -157,31 +219,33 @@ class SequencePoseAnswer(ResponseModel):
     room_id: str
     confidence: Share | None
     heading_confidence: Share | None
+    probability_elsewhere: Share | None = None
     warnings: list[str]
     covariance_m2: Covariance | None
     heading_std_deg: Degrees | None
     cost: Score
     latent_distance: Score
     geopose: GeoPose | None = None
+    view: ViewAnswer | None = None
     candidates: list[CandidateAnswer] = Field(
         description="Poses on the best paths, best path first; the first is the answer."
     )
 
 
 class SequenceAnswer(ResponseModel):
-    """Poses of the panoramas of one visit."""
+    """Poses of the photographs of one visit."""
 
     floorplan_id: str
     floorplan_revision: str = Field(description="Revision of the plan that was searched.")
-    poses: list[SequencePoseAnswer] = Field(description="Poses, one per panorama, in the order sent.")
+    poses: list[SequencePoseAnswer] = Field(description="Poses, one per photograph, in the order sent.")
     confidence: Share | None = Field(
         description="Probability that all positions are right within 1 m: the probability of the path among all paths, "
-        "times the lowest probability that a panorama shows this plan. Null for a model without confidence."
+        "times the lowest probability that a photograph shows this plan. Null for a model without confidence."
     )
     warnings: list[str] = Field(
-        description="Motions in the request that were ignored, because the panoramas contradict them."
+        description="Motions in the request that were ignored, because the photographs contradict them."
     )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
-    camera_height_m: Metres = Field(description="Camera height that fits all panoramas best.")
+    camera_height_m: Metres = Field(description="Camera height that fits all photographs best.")
     timings_ms: TimingsAnswer
     model: ModelAnswer

@@ -63,6 +63,7 @@ class StoredBytesByKind(ResponseModel):
     grids: int = Field(description="Pose grids.")
     venues: int = Field(description="Venues.")
     answers: int = Field(description="Kept answers.")
+    sessions: int = Field(description="Sessions of tracked cameras.")
     idempotency: int = Field(description="Idempotency keys and their answers.")
 
 

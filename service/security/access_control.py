@@ -69,7 +69,7 @@ class AccessControl:
             HTTPException: unknown route or method.
         """
         if not self._needs_keys:
-            self._check_local(request)
+            self._check_local(request, request.method)
             return anyone(_client_of(request))
         is_read = request.method in ("GET", "HEAD")
         if is_read and is_page(routed_path(request.scope)) and "authorization" not in request.headers:
@@ -99,7 +99,19 @@ class AccessControl:
         except StoreUnavailableError:
             return False
 
-    def _check_local(self, request: Request) -> None:
+    def check_handshake(self, request: Request) -> None:
+        """Refuse an authorised handshake of a WebSocket if a page of another site made it.
+
+        Pages can read the answers of other sites' WebSockets, so the rules are those of changes. Browsers do not send
+        keys with a handshake.
+
+        Raises:
+            ExposedWithoutKeysError: the handshake comes from a page of another site.
+        """
+        if not self._needs_keys:
+            self._check_local(request, "POST")
+
+    def _check_local(self, request: Request, method: str) -> None:
         """Refuse requests from other machines and from pages of other sites.
 
         Raises:
@@ -111,7 +123,7 @@ class AccessControl:
         # Only proxies use Unix sockets, and they pass on the host name that their clients use.
         if server is not None and server[1] is not None:
             headers = Headers(scope=request.scope)
-            check_origin(request.method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
+            check_origin(method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
 
     async def _key_of(self, request: Request) -> ApiKey:
         values = Headers(scope=request.scope).getlist("authorization")

@@ -59,6 +59,10 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("POST", "/localise"): Permission.LOCALISE,
     ("POST", "/localise/sequence"): Permission.LOCALISE,
     ("POST", "/geopose"): Permission.LOCALISE,
+    ("POST", "/sessions"): Permission.LOCALISE,
+    ("GET", "/sessions/{session_id}"): Permission.LOCALISE,
+    ("DELETE", "/sessions/{session_id}"): Permission.LOCALISE,
+    ("POST", "/sessions/{session_id}/photographs"): Permission.LOCALISE,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
 _PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]

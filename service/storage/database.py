@@ -45,6 +45,7 @@ Result = TypeVar("Result")
 _MAX_STEPS, _PAUSE_S = 40, 0.12
 _WRITER = "lalaloc_writer"
 _SQLITE_WAIT_MS = 5000
+_WRITE_AHEAD, _PRAGMA_PAUSE_S = "journal_mode=WAL", 0.02
 # Time limits of the server, so that a stuck statement or lock never holds a connection for good.
 _STATEMENT_MS, _LOCK_MS, _IDLE_MS = 30_000, 10_000, 60_000
 # Tolerance (s) between two readings of the clock, for waiting on a lock or a corrected clock in between.
@@ -145,8 +146,11 @@ class Database:
         with self.writing() as connection:
             return work(connection)
 
-    def give_back(self) -> None:
+    def give_back(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
         """Return free space of an SQLite file to the disk, in short transactions, and restore the reserve.
+
+        Args:
+            is_stopped: asked before each transaction; when it is true, the rest stays for the next call.
 
         Raises:
             StoreUnavailableError, StoreBusyError: see `reading`.
@@ -155,7 +159,7 @@ class Database:
             return
         with self._driver_cursor() as cursor:
             for _ in range(_MAX_STEPS):
-                if not disk.has_surplus(cursor):
+                if is_stopped() or not disk.has_surplus(cursor):
                     break
                 try:
                     disk.return_pages(cursor)
@@ -284,15 +288,32 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     pragmas = (
         f"busy_timeout={_SQLITE_WAIT_MS}",
         "auto_vacuum=INCREMENTAL",
-        "journal_mode=WAL",
+        _WRITE_AHEAD,
         f"journal_size_limit={LOG_BYTES}",
         "foreign_keys=ON",
         "synchronous=NORMAL",
         "secure_delete=FAST",
     )
     for pragma in pragmas:
-        cursor.execute(f"PRAGMA {pragma}")
+        _set_pragma(cursor, pragma)
     cursor.close()
+
+
+def _set_pragma(cursor: sqlite3.Cursor, pragma: str) -> None:
+    """Set a pragma, and wait for the lock of a new file.
+
+    While several connections switch one new file to its write-ahead log, SQLite refuses all but one at once, whatever
+    `busy_timeout` is.
+    """
+    deadline = time.monotonic() + _SQLITE_WAIT_MS / 1000
+    while True:
+        try:
+            cursor.execute(f"PRAGMA {pragma}")
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorname != "SQLITE_BUSY" or pragma != _WRITE_AHEAD or time.monotonic() > deadline:
+                raise
+        time.sleep(_PRAGMA_PAUSE_S)
 
 
 def _begin_sqlite(connection: Connection) -> None:

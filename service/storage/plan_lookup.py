@@ -6,6 +6,7 @@ from time import monotonic
 
 from service.errors import StoreBusyError, StoreUnavailableError
 from service.storage.circuit_breaker import CircuitBreaker
+from service.storage.plans import FoundPlan, Plans
 from service.storage.records import PlanRecord
 from service.storage.store import Store
 from service.threads import BoundedReads
@@ -25,44 +26,31 @@ class PlanLookup:
         self._max_age_s = max_age_s
         self._breaker = CircuitBreaker()
 
-    def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """Return a plan at its current revision, or at the last known one while the database is unavailable.
-
-        Raises:
-            StoreUnavailableError: the database is unavailable, and the plan was not read recently.
-            StoreBusyError: all connections are in use.
-        """
-        if (known := self._during_outage(tenant, plan_id)) is not None:
-            return known
-        try:
-            return self._store.plans.get(tenant, plan_id)
-        except StoreBusyError:
-            # The database answers, so the plan may have been deleted.
-            raise
-        except StoreUnavailableError as error:
-            return self._despite(error, tenant, plan_id)
-
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
-        """Return a plan as `get` does, without blocking on a silent database.
+        """Return a plan at its current revision, or at the last known one while the database is unavailable.
 
         Args:
             tenant: owner of the plan.
             plan_id: id of the plan.
-            reads: threads for reads of the database.
+            reads: threads for reads of the database, which may be silent.
 
         Raises:
-            StoreUnavailableError: see `get`; or too many reads wait already.
+            StoreUnavailableError: the database is unavailable, and the plan was not read recently; or too many reads
+                wait already.
+            StoreBusyError: all connections are in use.
+            DamagedDataError: the plan's document is damaged.
         """
         if (known := self._during_outage(tenant, plan_id)) is not None:
             return known
         begin_s = monotonic()
         try:
-            return await reads.run(self.get, tenant, plan_id)
+            found = await reads.run(tenant, self._store.plans.find, tenant, plan_id)
         except StoreUnavailableError as error:
-            if self._store.answered_since(begin_s):
+            if isinstance(error, StoreBusyError) or self._store.answered_since(begin_s):
                 # The database answers, so the plan may have been deleted.
                 raise
             return self._despite(error, tenant, plan_id)
+        return await parsed(found, self._store.plans, reads)
 
     def _during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """Return a recently read plan from memory if the database failed a moment ago."""
@@ -81,3 +69,14 @@ class PlanLookup:
 
     def _recent(self, tenant: str, plan_id: str) -> PlanRecord | None:
         return self._store.plan_cache.recent(tenant, plan_id, self._max_age_s)
+
+
+async def parsed(found: FoundPlan | None, plans: Plans, reads: BoundedReads) -> PlanRecord | None:
+    """Parse a plan that was read, on a thread of its tenant if it is not in memory.
+
+    Raises:
+        DamagedDataError: its document is damaged.
+    """
+    if found is None or found.is_parsed:
+        return None if found is None else plans.record(found)
+    return await reads.process(found.row.tenant, plans.record, found)

@@ -2,64 +2,46 @@
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import uuid
 from collections.abc import Callable, Collection
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, true, update
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M
-from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.single_flight import SingleFlight
 from service.storage.database import Database
-from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_cache import PlanCache
-from service.storage.plan_places import place_columns
-from service.storage.records import JSON, ComputedGrid, Cursor, GridKey, Original, PlanRecord, PlanSummary
-from service.storage.statements import newest_first, read_chunks, select_summaries, write_chunks
+from service.storage.plan_rows import (
+    PlanContent,
+    count_plans,
+    insert_plan,
+    insert_revision,
+    new_record,
+    revision_values,
+)
+from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
+from service.storage.statements import damaged, newest_first, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.stored_grids import grid_bytes, insert_grid
-from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
-from service.storage.venues import remove_from_venues
+from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
+from service.storage.venue_rows import remove_from_venues
 from service.stored_plan import PlanDocument, StoredPlan
-from service.telemetry import LOGGER_NAME
 
 
 @dataclass(frozen=True)
-class _Content:
-    """Documents, file and grid of a new revision, prepared before the transaction."""
-
-    document: PlanDocument
-    original: Original
-    original_sha256: str
-    grid: tuple[GridKey, PackedGrid] | None
-
-    @classmethod
-    def prepare(
-        cls, record: PlanRecord, original: Original, document: PlanDocument | None, grid: ComputedGrid | None
-    ) -> _Content:
-        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
-        document = document or PlanDocument.from_plan(record.plan)
-        return cls(document, original, hashlib.sha256(original.content).hexdigest(), packed)
-
-    @property
-    def stored(self) -> StoredBytes:
-        texts = (self.document.document, self.document.warnings, self.original.report)
-        # The texts are ASCII.
-        plan = ROW_BYTES + sum(len(text or "") for text in texts) + len(self.original.content)
-        return StoredBytes(plans=plan, grids=0 if self.grid is None else grid_bytes(self.grid[1]))
-
-
-@dataclass(frozen=True)
-class _StoredPlan:
+class FoundPlan:
     """Row of a plan with the plan itself if it is in memory, otherwise with its document."""
 
     row: Row[Any]
     plan: FloorPlan | PlanDocument
+    is_current: bool
+
+    @property
+    def is_parsed(self) -> bool:
+        """True if the plan is in memory."""
+        return isinstance(self.plan, FloorPlan)
 
 
 class Plans:
@@ -77,6 +59,7 @@ class Plans:
         self._cache = cache
         self._quota = quota
         self._parse: Callable[[PlanDocument], FloorPlan | None] = PlanDocument.plan
+        self._parsing = SingleFlight[str, FloorPlan | None]()
 
     def parse_with(self, parse: Callable[[PlanDocument], FloorPlan | None]) -> None:
         """Set the function that parses documents; it returns None for a damaged one."""
@@ -113,27 +96,24 @@ class Plans:
             StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
-        record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
-        content = _Content.prepare(record, original, document, grid)
+        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
+        content = PlanContent.prepare(record, original, document, grid)
         with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
-                if _count(connection, tenant) >= limit:
+                if count_plans(connection, tenant) >= limit:
                     raise TooManyFloorPlansError(limit)
                 self._quota.check(connection, tenant, content.stored.total + later_bytes)
-                values = {"id": plan_id, "tenant": tenant, "created_at": now, **_revision_values(record)}
-                statement = self._database.insert(FLOORPLANS).values(values).on_conflict_do_nothing()
-                if connection.scalar(statement.returning(FLOORPLANS.c.id)) is None:
-                    # Another attempt of the same upload was faster.
-                    stored = self._find(connection, _select_current(tenant, plan_id))
-                else:
-                    _insert_revision(connection, record, content)
+                if insert_plan(connection, self._database, record, content):
                     self._quota.settle(connection, tenant, content.stored)
                     # Exact now, because settling locks the tenant.
-                    if _count(connection, tenant) > limit:
+                    if count_plans(connection, tenant) > limit:
                         raise TooManyFloorPlansError(limit)
+                else:
+                    # Another attempt of the same upload was faster.
+                    stored = self._find(connection, _select_current(tenant, plan_id))
         if stored is not None:
-            record = self._record(stored)
+            record = self.record(stored)
         self._cache.put(record)
         return record
 
@@ -171,8 +151,8 @@ class Plans:
             StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
-        record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
-        content = _Content.prepare(record, original, document, grid)
+        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
+        content = PlanContent.prepare(record, original, document, grid)
         with self._database.writing(grows_by=content.stored.total) as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -186,29 +166,48 @@ class Plans:
             freed = _delete_revisions(connection, own, grids_before=number - 1, before=number - keep + 1)
             change = content.stored - freed
             self._quota.check(connection, tenant, change.total + later_bytes)
-            _insert_revision(connection, record, content)
-            connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_revision_values(record)))
+            insert_revision(connection, record, content)
+            connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**revision_values(record)))
             self._quota.settle(connection, tenant, change)
         self._cache.put(record)
         return record
 
-    def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """Return a plan at its current revision."""
-        record = self._get(_select_current(tenant, plan_id))
-        if record is None:
+    def find(self, tenant: str, plan_id: str, revision_id: str | None = None) -> FoundPlan | None:
+        """Return a plan for `record`, at its current or another stored revision."""
+        if revision_id is not None:
+            own = REVISIONS.c.id == revision_id, FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant
+            return self._read(_select_heads(current=False).where(*own))
+        found = self._read(_select_current(tenant, plan_id), current=True)
+        if found is None:
             self._cache.forget(tenant, plan_id)
-        else:
+        return found
+
+    def record(self, found: FoundPlan) -> PlanRecord:
+        """Parse a plan unless it is in memory. This is slow for large plans, and does not touch the database.
+
+        Raises:
+            DamagedDataError: the document is damaged.
+        """
+        row, plan = found.row, found.plan
+        if isinstance(plan, PlanDocument):
+            document = plan
+            plan = self._parsing.run(row.revision_id, lambda: self._parse(document))
+            if plan is None:
+                raise damaged("document", row.id, row.revision_id)
+        record = PlanRecord(**row._mapping, plan=plan)
+        if found.is_current:
             self._cache.put(record)
         return record
 
-    def get_revision(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
-        """Return a plan at any stored revision."""
-        query = _select_heads(current=False).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
-        return self._get(query.where(REVISIONS.c.id == revision_id))
+    def get(self, tenant: str, plan_id: str, revision_id: str | None = None) -> PlanRecord | None:
+        """Return a plan at its current or another stored revision."""
+        found = self.find(tenant, plan_id, revision_id)
+        return None if found is None else self.record(found)
 
     def get_by_revision(self, revision_id: str) -> PlanRecord | None:
         """Return a plan at a revision, regardless of tenant, for work on grids."""
-        return self._get(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
+        found = self._read(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
+        return None if found is None else self.record(found)
 
     def has_revision(self, revision_id: str) -> bool:
         """Tell whether a revision exists, regardless of tenant."""
@@ -239,31 +238,6 @@ class Plans:
             if row is None:
                 return None
             return StoredPlan(**row._mapping, document=_document(connection, revision_id))
-
-    def original_digest(self, revision_id: str) -> str | None:
-        """Return the digest of a revision's uploaded file, regardless of tenant. Callers check access first."""
-        with self._database.reading() as connection:
-            return connection.scalar(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
-
-    def original(self, tenant: str, plan_id: str) -> Original | None:
-        """Return the uploaded file of a plan's current revision.
-
-        Raises:
-            DamagedDataError: the stored file has another digest.
-        """
-        query = (
-            select(REVISIONS.c.id, REVISIONS.c.original_sha256, REVISIONS.c.original_media_type, REVISIONS.c.report)
-            .join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
-            .where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
-        )
-        with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
-            if row is None:
-                return None
-            content = b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": row.id}))
-        if hashlib.sha256(content).hexdigest() != row.original_sha256:
-            raise _damaged("original", plan_id, row.id)
-        return Original(content, row.original_media_type or JSON, row.report)
 
     def any_stored(self) -> bool:
         """Tell whether any tenant has a plan."""
@@ -334,7 +308,10 @@ class Plans:
         connection.execute(select(REVISIONS.c.id).where(own).with_for_update())
         members = remove_from_venues(connection, plan_id)
         answers = deleted_bytes(connection, delete(KEPT_ANSWERS).where(KEPT_ANSWERS.c.plan_id == plan_id))
-        freed = replace(_delete_revisions(connection, own), venues=ROW_BYTES * members, answers=answers)
+        sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.plan_id == plan_id))
+        freed = replace(
+            _delete_revisions(connection, own), venues=ROW_BYTES * members, answers=answers, sessions=sessions
+        )
         connection.execute(delete(FLOORPLANS).where(*mine))
         self._quota.settle(connection, tenant, StoredBytes() - freed)
         return True
@@ -343,106 +320,24 @@ class Plans:
         with self._database.reading() as connection:
             return [PlanSummary(**row._mapping) for row in connection.execute(query)]
 
-    def _get(self, query: Any) -> PlanRecord | None:
+    def _read(self, query: Any, *, current: bool = False) -> FoundPlan | None:
         with self._database.reading() as connection:
-            found = self._find(connection, query)
-        return None if found is None else self._record(found)
+            return self._find(connection, query, current=current)
 
-    def _find(self, connection: Connection, query: Any) -> _StoredPlan | None:
+    def _find(self, connection: Connection, query: Any, *, current: bool = True) -> FoundPlan | None:
         """Return a plan's row; read its document only if the plan is not in memory."""
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
         if (plan := self._cache.plan(row.tenant, row.id, row.revision_id)) is not None:
-            return _StoredPlan(row, plan)
-        return _StoredPlan(row, _document(connection, row.revision_id))
-
-    def _record(self, found: _StoredPlan) -> PlanRecord:
-        """Parse a plan; call it outside of transactions, because it is slow.
-
-        Raises:
-            DamagedDataError: the document is damaged.
-        """
-        row, plan = found.row, found.plan
-        if isinstance(plan, PlanDocument):
-            plan = self._parse(plan)
-            if plan is None:
-                raise _damaged("document", row.id, row.revision_id)
-        return PlanRecord(**row._mapping, plan=plan)
+            return FoundPlan(row, plan, current)
+        return FoundPlan(row, _document(connection, row.revision_id), current)
 
 
 def _document(connection: Connection, revision_id: str) -> PlanDocument:
     columns = REVISIONS.c
     query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == revision_id)
     return PlanDocument(**connection.execute(query).one()._mapping)
-
-
-def _count(connection: Connection, tenant: str) -> int:
-    return connection.scalar(select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)) or 0
-
-
-def _record(
-    plan: FloorPlan,
-    original: Original,
-    *,
-    plan_id: str,
-    tenant: str,
-    number: int,
-    created_at: datetime,
-    updated_at: datetime,
-) -> PlanRecord:
-    return PlanRecord(
-        id=plan_id,
-        tenant=tenant,
-        revision_id=uuid.uuid4().hex,
-        revision=number,
-        created_at=created_at,
-        updated_at=updated_at,
-        plan=plan,
-        failure=None,
-        report=original.report,
-    )
-
-
-def _revision_values(record: PlanRecord) -> dict[str, Any]:
-    """Return the columns of `floorplans` that change with a revision."""
-    name = record.plan.name
-    return {
-        "name": name,
-        "folded_name": name.casefold(),
-        "revision_id": record.revision_id,
-        "updated_at": record.updated_at,
-        **place_columns(record.plan),
-    }
-
-
-def _damaged(part: str, plan_id: str, revision_id: str) -> DamagedDataError:
-    fields = {"floorplan": plan_id, "revision": revision_id}
-    logging.getLogger(LOGGER_NAME).error(f"the stored {part} of a floor plan is damaged", extra={"fields": fields})
-    return DamagedDataError(f"the {part} of floor plan '{plan_id}' at revision '{revision_id}' is damaged")
-
-
-def _insert_revision(connection: Connection, record: PlanRecord, content: _Content) -> None:
-    plan = record.plan
-    values = {
-        "id": record.revision_id,
-        "plan_id": record.id,
-        "number": record.revision,
-        "created_at": record.updated_at,
-        **asdict(content.document),
-        "original_sha256": content.original_sha256,
-        "original_media_type": content.original.media_type,
-        "report": content.original.report,
-        "room_count": len(plan.rooms),
-        "area_m2": plan.area_m2,
-        "camera_height_m": plan.camera_height_m,
-        "camera_height_std_m": _height_std_m(plan),
-        "stored_bytes": content.stored.plans,
-    }
-    connection.execute(REVISIONS.insert(), values)
-    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
-    if content.grid is not None:
-        insert_grid(connection, *content.grid)
 
 
 def _delete_revisions(
@@ -454,13 +349,6 @@ def _delete_revisions(
     grids = deleted_bytes(connection, delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
     dropped = delete(REVISIONS).where(own, true() if before is None else numbers < before)
     return StoredBytes(plans=deleted_bytes(connection, dropped), grids=grids)
-
-
-def _height_std_m(plan: FloorPlan) -> float | None:
-    """Return the standard deviation (m) of a plan's camera height; None for an unknown height."""
-    if plan.camera_height_std_m is not None:
-        return plan.camera_height_std_m
-    return DEFAULT_STD_M if plan.states_camera_height else None
 
 
 def _select_current(tenant: str, plan_id: str) -> Any:

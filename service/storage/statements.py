@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, or_, select
 
+from service.errors import DamagedDataError
 from service.storage.records import Cursor
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS
+from service.telemetry import LOGGER_NAME
 
 # Large values are stored in pieces, so that neither database nor driver handles one of them whole.
 CHUNK_BYTES = 2**20
@@ -70,6 +73,13 @@ def read_exactly(connection: Connection, table: Table, owner: dict[str, Any], si
         content[filled : filled + len(chunk)] = chunk
         filled += len(chunk)
     return content if filled == size_bytes else None
+
+
+def damaged(part: str, plan_id: str, revision_id: str) -> DamagedDataError:
+    """Log that a part of a stored plan is damaged, and return the error."""
+    fields = {"floorplan": plan_id, "revision": revision_id}
+    logging.getLogger(LOGGER_NAME).error(f"the stored {part} of a floor plan is damaged", extra={"fields": fields})
+    return DamagedDataError(f"the {part} of floor plan '{plan_id}' at revision '{revision_id}' is damaged")
 
 
 def select_summaries(*, current: bool = True) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from alembic.migration import MigrationContext
@@ -20,11 +21,14 @@ from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
 from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.kept_answers import KeptAnswers
+from service.storage.originals import Originals
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
+from service.storage.sessions import Sessions
 from service.storage.stored_bytes import StorageQuota
 from service.storage.stored_grids import GridLeases, StoredGrids
 from service.storage.tenants import TenantLimits, Tenants
+from service.storage.venue_imports import VenueImports
 from service.storage.venues import Venues
 
 # Margin (s) of the lease of an idempotency key over the query timeout.
@@ -44,14 +48,17 @@ class Store:
     Every call can raise `StoreUnavailableError`; the next call reconnects.
 
     Attributes:
-        plans: floor plans with revisions and originals.
+        plans: floor plans with revisions.
+        originals: uploaded files of the plans.
         plan_cache: plans in memory.
         venues: venues.
+        venue_imports: venues that are stored together with their plans.
         grids: pose grids.
         leases: leases on the computation of grids.
         idempotency_keys: answers by idempotency key.
         keys: API keys.
         answers: kept answers.
+        sessions: sessions of tracked cameras.
         quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
         tenant_limits: the same limits in memory.
@@ -91,12 +98,15 @@ class Store:
         self.plan_cache = PlanCache(plan_cache_bytes)
         self.quota = StorageQuota(database, stored_bytes)
         self.plans = Plans(database, self.plan_cache, self.quota)
+        self.originals = Originals(database)
         self.venues = Venues(database, self.quota)
+        self.venue_imports = VenueImports(database, self.plan_cache, self.quota)
         self.grids = StoredGrids(database, self.quota)
         self.leases = GridLeases(database)
         self.idempotency_keys = IdempotencyKeys(database, self.quota, claim_s, max_bytes=idempotency_bytes)
         self.keys = ApiKeys(database)
         self.answers = KeptAnswers(database, self.quota)
+        self.sessions = Sessions(database, self.quota, claim_s)
         self.tenants = Tenants(database)
         self.tenant_limits = TenantLimits(self.tenants)
 
@@ -126,9 +136,9 @@ class Store:
         """
         self._database.compact()
 
-    def give_back(self) -> None:
-        """Return free space of an SQLite file to the disk."""
-        self._database.give_back()
+    def give_back(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
+        """Return free space of an SQLite file to the disk, until `is_stopped`."""
+        self._database.give_back(is_stopped)
 
     def close(self) -> None:
         """Close all connections."""

@@ -20,6 +20,7 @@ from service.storage.tables import (
     KEPT_ANSWERS,
     LATENT_GRIDS,
     REVISIONS,
+    SESSIONS,
     TENANTS,
     VENUE_PLANS,
     VENUES,
@@ -38,6 +39,7 @@ class StoredBytes:
         grids: pose grids and prototypes.
         venues: venues and the rows of their plans.
         answers: kept answers.
+        sessions: sessions of tracked cameras.
         idempotency: idempotency keys and their answers.
     """
 
@@ -45,6 +47,7 @@ class StoredBytes:
     grids: int = 0
     venues: int = 0
     answers: int = 0
+    sessions: int = 0
     idempotency: int = 0
 
     @property
@@ -152,7 +155,7 @@ class StorageQuota:
 
     def recount(self) -> None:
         """Count everything again: earlier versions of the service, running beside, change the tables uncounted."""
-        tables = (FLOORPLANS, VENUES, KEPT_ANSWERS, IDEMPOTENCY, TENANTS)
+        tables = (FLOORPLANS, VENUES, KEPT_ANSWERS, SESSIONS, IDEMPOTENCY, TENANTS)
         with self._database.reading() as connection:
             tenants = {name for table in tables for name in connection.scalars(select(table.c.tenant).distinct())}
         for tenant in sorted(tenants):
@@ -201,5 +204,6 @@ def _count(connection: Connection, tenant: str) -> StoredBytes:
         grids=total(func.sum(LATENT_GRIDS.c.stored_bytes), own_grids, of_plan),
         venues=ROW_BYTES * venue_rows,
         answers=total(func.sum(KEPT_ANSWERS.c.stored_bytes), KEPT_ANSWERS, KEPT_ANSWERS.c.tenant),
+        sessions=total(func.sum(SESSIONS.c.stored_bytes), SESSIONS, SESSIONS.c.tenant),
         idempotency=total(func.sum(IDEMPOTENCY.c.stored_bytes), IDEMPOTENCY, IDEMPOTENCY.c.tenant),
     )

@@ -196,7 +196,7 @@ TENANTS = Table(
     # Counters of stored bytes by kind, see `stored_bytes.py`.
     *(
         Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
-        for kind in ("plans", "grids", "venues", "answers", "idempotency")
+        for kind in ("plans", "grids", "venues", "answers", "sessions", "idempotency")
     ),
 )
 
@@ -226,6 +226,31 @@ KEPT_ANSWERS = Table(
     Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
     Index("kept_answers_by_age", "created_at"),
     Index("kept_answers_by_plan", "plan_id"),
+)
+
+SESSIONS = Table(
+    "sessions",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    Column("revision_id", String(32), nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("expires_at", UtcDateTime, nullable=False),
+    # The request that began the session, as JSON.
+    Column("options", Text, nullable=False),
+    Column("photographs", Integer, nullable=False),
+    # State and last pose; NULL before the first photograph.
+    Column("state", LargeBinary),
+    Column("pose", Text),
+    # Claim of the photograph that is computed: seconds since 1970 by `Database.now_s`, 0 without one.
+    Column("claim", String(32), nullable=False),
+    Column("claimed_until_s", Double, nullable=False),
+    Column("claim_s", Double),
+    _stored_bytes(),
+    Index("sessions_by_tenant_and_age", "tenant", "expires_at"),
+    Index("sessions_by_age", "expires_at"),
+    Index("sessions_by_plan", "plan_id"),
 )
 
 IDEMPOTENCY = Table(

@@ -6,7 +6,6 @@ not change when a plan of it gets a new revision.
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -27,7 +26,7 @@ from sqlalchemy import (
 )
 
 from lalaloc_core.floorplan.earth import Anchor
-from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
+from service.errors import InvalidRequestError, RevisionMismatchError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_places import lies_in_box
 from service.storage.records import (
@@ -41,6 +40,15 @@ from service.storage.records import (
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
+from service.storage.venue_rows import (
+    check_count,
+    find_venue,
+    insert_members,
+    insert_venue,
+    revision_values,
+    select_venues,
+    venue_record,
+)
 
 # Ids per statement.
 _BATCH_SIZE = 1000
@@ -97,24 +105,17 @@ class Venues:
             InvalidRequestError: a plan is not the tenant's.
             StorageQuotaError: the tenant would store too many bytes.
         """
-        now = datetime.now(UTC)
         size = ROW_BYTES * (1 + len(members))
         with self._database.writing(grows_by=size) as connection:
-            if (stored := _find(connection, tenant, venue_id)) is None:
+            if (stored := find_venue(connection, tenant, venue_id)) is None:
                 _check_plans(connection, tenant, [member.plan_id for member in members])
-                values = {"id": venue_id, "tenant": tenant, "number": 1, "created_at": now}
-                values |= _revision_values(name, anchor, now)
-                statement = self._database.insert(VENUES).values(values).on_conflict_do_nothing()
-                if connection.scalar(statement.returning(VENUES.c.id)) is not None:
-                    _insert(connection, venue_id, members)
+                if insert_venue(connection, self._database, tenant, venue_id, name, anchor):
+                    insert_members(connection, venue_id, members)
                     self._quota.settle(connection, tenant, StoredBytes(venues=size))
-                    # Exact, because settling locks the tenant.
-                    own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
-                    if (connection.scalar(own) or 0) > limit:
-                        raise TooManyVenuesError(limit)
-                stored = _find(connection, tenant, venue_id)
+                    check_count(connection, tenant, limit)
+                stored = find_venue(connection, tenant, venue_id)
         assert stored is not None
-        return _record(stored)
+        return stored
 
     def change(
         self,
@@ -161,24 +162,23 @@ class Venues:
                 connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.venue_id == venue_id))
             _remove(connection, venue_id, removed)
             _remove(connection, venue_id, [member.plan_id for member in members], strict=False)
-            _insert(connection, venue_id, members)
+            insert_members(connection, venue_id, members)
             count = _count(connection, venue_id)
             if count > max_plans:
                 fault = f"the venue would have {count} plans; the limit is {max_plans} (LALALOC_MAX_VENUE_PLANS)"
                 raise InvalidRequestError([("plans", fault)])
-            kept = None if drop_anchor else _record(row).anchor if anchor is None else anchor
-            values = _revision_values(row.name if name is None else name, kept, now) | {"number": row.number + 1}
+            kept = None if drop_anchor else venue_record(row).anchor if anchor is None else anchor
+            values = revision_values(row.name if name is None else name, kept, now) | {"number": row.number + 1}
             connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
-            found = _find(connection, tenant, venue_id)
+            found = find_venue(connection, tenant, venue_id)
             self._quota.settle(connection, tenant, StoredBytes(venues=ROW_BYTES * (count - before)))
         assert found is not None
-        return _record(found)
+        return found
 
     def get(self, tenant: str, venue_id: str) -> VenueRecord | None:
         """Return a venue."""
         with self._database.reading() as connection:
-            row = _find(connection, tenant, venue_id)
-        return None if row is None else _record(row)
+            return find_venue(connection, tenant, venue_id)
 
     def list_venues(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
@@ -191,9 +191,9 @@ class Venues:
             after: the last venue of the previous page.
             name: part of the name, case-insensitive.
         """
-        page = newest_first(_select(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
+        page = newest_first(select_venues(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
         with self._database.reading() as connection:
-            return [_record(row) for row in connection.execute(page)]
+            return [venue_record(row) for row in connection.execute(page)]
 
     def plans(
         self, venue_id: str, *, limit: int, after: VenuePlace | None = None, level: float | None = None
@@ -283,64 +283,6 @@ class Venues:
         return self._database.freeing(work)
 
 
-def remove_from_venues(connection: Connection, plan_id: str) -> int:
-    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it.
-
-    Returns:
-        The number of deleted rows.
-    """
-    own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
-    venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
-    ids = connection.scalars(venues).all()
-    rows = connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.plan_id == plan_id)).rowcount
-    now = datetime.now(UTC)
-    for venue_id in ids:
-        values = {"revision_id": uuid.uuid4().hex, "number": VENUES.c.number + 1, "updated_at": now}
-        connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
-    return rows
-
-
-def _revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
-    """Return the columns that change with a venue's revision."""
-    return {
-        "name": name,
-        "folded_name": name.casefold(),
-        "revision_id": uuid.uuid4().hex,
-        "updated_at": now,
-        "latitude": None if anchor is None else anchor.latitude,
-        "longitude": None if anchor is None else anchor.longitude,
-        "altitude_m": None if anchor is None else anchor.altitude_m,
-        "north_deg": None if anchor is None else anchor.north_deg,
-    }
-
-
-def _select(*conditions: Any) -> Any:
-    own = VENUE_PLANS.c.venue_id == VENUES.c.id
-    plans = select(func.count()).select_from(VENUE_PLANS).where(own).scalar_subquery().label("plans")
-    return select(VENUES, plans).where(*conditions)
-
-
-def _find(connection: Connection, tenant: str, venue_id: str) -> Row[Any] | None:
-    return connection.execute(_select(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)).one_or_none()
-
-
-def _record(row: Row[Any]) -> VenueRecord:
-    anchor = None
-    if row.latitude is not None:
-        anchor = Anchor(row.latitude, row.longitude, row.altitude_m, row.north_deg)
-    return VenueRecord(
-        id=row.id,
-        tenant=row.tenant,
-        revision_id=row.revision_id,
-        revision=row.number,
-        name=row.name,
-        anchor=anchor,
-        plans=getattr(row, "plans", 0),
-        created_at=row.created_at,
-        updated_at=row.updated_at,
-    )
-
-
 def _locked(connection: Connection, tenant: str, venue_id: str, expected: str | None) -> Row[Any]:
     """Return a venue's row, locked until the transaction ends."""
     query = select(VENUES).where(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)
@@ -365,15 +307,6 @@ def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -
         found |= set(connection.scalars(query.with_for_update(read=True, key_share=True)))
     if missing := [plan_id for plan_id in plan_ids if plan_id not in found]:
         raise InvalidRequestError([("plans", f"floor plan {_named(missing)} does not exist")])
-
-
-def _insert(connection: Connection, venue_id: str, members: Sequence[VenueMember]) -> None:
-    if members:
-        values = [
-            {"venue_id": venue_id, "plan_id": member.plan_id, "level": member.level, "name": member.name}
-            for member in members
-        ]
-        connection.execute(VENUE_PLANS.insert(), values)
 
 
 def _remove(connection: Connection, venue_id: str, plan_ids: Collection[str], *, strict: bool = True) -> None:

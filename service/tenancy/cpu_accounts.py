@@ -6,14 +6,21 @@ import threading
 from collections.abc import Callable, Coroutine, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import takewhile
 from time import monotonic, thread_time
 from types import coroutine
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
+# Client of health checks and metrics, which is never active: it leaves all permits to tenants.
+PROBES = "(probes)"
 # CPU time counts half after this time, so that a client that used much is served last for some tens of seconds.
 _HALF_LIFE_S = 10.0
+# A client is active for this long after it last used CPU time.
+_ACTIVE_S = 1.0
+# Time of rest per CPU time while others are active. Shorter CPU times (s) add up first; longer rests (s) are cut.
+_REST_RATIO, _LEAST_OWED_S, _LONGEST_REST_S = 3.0, 0.005, 0.5
 # Clients whose recent CPU time differs by less take turns.
 _RANK_S = 0.02
 # Without API keys every client address is a client.
@@ -25,6 +32,8 @@ class _Account:
     total_s: float = 0.0
     recent_s: float = 0.0
     charged_at: float = 0.0
+    owed_s: float = 0.0
+    rest_until: float = 0.0
 
     def recent_at(self, now: float) -> float:
         return self.recent_s * 0.5 ** ((now - self.charged_at) / _HALF_LIFE_S)
@@ -46,28 +55,33 @@ class CpuAccounts:
         self._lock = threading.Lock()
         self._accounts: dict[str, _Account] = {}
 
-    def charge(self, client: str, cpu_s: float) -> None:
-        """Add CPU time (s) to a client's account."""
+    def charge(self, client: str, cpu_s: float, *, rests: bool = False) -> None:
+        """Add CPU time (s) to a client's account; `rests`: it counts for `rest_s`."""
         with self._lock:
             now = self._clock()
-            account = self._accounts.get(client)
+            account = self._accounts.pop(client, None)
             if account is None:
                 self._make_room(now)
-                account = self._accounts[client] = _Account()
+                account = _Account()
+            # The last one charged is the last in the dictionary.
+            self._accounts[client] = account
             account.recent_s, account.charged_at = account.recent_at(now) + cpu_s, now
             account.total_s += cpu_s
+            account.owed_s += cpu_s if rests else 0.0
 
     @contextmanager
-    def charged(self, client: str) -> Iterator[None]:
+    def charged(self, client: str, *, rests: bool = False) -> Iterator[None]:
         """Charge the CPU time that this thread uses in the block."""
         begin = thread_time()
         try:
             yield
         finally:
-            self.charge(client, thread_time() - begin)
+            self.charge(client, thread_time() - begin, rests=rests)
 
     @coroutine
-    def charged_steps(self, client: str, work: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
+    def charged_steps(
+        self, client: str, work: Coroutine[Any, Any, T], *, rests: bool = False
+    ) -> Generator[Any, Any, T]:
         """Run a coroutine and charge the CPU time of its steps, without those of other tasks in between."""
         value, error = None, None
         while True:
@@ -77,7 +91,7 @@ class CpuAccounts:
             except StopIteration as done:
                 return done.value
             finally:
-                self.charge(client, thread_time() - begin)
+                self.charge(client, thread_time() - begin, rests=rests)
             value, error = None, None
             try:
                 value = yield awaited
@@ -88,6 +102,27 @@ class CpuAccounts:
         """Return the CPU time (s) that a client used lately, by its weight."""
         account = self._accounts.get(client)
         return 0.0 if account is None else account.recent_at(self._clock()) / self.share(client)
+
+    def active(self) -> set[str]:
+        """Return the clients that used CPU time within the last second."""
+        with self._lock:
+            return self._active(self._clock())
+
+    def rest_s(self, client: str) -> float:
+        """Return how long (s) a client must rest now: while others are active, three times as long as it computed.
+
+        So a client whose requests follow each other computes for a quarter of the time, and leaves the interpreter to
+        others for the rest. Only CPU time since its last rest counts that was charged with `rests`.
+        """
+        with self._lock:
+            now = self._clock()
+            account = self._accounts.get(client)
+            if account is None:
+                return 0.0
+            if account.rest_until <= now and account.owed_s >= _LEAST_OWED_S:
+                rest_s = min(_REST_RATIO * account.owed_s, _LONGEST_REST_S) if self._active(now) - {client} else 0.0
+                account.owed_s, account.rest_until = 0.0, now + rest_s
+            return max(account.rest_until - now, 0.0)
 
     def rank(self, client: str) -> int:
         """Return the place of a client in a queue, the lowest first: its recent CPU time in units that matter."""
@@ -103,7 +138,13 @@ class CpuAccounts:
         with self._lock:
             return {client: account.total_s for client, account in self._accounts.items()}
 
+    def _active(self, now: float) -> set[str]:
+        latest = takewhile(lambda item: item[1].charged_at >= now - _ACTIVE_S, reversed(self._accounts.items()))
+        return {client for client, _ in latest} - {PROBES}
+
     def _make_room(self, now: float) -> None:
-        """Forget the client that used the least CPU time lately if there are too many."""
+        """Forget the quarter of the clients that used the least CPU time lately if there are too many."""
         if len(self._accounts) >= _MAX_CLIENTS:
-            del self._accounts[min(self._accounts, key=lambda client: self._accounts[client].recent_at(now))]
+            by_use = sorted(self._accounts, key=lambda client: self._accounts[client].recent_at(now))
+            for client in by_use[: _MAX_CLIENTS // 4]:
+                del self._accounts[client]

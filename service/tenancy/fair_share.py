@@ -16,15 +16,12 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Set
 from concurrent.futures import Future
 from contextlib import asynccontextmanager, contextmanager
-from time import monotonic
 from typing import Generic, TypeVar
 
 from service.tenancy.cpu_accounts import CpuAccounts
 
 T = TypeVar("T")
 
-# A client is active for this long after it last held a permit.
-_ACTIVE_S = 1.0
 # Largest ratio of the units of a client to the units that stay free.
 _MAX_RATIO = 3
 
@@ -141,13 +138,13 @@ class FairSemaphore:
     Args:
         limit: number of permits.
         accounts: CPU time of the clients.
-        cores: a client holds fewer permits than there are cores while others are active, one for each of them, so that
-            its computations leave a core to theirs; None: it holds no fewer.
+        cores: while other clients use CPU time, a client holds fewer permits than this, one less for each of them, so
+            that its computations leave a core to theirs; it can always hold one. None: it holds no fewer.
     """
 
     def __init__(self, limit: int, accounts: CpuAccounts, *, cores: int | None = None) -> None:
+        self._accounts = accounts
         self._cores = cores
-        self._released_at: dict[str, float] = {}
         self._lock = threading.Lock()
         self._shares = Shares(limit)
         self._waiting: FairQueue[Future[None]] = FairQueue(accounts)
@@ -185,7 +182,6 @@ class FairSemaphore:
         """Release a permit."""
         with self._lock:
             self._shares.give_back(client)
-            self._released_at[client] = monotonic()
         self._grant()
 
     def _queued(self, client: str) -> Future[None]:
@@ -211,9 +207,7 @@ class FairSemaphore:
         """Return the test of the clients that can take a permit now."""
         if self._cores is None:
             return self._shares.may_take
-        since = monotonic() - _ACTIVE_S
-        self._released_at = {client: at for client, at in self._released_at.items() if at >= since}
-        active = len(self._released_at.keys() | self._shares.clients() | self._waiting.clients())
+        active = len(self._accounts.active() | self._shares.clients() | self._waiting.clients())
         if active < 2:
             return self._shares.may_take
         most = max(self._cores - active + 1, self._cores // active, 1)

@@ -1,6 +1,6 @@
 """Program of a conversion worker process, the only part of the service that reads drawings and models.
 
-It turns an `ImportJob` into an `Imported`, a `RenditionJob` into a `Rendition`, a `ParseJob` into a `PackedPlan`, and
+It turns an `ImportJob` into plans, a `RenditionJob` into a `Rendition`, a `ParseJob` into a `PackedPlan`, and
 each into a `ConversionRefusal` if the file cannot be read or written. The libraries of a format are loaded with its
 first file.
 """
@@ -19,8 +19,10 @@ from lalaloc_core.importers import (
     ImportedPlan,
     ImportLimits,
     ImportOptions,
+    Level,
     detect_media_type,
     import_plan,
+    import_plans,
 )
 from service.errors import DamagedDataError
 from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionKind, StoredPlan
@@ -33,11 +35,21 @@ _WORN = 0.5
 
 @dataclass(frozen=True)
 class ImportJob:
-    """Uploaded plan file, and the options of its import."""
+    """Uploaded plan file, and the options of its import.
+
+    Attributes:
+        content: the file.
+        options: the options.
+        step_m: grid step of descriptions.
+        every_level: import all levels of the file, not the only one.
+        building: name for the plans of several levels, see `import_plans`.
+    """
 
     content: bytes
     options: ImportOptions
     step_m: float
+    every_level: bool = False
+    building: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,10 +70,11 @@ class RenditionJob:
 
 @dataclass(frozen=True)
 class Imported:
-    """Result of an import.
+    """Plan of a level of a file.
 
     Attributes:
         plan: the plan, validated under the service's limits.
+        level: the level, if the file has levels.
         document: its stored form.
         report: the import report as JSON text.
         media_type: media type of the file.
@@ -69,6 +82,7 @@ class Imported:
     """
 
     plan: PackedPlan
+    level: Level | None
     document: PlanDocument
     report: str
     media_type: str
@@ -114,7 +128,7 @@ class ConversionRefusal:
 
 
 ConversionJob = ImportJob | RenditionJob | ParseJob
-ConversionResult = Imported | Rendition | PackedPlan | ConversionRefusal
+ConversionResult = tuple[Imported, ...] | Rendition | PackedPlan | ConversionRefusal
 
 
 def report_of(imported: ImportedPlan) -> str:
@@ -166,8 +180,14 @@ def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionRes
     return convert
 
 
-def _import(job: ImportJob, limits: ImportLimits) -> Imported:
-    imported = import_plan(job.content, job.options, limits)
+def _import(job: ImportJob, limits: ImportLimits) -> tuple[Imported, ...]:
+    if not job.every_level:
+        return (_imported(import_plan(job.content, job.options, limits), job, limits),)
+    plans = import_plans(job.content, job.options, limits, building=job.building)
+    return tuple(_imported(plan, job, limits) for plan in plans)
+
+
+def _imported(imported: ImportedPlan, job: ImportJob, limits: ImportLimits) -> Imported:
     plan = imported.plan(limits.plan)
     document, report = PlanDocument.from_plan(plan), report_of(imported)
     description = None
@@ -177,7 +197,7 @@ def _import(job: ImportJob, limits: ImportLimits) -> Imported:
 
         description = describe_content(plan, report, job.step_m)
     media_type = detect_media_type(job.content, imported.report.format)
-    return Imported(PackedPlan.of(plan), document, report, media_type, description)
+    return Imported(PackedPlan.of(plan), imported.level, document, report, media_type, description)
 
 
 def _parse(job: ParseJob) -> PackedPlan:

@@ -1,7 +1,7 @@
 """Program of a decoding worker process, which opens uploaded photographs.
 
-It turns an uploaded file into a `Panorama` or a `DecodeRefusal`. It also rasterises drawings, which keeps the
-interpreter busy for as long.
+It turns an uploaded file into a `View`, a picture to be shown, or a `DecodeRefusal`. It also rasterises drawings, which
+keeps the interpreter busy for as long.
 """
 
 from __future__ import annotations
@@ -10,20 +10,42 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
+import cv2
+import numpy as np
+
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.panorama.images import Panorama, PanoramaLimits, open_panorama, warm_up
+from lalaloc_core.panorama.pictures import PanoramaLimits
+from lalaloc_core.photograph import PatchSize, StatedView, View, open_view
+from lalaloc_core.photograph.view import open_picture, warm_up
 from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
 
 
+@dataclass(frozen=True, kw_only=True)
+class DecodeSizes:
+    """Sizes of decoded photographs: height and width (pixels) of full spheres, and the patches of others."""
+
+    sphere: tuple[int, int]
+    patch: PatchSize
+
+
 @dataclass(frozen=True)
 class DecodeJob:
-    """Uploaded picture, and the size (pixels) of the panorama to return; the worker gets the picture as bytes."""
+    """Uploaded photograph to read for the encoders; the worker gets it as bytes."""
 
     content: bytes | UploadedFile
-    height: int
-    width: int
+    stated: StatedView
+
+
+@dataclass(frozen=True)
+class ShowJob:
+    """Uploaded photograph to decode as a picture to be shown, a full sphere levelled; sizes are width and height."""
+
+    content: bytes | UploadedFile
+    stated: StatedView
+    is_sphere: bool
+    max_size: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -35,37 +57,53 @@ class RasteriseJob:
 
 @dataclass(frozen=True)
 class DecodeRefusal:
-    """Reason why a picture is not a usable panorama."""
+    """Reason why a picture is not a usable photograph."""
 
     reason: str
 
 
-def run_decoder(connection: Connection, height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> None:
+Job = DecodeJob | ShowJob | RasteriseJob
+Result = View | np.ndarray | DecodeRefusal | bytes
+
+
+def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PanoramaLimits, memory_bytes: int) -> None:
     """Run decoding and rasterising jobs until the pipe closes.
 
     Args:
         connection: the worker's end of the pipe.
-        height: usual height (pixels) of a panorama, for which the worker warms up.
-        width: usual width (pixels).
-        limits: limits of panorama files.
+        sizes: sizes of decoded photographs.
+        limits: limits of photographs.
         memory_bytes: memory limit of decoding, besides what the process uses before its first picture.
     """
-    serve_jobs(connection, lambda: _load(height, width, limits, memory_bytes))
+    serve_jobs(connection, lambda: _load(sizes, limits, memory_bytes))
 
 
-def _load(
-    height: int, width: int, limits: PanoramaLimits, memory_bytes: int
-) -> Callable[[DecodeJob | RasteriseJob], Panorama | DecodeRefusal | bytes]:
-    warm_up(height=height, width=width)
+def _load(sizes: DecodeSizes, limits: PanoramaLimits, memory_bytes: int) -> Callable[[Job], Result]:
+    # A worker stands for one core.
+    cv2.setNumThreads(1)
+    warm_up(sphere_size=sizes.sphere, patch_size=sizes.patch)
     limit_memory(memory_bytes)
 
-    def work(job: DecodeJob | RasteriseJob) -> Panorama | DecodeRefusal | bytes:
+    def work(job: Job) -> Result:
         if isinstance(job, RasteriseJob):
             return rasterise(job.svg)
+        assert isinstance(job.content, bytes)
         try:
-            assert isinstance(job.content, bytes)
-            return open_panorama(job.content, height=job.height, width=job.width, limits=limits)
+            if isinstance(job, DecodeJob):
+                return open_view(
+                    job.content, sphere_size=sizes.sphere, stated=job.stated, patch_size=sizes.patch, limits=limits
+                )
+            return _shown(job, job.content, limits)
         except InvalidPanoramaError as error:
             return DecodeRefusal(str(error))
 
     return work
+
+
+def _shown(job: ShowJob, content: bytes, limits: PanoramaLimits) -> np.ndarray:
+    if not job.is_sphere:
+        return open_picture(content, max_size=job.max_size, limits=limits)
+    width, height = job.max_size
+    view = open_view(content, sphere_size=(height, width), stated=job.stated, limits=limits)
+    assert view.panorama is not None
+    return view.panorama.pixels

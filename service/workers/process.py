@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import pickle
 import signal
 import sys
 from collections.abc import Callable
@@ -63,7 +64,8 @@ def serve_jobs(
     message: Ready | JobResult | WorkerFailure = Ready()
     while _send(connection, message) and is_fit():
         try:
-            job = connection.recv()
+            # In parts, of which the last is empty.
+            job = pickle.loads(b"".join(iter(connection.recv_bytes, b"")))
         except (EOFError, OSError):
             return
         begin = process_time()

@@ -12,13 +12,17 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.http.admission_control import EXEMPT, Admission, is_read, is_stream
+from service.http.admission_control import EXEMPT, Admission, is_query, is_read, is_stream
 from service.http.bytes_in_flight import BodyBudget
 from service.http.problems import problem_answer
 from service.http.request_end import ending_request
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of
+from service.tenancy.cpu_accounts import PROBES, CpuAccounts
 from service.tenancy.fair_share import FairSemaphore
+
+# Bytes of a query's body that arrive without a rest, and the time (s) that the server takes to receive a byte.
+_FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9
 
 
 class AdmissionMiddleware:
@@ -31,8 +35,15 @@ class AdmissionMiddleware:
         """Handle one request."""
         # An app without its lifespan has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
-        if scope["type"] != "http" or admission is None or (path := routed_path(scope)) in EXEMPT:
+        if scope["type"] != "http" or admission is None:
             await self._app(scope, receive, send)
+            return
+        path = routed_path(scope)
+        if path in EXEMPT:
+            # They have no key, and need no slot.
+            await _Rests(admission.cpu_accounts, PROBES, query=False).take()
+            handled = cast(Coroutine[Any, Any, None], self._app(scope, receive, send))
+            await admission.cpu_accounts.charged_steps(PROBES, handled, rests=True)
             return
         try:
             client = caller_of(scope).client
@@ -46,14 +57,15 @@ class AdmissionMiddleware:
         semaphore = admission.reading if is_read(scope["method"], path) else None
         stated = Headers(scope=scope).get("content-length", "")
         body = BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
-        connection = _Connection(receive, send, body)
+        rests = _Rests(admission.cpu_accounts, client, query=is_query(path))
+        connection = _Connection(receive, send, body, rests)
         limit_s = None if is_stream(scope["method"], path) else admission.limits.deadline_s
         try:
-            async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client) as permit:
+            async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client, rests) as permit:
                 connection.on_answer = permit.end
                 with ending_request(scope):
-                    handled = self._app(scope, connection.receive, connection.send)
-                    await admission.cpu_accounts.charged_steps(client, cast(Coroutine[Any, Any, None], handled))
+                    handled = cast(Coroutine[Any, Any, None], self._app(scope, connection.receive, connection.send))
+                    await admission.cpu_accounts.charged_steps(client, handled, rests=not is_query(path))
         except asyncio.CancelledError:
             # The stopping server cancels requests that did not finish in time.
             if not admission.stopping or connection.answered:
@@ -65,18 +77,52 @@ class AdmissionMiddleware:
                 await problem_answer(Request(scope), error)(scope, receive, send)
 
 
+class _Rests:
+    """Rests of one request. A query only rests while a large body arrives, as queries share threads of their own."""
+
+    def __init__(self, accounts: CpuAccounts, client: str, *, query: bool) -> None:
+        self._accounts = accounts
+        self._client = client
+        self._free_bytes = _FREE_BYTES if query else 0
+
+    @property
+    def left_s(self) -> float:
+        """Time (s) that the client must rest now."""
+        return 0.0 if self._free_bytes > 0 else self._accounts.rest_s(self._client)
+
+    async def take(self) -> None:
+        """Wait until no rest is left."""
+        while (left_s := self.left_s) > 0.0:
+            await asyncio.sleep(left_s)
+
+    async def receive(self, size: int) -> None:
+        """Count bytes of the body, and rest."""
+        self._free_bytes -= size
+        if self._free_bytes <= 0:
+            self._accounts.charge(self._client, size * _RECEIVING_S, rests=True)
+        await self.take()
+
+
 class _Permit:
     """Permit to compute an answer, held until the answer begins to be sent."""
 
-    def __init__(self, semaphore: FairSemaphore | None, client: str) -> None:
+    def __init__(self, semaphore: FairSemaphore | None, client: str, rests: _Rests) -> None:
         self._semaphore = semaphore
         self._client = client
+        self._rests = rests
         self._held = False
 
     async def __aenter__(self) -> _Permit:
-        if self._semaphore is not None:
+        await self._rests.take()
+        if self._semaphore is None:
+            return self
+        await self._semaphore.acquire(self._client)
+        while self._rests.left_s > 0.0:
+            # Other clients can have the permit meanwhile.
+            self._semaphore.release(self._client)
+            await self._rests.take()
             await self._semaphore.acquire(self._client)
-            self._held = True
+        self._held = True
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -92,8 +138,9 @@ class _Permit:
 class _Connection:
     """Connection of a request. Once the body is read, a disconnect cancels the work on the answer."""
 
-    def __init__(self, receive: Receive, send: Send, body: BodyBudget) -> None:
+    def __init__(self, receive: Receive, send: Send, body: BodyBudget, rests: _Rests) -> None:
         self._body = body
+        self._rests = rests
         self._begun = False
         self.answered = False
         self.on_answer: Callable[[], None] = lambda: None
@@ -128,7 +175,9 @@ class _Connection:
             self._begun = True
             self._body.begin()
         message = await self._receive()
-        self._body.receive(len(message.get("body", b"")))
+        size = len(message.get("body", b""))
+        self._body.receive(size)
+        await self._rests.receive(size)
         if message["type"] == "http.request" and not message.get("more_body", False):
             self._watch = asyncio.create_task(self._wait_for_disconnect())
         return message

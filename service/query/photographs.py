@@ -1,0 +1,119 @@
+"""Photographs of queries: from decoded files to encoded queries, and to the answer's part about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.confidence import Confidence
+from lalaloc_core.localise.information import advice_for, information_bits, union_of_arcs
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.pipeline import Localisation, StageClock
+from lalaloc_core.localise.poses import PoseGrid, Query
+from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.photograph import Assumed, View
+from lalaloc_core.photograph.cameras import Around, Fisheye
+from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, ViewAnswer
+
+# OpenCV counts pixels from the centre of the first one.
+_HALF_PIXEL = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A decoded photograph of a query, or several that were taken from one spot.
+
+    Attributes:
+        view: the photograph, whose heading is searched.
+        others: further photographs from its place, each with its heading minus that of `view` (radians).
+    """
+
+    view: View
+    others: Sequence[tuple[View, float]] = ()
+
+    @property
+    def arcs(self) -> list[tuple[float, float]]:
+        """Azimuths (radians, first and last) that are seen, relative to the centre of `view`."""
+        turned = [(self.view, 0.0), *self.others]
+        return union_of_arcs([(view.azimuths[0] + turn, view.azimuths[1] + turn) for view, turn in turned])
+
+
+def encode(
+    encoder: PhotographEncoder,
+    photographs: Sequence[Photograph],
+    known: Sequence[KnownHeading],
+    height: CameraHeight,
+    clock: StageClock,
+) -> list[Query]:
+    """Encode decoded photographs, each with its known heading; all queries go through here.
+
+    Raises:
+        InvalidPanoramaError: a photograph is no sphere, and the model has no encoder of views.
+    """
+    with clock.stage("encode"):
+        return [
+            encoder.query(
+                photograph.view,
+                heading.heading,
+                height,
+                heading_tolerance=heading.tolerance,
+                others=photograph.others,
+            )
+            for photograph, heading in zip(photographs, known, strict=True)
+        ]
+
+
+def view_answer(
+    photograph: Photograph, found: Localisation, confidence: Confidence | None, plan: FloorPlan, grid: PoseGrid
+) -> ViewAnswer:
+    """Return the answer's part about its photograph; `plan` and `grid` are those that were searched."""
+    bits = information_bits(plan, grid.poses, found.posterior.pose)
+    sure = found.posterior.position if confidence is None else confidence.position
+    return ViewAnswer(
+        **vars(read_view(photograph)),
+        information_bits=bits,
+        ruled_out=1.0 - 2.0**-bits,
+        advice=advice_for(photograph.arcs, sure),
+    )
+
+
+def read_view(photograph: Photograph) -> ReadView:
+    """Return what was assumed about a photograph."""
+    view = photograph.view
+    return ReadView(
+        projection=view.projection,
+        projection_source=view.projection_source,
+        hfov=_angle(view.hfov),
+        pitch=_angle(view.pitch),
+        roll=_angle(view.roll),
+        camera=_camera(view),
+        seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in photograph.arcs],
+        warnings=list(view.warnings),
+    )
+
+
+def _angle(assumed: Assumed) -> AssumedAngle:
+    return AssumedAngle(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
+
+
+def _camera(view: View) -> CameraAnswer | None:
+    camera = view.camera
+    if camera is None or isinstance(camera, Around):
+        return None
+    if isinstance(camera, Fisheye):
+        distortion = camera.radial
+    else:
+        (k1, k2, k3), (p1, p2) = camera.radial, camera.tangential
+        distortion = (k1, k2, p1, p2, k3)
+    return CameraAnswer(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx - _HALF_PIXEL,
+        cy=camera.cy - _HALF_PIXEL,
+        distortion=list(distortion),
+    )

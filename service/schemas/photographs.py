@@ -1,0 +1,162 @@
+"""Photographs as requests describe them, and as answers say that they were read."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from lalaloc_core.photograph import Intrinsics, StatedView
+from lalaloc_core.photograph.stated import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
+from service.schemas.fields import Degrees, Finite, ResponseModel, Score, Share, SignedDegrees
+
+Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
+ValueSource = Literal["given", "gpano", "exif", "estimated", "assumed"]
+_HFOV_RANGES = ", ".join(
+    f"{low:g} to {high:g} ({name})" for name, (low, high) in HFOV_RANGE_DEG.items() if name != AUTO
+)
+_Number = Annotated[float, Finite]
+
+
+class StatedIntrinsics(BaseModel):
+    """Camera matrix and distortion as OpenCV's calibration prints them, for the upright picture at its full size."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        json_schema_extra={"example": {"fx": 2870.0, "fy": 2868.0, "cx": 2010.5, "cy": 1509.0}},
+    )
+
+    fx: _Number = Field(description="Focal length, pixels.")
+    fy: _Number = Field(description="Focal length, pixels.")
+    cx: _Number | None = Field(None, description="Optical centre, pixels from the first one's. Default: the middle.")
+    cy: _Number | None = Field(None, description="Optical centre, pixels from the first one's. Default: the middle.")
+    k1: _Number = Field(0.0, description="Radial distortion; of the fisheye model for `fisheye`, as k2 and k3.")
+    k2: _Number = 0.0
+    k3: _Number = 0.0
+    k4: _Number = Field(0.0, description="Radial distortion of the fisheye model only.")
+    p1: _Number = Field(0.0, description="Tangential distortion, not of the fisheye model.")
+    p2: _Number = 0.0
+
+
+class ViewFields(BaseModel):
+    """Form fields about the camera of a photograph."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    projection: Literal["auto", "equirectangular", "perspective", "cylindrical", "fisheye"] = Field(
+        "auto",
+        description="Projection of the photograph: `equirectangular` (360° cameras), `perspective` (ordinary cameras), "
+        "`cylindrical` (strips of a phone's panorama mode) or `fisheye`. `auto` decides by photo sphere metadata, then "
+        "by the picture itself, then by the EXIF focal length.",
+    )
+    hfov_deg: _Number | None = Field(
+        None,
+        description=f"Horizontal field of view of the upright photograph, degrees: {_HFOV_RANGES}. Default: from the "
+        "metadata, else estimated from straight lines, with a warning.",
+    )
+    intrinsics: StatedIntrinsics | None = Field(
+        None, description="Camera matrix and distortion as a JSON object, instead of `hfov_deg`."
+    )
+    pitch_deg: _Number | None = Field(
+        None,
+        description="Elevation of the photograph's centre above the horizon, degrees, at most "
+        f"{MAX_PITCH_DEG:g} either way. Default: from the metadata, else estimated from straight lines.",
+    )
+    roll_deg: _Number | None = Field(
+        None,
+        description="Clockwise rotation of the camera about its optical axis, degrees, at most "
+        f"{MAX_ROLL_DEG:g} either way. Default: as for `pitch_deg`.",
+    )
+
+    @field_validator("intrinsics", mode="before")
+    @classmethod
+    def _parse_intrinsics(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        try:
+            return json.loads(value)
+        except (ValueError, RecursionError) as error:
+            raise ValueError('not a JSON object such as {"fx": 2870, "fy": 2868}') from error
+
+    @field_validator("hfov_deg", "pitch_deg", "roll_deg", mode="before")
+    @classmethod
+    def _reject_underscored_angles(cls, value: object) -> object:
+        if isinstance(value, str) and "_" in value:
+            raise ValueError("not a number")
+        return value
+
+    @property
+    def stated_view(self) -> StatedView:
+        """The statements for the core, which checks them."""
+        intrinsics = None if self.intrinsics is None else Intrinsics(**self.intrinsics.model_dump())
+        return StatedView(
+            projection=self.projection,
+            hfov_deg=self.hfov_deg,
+            intrinsics=intrinsics,
+            pitch_deg=self.pitch_deg,
+            roll_deg=self.roll_deg,
+        )
+
+
+class AssumedAngle(ResponseModel):
+    """Angle that the photograph was read with."""
+
+    value_deg: SignedDegrees
+    std_deg: Degrees = Field(description="Standard deviation; 0 where it does not apply.")
+    source: ValueSource = Field(
+        description="Origin: the request (`given`), metadata (`gpano`, `exif`), the picture (`estimated`), or a usual "
+        "value (`assumed`)."
+    )
+
+
+class CameraAnswer(ResponseModel):
+    """Camera matrix and distortion of the upright photograph, as `intrinsics` of the request."""
+
+    width: int = Field(description="Size of the upright photograph, pixels.")
+    height: int
+    fx: Score
+    fy: Score
+    cx: Score
+    cy: Score
+    distortion: list[float] = Field(
+        description="k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye camera: OpenCV's order."
+    )
+
+
+class SeenArc(ResponseModel):
+    """Azimuths that photographs show, relative to the centre of the first, clockwise."""
+
+    from_deg: SignedDegrees
+    to_deg: SignedDegrees = Field(description="Greater than `from_deg`; above 180 for an arc that passes the back.")
+
+
+class ReadView(ResponseModel):
+    """Assumptions about the photograph, and the azimuths it shows."""
+
+    projection: Projection
+    projection_source: ValueSource
+    hfov: AssumedAngle = Field(description="Horizontal field of view.")
+    pitch: AssumedAngle = Field(description="Elevation of the photograph's centre above the horizon.")
+    roll: AssumedAngle = Field(description="Clockwise rotation of the camera about its optical axis.")
+    camera: CameraAnswer | None = Field(
+        description="Camera model, with which the plan's walls can be drawn over the photograph; null for full spheres "
+        "and strips."
+    )
+    seen: list[SeenArc] = Field(description="Azimuths that the photographs behind the answer show.")
+    warnings: list[str] = Field(description="Metadata that were ignored, and estimates to check.")
+
+
+class ViewAnswer(ReadView):
+    """Assumptions about the photograph, the azimuths it shows, and how much it could tell."""
+
+    information_bits: Score = Field(
+        description="Information about the place, in bits: the divergence of the posterior from the shares of the "
+        "searched area, hints included. 0: all places stay equally likely."
+    )
+    ruled_out: Share = Field(description="Share of the searched area that this rules out: 1 - 2 ** -information_bits.")
+    advice: str | None = Field(
+        description="How to photograph the place for a sure answer, such as `turn around`; null where it is sure, or "
+        "where more of the surroundings would not help."
+    )

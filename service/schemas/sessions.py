@@ -1,0 +1,227 @@
+"""Sessions of tracked cameras: the request that begins one, its photographs, and the answer."""
+
+from __future__ import annotations
+
+import json
+import math
+from datetime import datetime
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
+
+from lalaloc_core.localise.tracking import Odometry
+from lalaloc_core.localise.tracking.motion import MAX_STEP_M, MAX_TURN
+from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
+from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
+from service.schemas.localise_query import HEADING_MEANING
+from service.schemas.photographs import ReadView, ViewFields
+from service.schemas.query_fields import CameraFields, EarthPoint, PlanPoint
+
+# `Odometry` checks the limits of motions, which this only describes.
+Step = Annotated[float, Finite, Field(json_schema_extra={"minimum": -MAX_STEP_M, "maximum": MAX_STEP_M})]
+StepStd = Annotated[float, Finite, Field(json_schema_extra={"minimum": 0, "maximum": MAX_STEP_M})]
+Row = Annotated[list[Annotated[float, Finite]], Field(min_length=3, max_length=3)]
+_MAX_TURN_DEG = math.degrees(MAX_TURN)
+_ROOMS = 100
+# Errors of odometry whose deviations are not stated: shares of the distance and degrees per metre, and what is added.
+_DRIFT, _LEAST_M, _TURN_PER_M_DEG, _LEAST_DEG = 0.05, 0.02, 2.0, 1.0
+
+
+class SessionDocument(CameraFields):
+    """Begin of a session: the plan, the camera, and what is known about the place of the first photograph."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", json_schema_extra={"example": {"floorplan_id": "0" * 32, "camera_height_m": 1.5}}
+    )
+
+    floorplan_id: str = Field(min_length=1, description="Id of the floor plan.")
+    near: PlanPoint | EarthPoint | None = Field(
+        None, description="Approximate place of the first photograph. Needs `radius_m`."
+    )
+    radius_m: Annotated[float, Finite] | None = Field(
+        None, gt=0, le=1000, description="Largest distance of the first photograph from `near`."
+    )
+    rooms: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1, max_length=_ROOMS)] | None = Field(
+        None, description="Rooms that the first photograph can be in, by id or name."
+    )
+
+    @model_validator(mode="after")
+    def _check_near(self) -> Self:
+        if (self.near is None) != (self.radius_m is None):
+            raise ValueError("near and radius_m are needed together")
+        return self
+
+
+class PhotographForm(ViewFields):
+    """Form fields of a photograph of a session; an empty field counts as left out.
+
+    The motion is that since the photograph before, in the frame of the camera at that photograph.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    number: int | None = Field(
+        None, ge=1, description="Number of the photograph, from 1: 409 if it is not the next one of the session."
+    )
+    forward_m: Step | None = Field(None, description="Motion along the heading of the photograph before.")
+    right_m: Step | None = Field(None, description="Motion to its right. Default: 0 if `forward_m` is given.")
+    turn_deg: Annotated[float, Finite] | None = Field(
+        None,
+        json_schema_extra={"minimum": -_MAX_TURN_DEG, "maximum": _MAX_TURN_DEG},
+        description="Heading of this photograph minus that of the one before, clockwise seen from above. Needs "
+        "`forward_m`, which needs it.",
+    )
+    forward_std_m: StepStd | None = Field(
+        None, description="Standard deviation of `forward_m`. Default: 5 % of the distance and 2 cm."
+    )
+    right_std_m: StepStd | None = Field(None, description="Standard deviation of `right_m`; default as before.")
+    turn_std_deg: Annotated[float, Finite] | None = Field(
+        None,
+        json_schema_extra={"minimum": 0, "maximum": 360},
+        description="Standard deviation of `turn_deg`. Default: 2° per metre and 1°.",
+    )
+    covariance: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = Field(
+        None,
+        description="Covariance of `forward_m`, `right_m` and `turn_deg` as a JSON array of three rows, in m², m·° and "
+        "°², instead of the standard deviations.",
+    )
+    heading_deg: Annotated[float, Finite] | None = Field(
+        None, ge=-360, le=360, description=f"The {HEADING_MEANING}, if it is known."
+    )
+    heading_tolerance_deg: Annotated[float, Finite] = Field(
+        0.0, ge=0, le=45, description="Largest error of `heading_deg`, as in `POST /localise`. Needs `heading_deg`."
+    )
+
+    @field_validator("covariance", mode="before")
+    @classmethod
+    def _parse_rows(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        try:
+            return json.loads(value)
+        except (ValueError, RecursionError) as error:
+            raise ValueError("not a JSON array of three rows") from error
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _reject_underscores(cls, value: object) -> object:
+        if isinstance(value, str) and "_" in value:
+            raise ValueError("not a number")
+        return value
+
+    @field_validator("heading_tolerance_deg")
+    @classmethod
+    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
+        if value > 0.0 and given.data.get("heading_deg", 0.0) is None:
+            raise ValueError("needs heading_deg")
+        return value
+
+    @model_validator(mode="after")
+    def _check_motion(self) -> Self:
+        if (self.forward_m is None) != (self.turn_deg is None):
+            raise ValueError("forward_m and turn_deg are needed together")
+        stds = self.forward_std_m, self.right_std_m, self.turn_std_deg
+        rest = (self.right_m, *stds, self.covariance)
+        if self.forward_m is None and any(value is not None for value in rest):
+            raise ValueError("right_m, standard deviations and covariance need forward_m and turn_deg")
+        if self.covariance is not None and any(value is not None for value in stds):
+            raise ValueError("give the covariance or the standard deviations, not both")
+        return self
+
+    @property
+    def odometry(self) -> Odometry | None:
+        """The motion for the core, in radians; None if it was not measured.
+
+        Raises:
+            InvalidMotionError: the motion is too long, or its covariance is none.
+        """
+        if self.forward_m is None or self.turn_deg is None:
+            return None
+        right_m, turn = self.right_m or 0.0, math.radians(self.turn_deg)
+        if self.covariance is not None:
+            scale = np.array([1.0, 1.0, math.radians(1.0)])
+            return Odometry(self.forward_m, right_m, turn, np.array(self.covariance) * np.outer(scale, scale))
+        length_m = math.hypot(self.forward_m, right_m)
+        std_m, std_deg = _DRIFT * length_m + _LEAST_M, _TURN_PER_M_DEG * length_m + _LEAST_DEG
+        stds = (
+            std_m if self.forward_std_m is None else self.forward_std_m,
+            std_m if self.right_std_m is None else self.right_std_m,
+            math.radians(std_deg if self.turn_std_deg is None else self.turn_std_deg),
+        )
+        return Odometry.of_stds(self.forward_m, right_m, turn, stds)
+
+
+class RivalAnswer(ResponseModel):
+    """Possible pose of the last photograph."""
+
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360)
+    room: str
+    room_id: str
+    probability: Share
+
+
+class PathPoint(ResponseModel):
+    """Pose of one photograph of the path."""
+
+    number: int = Field(description="Number of the photograph, from 1.")
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360)
+    room_id: str
+    probability: Share
+
+
+TrackingMode = Literal["searching", "tracking", "lost"]
+CovarianceRow = Annotated[list[Variance], Field(min_length=3, max_length=3)]
+
+
+class TrackedPoseAnswer(ResponseModel):
+    """Pose of the last photograph of a session."""
+
+    number: int = Field(description="Number of the photograph, from 1.")
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    room: str
+    room_id: str = Field(description="`id` of the room, unique in the plan.")
+    covariance: Annotated[list[CovarianceRow], Field(min_length=3, max_length=3)] = Field(
+        description="Covariance of x_m, y_m and heading_deg in m², m·° and °², given that the position is right within "
+        "1 m."
+    )
+    probability: Share = Field(description="Probability that the position is right within 1 m.")
+    camera_height_m: Metres = Field(description="Best-fitting camera height.")
+    candidates: list[RivalAnswer] = Field(description="Possible poses, most probable first; the first is the answer.")
+    motion_contradicted: list[Literal["forward_m", "right_m", "turn_deg"]] = Field(
+        description="Components of the stated motion that the photographs contradict by more than 4 deviations."
+    )
+    warnings: list[str] = Field(description="Contradicted motions, and odometry that is wrong again and again.")
+    geopose: GeoPose | None = Field(None, description="Pose on Earth; null for a plan without an anchor.")
+    view: ReadView | None = Field(
+        None, description="Assumptions about the photograph; null for photographs of earlier versions."
+    )
+    timings_ms: TimingsAnswer
+    model: ModelAnswer
+
+
+class SessionAnswer(ResponseModel):
+    """Session of a tracked camera."""
+
+    id: str
+    floorplan_id: str
+    floorplan_revision: str = Field(description="Revision of the plan; the session ends if the plan is replaced.")
+    expires_at: datetime = Field(description="End of the session, unless a photograph comes before.")
+    photographs: int = Field(description="Photographs so far.")
+    mode: TrackingMode = Field(
+        description="`tracking`: the pose is known; `searching`: several places are possible; `lost`: the photographs "
+        "do not fit the plan."
+    )
+    pose: TrackedPoseAnswer | None = Field(description="Pose of the last photograph; null before the first.")
+    path: list[PathPoint] = Field(description="Poses of the last 200 photographs.")
+
+
+class StoredPose(ResponseModel):
+    """Part of the answer that is stored with a session."""
+
+    mode: TrackingMode
+    pose: TrackedPoseAnswer
+    path: list[PathPoint]

@@ -1,0 +1,139 @@
+"""Rows of a plan's revision: its documents, its uploaded file, and its pose grid if it is computed already."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any, Self
+
+from sqlalchemy import Connection, func, select
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M
+from service.storage.database import Database
+from service.storage.grid_format import PackedGrid, pack
+from service.storage.plan_places import place_columns
+from service.storage.records import ComputedGrid, GridKey, Original, PlanRecord
+from service.storage.statements import write_chunks
+from service.storage.stored_bytes import ROW_BYTES, StoredBytes
+from service.storage.stored_grids import grid_bytes, insert_grid
+from service.storage.tables import FLOORPLANS, ORIGINAL_CHUNKS, REVISIONS
+from service.stored_plan import PlanDocument
+
+
+@dataclass(frozen=True)
+class PlanContent:
+    """Documents, file and grid of a new revision, prepared before the transaction."""
+
+    document: PlanDocument
+    original: Original
+    original_sha256: str
+    grid: tuple[GridKey, PackedGrid] | None
+
+    @classmethod
+    def prepare(
+        cls, record: PlanRecord, original: Original, document: PlanDocument | None, grid: ComputedGrid | None
+    ) -> Self:
+        """Prepare the rows of a record.
+
+        Args:
+            record: the plan at its new revision.
+            original: the uploaded file.
+            document: the plan's stored form, if it is made already.
+            grid: the plan's own grid, if it is computed already.
+        """
+        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
+        document = document or PlanDocument.from_plan(record.plan)
+        return cls(document, original, hashlib.sha256(original.content).hexdigest(), packed)
+
+    @property
+    def stored(self) -> StoredBytes:
+        """Size of the rows."""
+        texts = (self.document.document, self.document.warnings, self.original.report)
+        # The texts are ASCII.
+        plan = ROW_BYTES + sum(len(text or "") for text in texts) + len(self.original.content)
+        return StoredBytes(plans=plan, grids=0 if self.grid is None else grid_bytes(self.grid[1]))
+
+
+def new_record(
+    plan: FloorPlan,
+    original: Original,
+    *,
+    plan_id: str,
+    tenant: str,
+    number: int,
+    created_at: datetime,
+    updated_at: datetime,
+) -> PlanRecord:
+    """Return the record of a plan at a new revision."""
+    return PlanRecord(
+        id=plan_id,
+        tenant=tenant,
+        revision_id=uuid.uuid4().hex,
+        revision=number,
+        created_at=created_at,
+        updated_at=updated_at,
+        plan=plan,
+        failure=None,
+        report=original.report,
+    )
+
+
+def count_plans(connection: Connection, tenant: str) -> int:
+    """Return the number of a tenant's plans."""
+    return connection.scalar(select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)) or 0
+
+
+def insert_plan(connection: Connection, database: Database, record: PlanRecord, content: PlanContent) -> bool:
+    """Insert a plan with its first revision; False if its id exists already."""
+    values = {"id": record.id, "tenant": record.tenant, "created_at": record.created_at, **revision_values(record)}
+    statement = database.insert(FLOORPLANS).values(values).on_conflict_do_nothing()
+    if connection.scalar(statement.returning(FLOORPLANS.c.id)) is None:
+        return False
+    insert_revision(connection, record, content)
+    return True
+
+
+def revision_values(record: PlanRecord) -> dict[str, Any]:
+    """Return the columns of `floorplans` that change with a revision."""
+    name = record.plan.name
+    return {
+        "name": name,
+        "folded_name": name.casefold(),
+        "revision_id": record.revision_id,
+        "updated_at": record.updated_at,
+        **place_columns(record.plan),
+    }
+
+
+def insert_revision(connection: Connection, record: PlanRecord, content: PlanContent) -> None:
+    """Insert a revision of a plan that exists."""
+    plan = record.plan
+    values = {
+        "id": record.revision_id,
+        "plan_id": record.id,
+        "number": record.revision,
+        "created_at": record.updated_at,
+        **asdict(content.document),
+        "original_sha256": content.original_sha256,
+        "original_media_type": content.original.media_type,
+        "report": content.original.report,
+        "room_count": len(plan.rooms),
+        "area_m2": plan.area_m2,
+        "camera_height_m": plan.camera_height_m,
+        "camera_height_std_m": _height_std_m(plan),
+        "stored_bytes": content.stored.plans,
+    }
+    connection.execute(REVISIONS.insert(), values)
+    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
+    if content.grid is not None:
+        insert_grid(connection, *content.grid)
+
+
+def _height_std_m(plan: FloorPlan) -> float | None:
+    """Return the standard deviation (m) of a plan's camera height; None for an unknown height."""
+    if plan.camera_height_std_m is not None:
+        return plan.camera_height_std_m
+    return DEFAULT_STD_M if plan.states_camera_height else None

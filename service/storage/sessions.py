@@ -1,0 +1,209 @@
+"""Sessions of tracked cameras: their state between two photographs.
+
+A photograph claims its session while it is computed, so that two at once cannot both move the camera. The claim of a
+process that died ends with its lease; the state is then that before the photograph.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import Connection, Row, delete, func, select, update
+
+from service.errors import (
+    PhotographOutOfOrderError,
+    SessionBusyError,
+    SessionOutdatedError,
+    TooManySessionsError,
+    UnknownFloorPlanError,
+    UnknownSessionError,
+)
+from service.storage.database import Database
+from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
+from service.storage.tables import FLOORPLANS, SESSIONS
+
+_COLUMNS = SESSIONS.c
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionRecord:
+    """Stored session.
+
+    Attributes:
+        options: the request that began it, as JSON.
+        photographs: number of photographs so far.
+        state: state of the filter; None before the first photograph.
+        pose: pose of the last photograph as JSON; None before the first.
+        claim: token of the claim, for `finish` and `release`; empty without one.
+    """
+
+    id: str
+    tenant: str
+    plan_id: str
+    revision_id: str
+    expires_at: datetime
+    options: str
+    photographs: int
+    state: bytes | None
+    pose: str | None
+    claim: str
+
+
+class Sessions:
+    """Sessions of all tenants, each visible to its own tenant."""
+
+    def __init__(self, database: Database, quota: StorageQuota, claim_s: float) -> None:
+        """Create the access to the table.
+
+        Args:
+            database: the database.
+            quota: counts the stored bytes.
+            claim_s: time limit (s) of a photograph, after which another one can be sent.
+        """
+        self._database = database
+        self._quota = quota
+        self._claim_s = claim_s
+
+    def add(
+        self, tenant: str, session_id: str, plan_id: str, revision_id: str, options: str, *, ttl_s: float, limit: int
+    ) -> SessionRecord:
+        """Store a session; return the one that exists under this id, if the request is repeated.
+
+        Raises:
+            TooManySessionsError: the tenant has `limit` sessions.
+            UnknownFloorPlanError: the plan was deleted.
+            StorageQuotaError: the tenant would store too many bytes.
+        """
+        now, own = datetime.now(UTC), _COLUMNS.tenant == tenant
+        size = ROW_BYTES + len(options.encode())
+        with self._database.writing(grows_by=size) as connection:
+            plan = select(FLOORPLANS.c.id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+            if connection.scalar(plan.with_for_update(read=True)) is None:
+                raise UnknownFloorPlanError(plan_id)
+            row = connection.execute(select(SESSIONS).where(own, _COLUMNS.id == session_id)).one_or_none()
+            if row is not None:
+                return _record(row)
+            freed = deleted_bytes(connection, delete(SESSIONS).where(own, _COLUMNS.expires_at < now))
+            if (connection.scalar(select(func.count()).select_from(SESSIONS).where(own)) or 0) >= limit:
+                raise TooManySessionsError(limit)
+            values = {
+                "id": session_id,
+                "tenant": tenant,
+                "plan_id": plan_id,
+                "revision_id": revision_id,
+                "created_at": now,
+                "expires_at": now + timedelta(seconds=ttl_s),
+                "options": options,
+                "photographs": 0,
+                "claim": "",
+                "claimed_until_s": 0.0,
+                "stored_bytes": size,
+            }
+            row = connection.execute(SESSIONS.insert().values(values).returning(SESSIONS)).one()
+            self._quota.settle(connection, tenant, StoredBytes(sessions=size - freed))
+        return _record(row)
+
+    def get(self, tenant: str, session_id: str) -> SessionRecord:
+        """Return a session.
+
+        Raises:
+            UnknownSessionError: no such session, or it has expired.
+        """
+        with self._database.reading() as connection:
+            return _record(self._find(connection, tenant, session_id))
+
+    def claim(self, tenant: str, session_id: str, number: int | None) -> SessionRecord:
+        """Claim a session for its next photograph; the caller then calls `finish` or `release`.
+
+        Args:
+            tenant: owner of the session.
+            session_id: its id.
+            number: number of the photograph, from 1; None for the next one.
+
+        Raises:
+            UnknownSessionError: no such session, or it has expired.
+            SessionBusyError: another photograph holds the claim.
+            PhotographOutOfOrderError: another photograph is next.
+        """
+        free = ~self._database.is_live(_COLUMNS.claimed_until_s, _COLUMNS.claim_s)
+        own = _COLUMNS.tenant == tenant, _COLUMNS.id == session_id, _COLUMNS.expires_at >= datetime.now(UTC)
+        values = {
+            "claim": uuid.uuid4().hex,
+            "claimed_until_s": self._database.now_s() + self._claim_s,
+            "claim_s": self._claim_s,
+        }
+        with self._database.writing() as connection:
+            taken = connection.execute(update(SESSIONS).where(*own, free).values(**values).returning(SESSIONS))
+            row = taken.one_or_none()
+            if row is None:
+                self._find(connection, tenant, session_id)
+                raise SessionBusyError(session_id)
+            if number is not None and number != row.photographs + 1:
+                # Rolls the claim back.
+                raise PhotographOutOfOrderError(session_id, number, row.photographs + 1)
+            return _record(row)
+
+    def finish(self, record: SessionRecord, state: bytes, pose: str, *, ttl_s: float) -> SessionRecord:
+        """Store the state after a photograph, and end the claim.
+
+        Raises:
+            SessionOutdatedError: the claim has expired, and another photograph took its place.
+            UnknownSessionError: the session was deleted meanwhile.
+            StorageQuotaError: the tenant would store too many bytes.
+        """
+        size = ROW_BYTES + len(record.options.encode()) + len(state) + len(pose.encode())
+        own = _COLUMNS.tenant == record.tenant, _COLUMNS.id == record.id
+        with self._database.writing(grows_by=size) as connection:
+            row = connection.execute(select(SESSIONS).where(*own).with_for_update()).one_or_none()
+            if row is None:
+                raise UnknownSessionError(record.id)
+            if row.claim != record.claim:
+                raise SessionOutdatedError(record.id, "the photograph took too long, and another one was answered")
+            values = {
+                "state": state,
+                "pose": pose,
+                "photographs": record.photographs + 1,
+                "expires_at": datetime.now(UTC) + timedelta(seconds=ttl_s),
+                "claim": "",
+                "claimed_until_s": 0.0,
+                "stored_bytes": size,
+            }
+            after = connection.execute(update(SESSIONS).where(*own).values(**values).returning(SESSIONS)).one()
+            self._quota.settle(connection, record.tenant, StoredBytes(sessions=size - row.stored_bytes))
+        return _record(after)
+
+    def release(self, record: SessionRecord) -> None:
+        """End the claim of a photograph that failed; the state stays as it was."""
+        own = _COLUMNS.id == record.id, _COLUMNS.claim == record.claim
+        with self._database.writing() as connection:
+            connection.execute(update(SESSIONS).where(*own).values(claim="", claimed_until_s=0.0))
+
+    def delete(self, tenant: str, session_id: str) -> bool:
+        """Delete a session; False without one."""
+        statement = delete(SESSIONS).where(_COLUMNS.tenant == tenant, _COLUMNS.id == session_id)
+
+        def work(connection: Connection) -> bool:
+            freed = deleted_bytes(connection, statement)
+            if freed:
+                self._quota.settle(connection, tenant, StoredBytes(sessions=-freed))
+            return freed > 0
+
+        return self._database.freeing(work)
+
+    def purge(self) -> int:
+        """Delete expired sessions, and return their number."""
+        return self._quota.purge("sessions", SESSIONS, _COLUMNS.expires_at < datetime.now(UTC))
+
+    def _find(self, connection: Connection, tenant: str, session_id: str) -> Row[tuple[object, ...]]:
+        wanted = _COLUMNS.tenant == tenant, _COLUMNS.id == session_id, _COLUMNS.expires_at >= datetime.now(UTC)
+        row = connection.execute(select(SESSIONS).where(*wanted)).one_or_none()
+        if row is None:
+            raise UnknownSessionError(session_id)
+        return row
+
+
+def _record(row: Row[tuple[object, ...]]) -> SessionRecord:
+    values = row._mapping
+    return SessionRecord(**{name: values[name] for name in SessionRecord.__dataclass_fields__})

@@ -1,0 +1,109 @@
+"""Rows of venues and of their plans."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import Connection, Row, delete, func, select, update
+
+from lalaloc_core.floorplan.earth import Anchor
+from service.errors import TooManyVenuesError
+from service.storage.database import Database
+from service.storage.records import VenueMember, VenueRecord
+from service.storage.tables import VENUE_PLANS, VENUES
+
+
+def find_venue(connection: Connection, tenant: str, venue_id: str) -> VenueRecord | None:
+    """Return a venue; None if the tenant has none of this id."""
+    row = connection.execute(select_venues(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)).one_or_none()
+    return None if row is None else venue_record(row)
+
+
+def insert_venue(
+    connection: Connection, database: Database, tenant: str, venue_id: str, name: str, anchor: Anchor | None
+) -> bool:
+    """Insert a venue without plans; False if its id exists already."""
+    now = datetime.now(UTC)
+    values = {"id": venue_id, "tenant": tenant, "number": 1, "created_at": now, **revision_values(name, anchor, now)}
+    statement = database.insert(VENUES).values(values).on_conflict_do_nothing()
+    return connection.scalar(statement.returning(VENUES.c.id)) is not None
+
+
+def insert_members(connection: Connection, venue_id: str, members: Sequence[VenueMember]) -> None:
+    """Insert plans of a venue."""
+    if members:
+        values = [
+            {"venue_id": venue_id, "plan_id": member.plan_id, "level": member.level, "name": member.name}
+            for member in members
+        ]
+        connection.execute(VENUE_PLANS.insert(), values)
+
+
+def check_count(connection: Connection, tenant: str, limit: int) -> None:
+    """Check the number of a tenant's venues; exact after `StorageQuota.settle`, which locks the tenant.
+
+    Raises:
+        TooManyVenuesError: there are more than `limit`.
+    """
+    own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
+    if (connection.scalar(own) or 0) > limit:
+        raise TooManyVenuesError(limit)
+
+
+def remove_from_venues(connection: Connection, plan_id: str) -> int:
+    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it.
+
+    Returns:
+        The number of deleted rows.
+    """
+    own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
+    venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
+    ids = connection.scalars(venues).all()
+    rows = connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.plan_id == plan_id)).rowcount
+    now = datetime.now(UTC)
+    for venue_id in ids:
+        values = {"revision_id": uuid.uuid4().hex, "number": VENUES.c.number + 1, "updated_at": now}
+        connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
+    return rows
+
+
+def revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
+    """Return the columns that change with a venue's revision."""
+    return {
+        "name": name,
+        "folded_name": name.casefold(),
+        "revision_id": uuid.uuid4().hex,
+        "updated_at": now,
+        "latitude": None if anchor is None else anchor.latitude,
+        "longitude": None if anchor is None else anchor.longitude,
+        "altitude_m": None if anchor is None else anchor.altitude_m,
+        "north_deg": None if anchor is None else anchor.north_deg,
+    }
+
+
+def select_venues(*conditions: Any) -> Any:
+    """Return a query for the rows of `venue_record`."""
+    own = VENUE_PLANS.c.venue_id == VENUES.c.id
+    plans = select(func.count()).select_from(VENUE_PLANS).where(own).scalar_subquery().label("plans")
+    return select(VENUES, plans).where(*conditions)
+
+
+def venue_record(row: Row[Any]) -> VenueRecord:
+    """Return the record of a venue's row."""
+    anchor = None
+    if row.latitude is not None:
+        anchor = Anchor(row.latitude, row.longitude, row.altitude_m, row.north_deg)
+    return VenueRecord(
+        id=row.id,
+        tenant=row.tenant,
+        revision_id=row.revision_id,
+        revision=row.number,
+        name=row.name,
+        anchor=anchor,
+        plans=getattr(row, "plans", 0),
+        created_at=row.created_at,
+        updated_at=row.updated_at,
+    )
