@@ -18,11 +18,15 @@ from lalaloc_client.answers import (
     Pool,
     Posterior,
     Readiness,
+    ReadView,
     SequenceLocalisation,
     SequencePose,
+    View,
 )
 from lalaloc_client.asynchronous.client import AsyncClient
+from lalaloc_client.asynchronous.tracker import AsyncTracker
 from lalaloc_client.blocking.client import Client
+from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.errors import (
     ClientError,
     ConflictError,
@@ -36,6 +40,7 @@ from lalaloc_client.errors import (
     ProblemError,
     UnauthorisedError,
 )
+from lalaloc_client.frames import RosPose, camera_matrix, heading_of, ros_covariance, ros_pose, world_from_plan, yaw_of
 from lalaloc_client.model import (
     Bounds,
     FloorPlan,
@@ -51,11 +56,13 @@ from lalaloc_client.model import (
     VenueAnchor,
     VenuePlan,
 )
-from lalaloc_client.requests import QueryOptions
+from lalaloc_client.requests import QueryOptions, ViewOptions
 from lalaloc_client.retry import RetryPolicy
+from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOptions, TrackedPose
 
 __all__ = [
     "AsyncClient",
+    "AsyncTracker",
     "Bounds",
     "Candidate",
     "Client",
@@ -72,10 +79,12 @@ __all__ = [
     "Localisation",
     "MalformedAnswerError",
     "Model",
+    "Motion",
     "NotFoundError",
     "NotReadyError",
     "OpeningPiece",
     "OverloadedError",
+    "PathPoint",
     "PlanEvent",
     "PlanProbability",
     "Pool",
@@ -83,14 +92,29 @@ __all__ = [
     "Posterior",
     "ProblemError",
     "QueryOptions",
+    "ReadView",
     "Readiness",
     "RetryPolicy",
+    "Rival",
     "Room",
     "RoomLayout",
+    "RosPose",
     "SequenceLocalisation",
     "SequencePose",
+    "Session",
+    "SessionOptions",
+    "TrackedPose",
+    "Tracker",
     "UnauthorisedError",
     "Venue",
     "VenueAnchor",
     "VenuePlan",
+    "View",
+    "ViewOptions",
+    "camera_matrix",
+    "heading_of",
+    "ros_covariance",
+    "ros_pose",
+    "world_from_plan",
+    "yaw_of",
 ]

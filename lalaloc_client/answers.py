@@ -89,14 +89,89 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class Localisation:
-    """Pose of a panorama.
+class AssumedAngle:
+    """Angle of a camera in degrees, with its standard deviation.
 
     Attributes:
-        heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y.
+        source: `given` (by the request), `gpano` or `exif` (metadata), `estimated` (from the picture) or `assumed`.
+    """
+
+    value_deg: float
+    std_deg: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Camera matrix and distortion of the upright photograph, pixels, in OpenCV's conventions."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SeenArc:
+    """Azimuths that photographs show, relative to the centre of the first, clockwise."""
+
+    from_deg: float
+    to_deg: float
+
+
+@dataclass(frozen=True)
+class ReadView:
+    """Assumptions about a photograph.
+
+    Attributes:
+        projection: `equirectangular`, `perspective`, `cylindrical` or `fisheye`.
+        projection_source: as `AssumedAngle.source`.
+        hfov: horizontal field of view.
+        pitch: elevation of the photograph's centre above the horizon.
+        roll: clockwise rotation of the camera about its optical axis.
+        camera: camera model; None for full spheres and strips.
+        seen: azimuths that the photographs behind the answer show.
+        warnings: metadata that were ignored, and estimates to check.
+    """
+
+    projection: str
+    projection_source: str
+    hfov: AssumedAngle
+    pitch: AssumedAngle
+    roll: AssumedAngle
+    camera: Camera | None
+    seen: tuple[SeenArc, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class View(ReadView):
+    """Assumptions about a photograph, and how much it could tell. See `ReadView` as well.
+
+    Attributes:
+        information_bits: information about the place.
+        ruled_out: share of the searched area that this rules out.
+        advice: how to photograph the place for a sure answer; None where it is sure.
+    """
+
+    information_bits: float
+    ruled_out: float
+    advice: str | None
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Pose of a photograph.
+
+    Attributes:
+        heading_deg: azimuth of the photograph's centre, clockwise from the plan's +y.
         heading_source: `given`, `panorama` (its metadata) or `searched`; None for services without this field.
         confidence: probability that the position error is below 1 m; None if the model is not calibrated.
         heading_confidence: probability that the heading error is below 5°.
+        probability_elsewhere: probability that the panorama is of none of the plan's places.
         warnings: options that were not followed, such as a heading that the panorama contradicts.
         camera_height_m: the best camera height.
         geopose: the pose on Earth; None without an anchor of plan or venue.
@@ -112,6 +187,7 @@ class Localisation:
         plans: the most probable plans of the venue, most probable first.
         answer_id: id of the answer for `get_answer`; None if the service does not store it.
         posterior: probability of every place, if requested.
+        view: assumptions about the photograph; None for services without this field.
     """
 
     floorplan_id: str
@@ -139,6 +215,8 @@ class Localisation:
     plans: tuple[PlanProbability, ...] | None = None
     answer_id: str | None = None
     posterior: Posterior | None = None
+    view: View | None = None
+    probability_elsewhere: float | None = None
 
 
 @dataclass(frozen=True)
@@ -201,7 +279,7 @@ class GeoPoseAnswer:
 
 @dataclass(frozen=True)
 class SequencePose:
-    """Pose of one panorama of a sequence, from all of them jointly; attributes as in `Localisation`."""
+    """Pose of one photograph of a sequence, from all of them jointly; attributes as in `Localisation`."""
 
     position: Position
     heading_deg: float
@@ -217,14 +295,16 @@ class SequencePose:
     latent_distance: float
     candidates: tuple[Candidate, ...]
     geopose: GeoPose | None = None
+    view: View | None = None
+    probability_elsewhere: float | None = None
 
 
 @dataclass(frozen=True)
 class SequenceLocalisation:
-    """Poses of the panoramas of one visit.
+    """Poses of the photographs of one visit.
 
     Attributes:
-        poses: one pose per panorama.
+        poses: one pose per photograph.
         confidence: probability that all position errors are below 1 m.
         warnings: motions that were not followed.
         stage: `retrieval` or `lpo`.

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
-Panorama: TypeAlias = "bytes | str | os.PathLike[str] | Image"
+Photograph: TypeAlias = "bytes | str | os.PathLike[str] | Image"
+Projection = Literal["auto", "equirectangular", "perspective", "cylindrical", "fisheye"]
 Refine = Literal["none", "vdr", "lpo"]
 SequenceRefine = Literal["none", "lpo"]
 Picture = Literal["both", "plan", "photograph"]
@@ -39,11 +40,31 @@ _IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
 
 
-class QueryOptions(TypedDict, total=False):
-    """Options of a query; an option that is left out or None has the default.
+class ViewOptions(TypedDict, total=False):
+    """Options about the camera; an option that is left out or None has the default, from the photograph's metadata.
 
     Attributes:
-        heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y. Default: search for it.
+        projection: `perspective` for ordinary cameras, `equirectangular` for 360° cameras, `cylindrical` for strips of
+            a phone's panorama mode, `fisheye`. Default: `auto`.
+        hfov_deg: horizontal field of view of the upright photograph.
+        intrinsics: camera matrix and distortion by OpenCV instead, such as {"fx": 2870, "fy": 2868, "k1": -0.03}: "fx",
+            "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2"; "k4" for `fisheye`, without "p1" and "p2".
+        pitch_deg: elevation of the photograph's centre above the horizon. Default: estimated.
+        roll_deg: clockwise rotation of the camera about its optical axis. Default: estimated.
+    """
+
+    projection: Projection | None
+    hfov_deg: float | None
+    intrinsics: Mapping[str, float] | None
+    pitch_deg: float | None
+    roll_deg: float | None
+
+
+class QueryOptions(ViewOptions, total=False):
+    """Options of a query; an option that is left out or None has the default. See `ViewOptions` as well.
+
+    Attributes:
+        heading_deg: azimuth of the photograph's centre, clockwise from the plan's +y. Default: search for it.
         heading_tolerance_deg: maximum error of `heading_deg`, up to 45. Default: 0.
         camera_height_m: camera height over the floor. Default: that of the plan; unknown if the plan has none.
         camera_height_std_m: standard deviation of the camera height, which is then estimated; 0 means exact. Default:
@@ -111,7 +132,7 @@ def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[s
     return {"base_url": address, "headers": headers, "timeout": timeout_s}
 
 
-def resource_path(collection: Literal["floorplans", "venues", "answers"], resource_id: str) -> str:
+def resource_path(collection: Literal["floorplans", "venues", "answers", "sessions"], resource_id: str) -> str:
     """Return the path of a resource.
 
     Raises:
@@ -166,7 +187,9 @@ def plan_request(
     else:
         content = Path(document).read_bytes()
     if options:
-        media, content = _form("file", [content], options)
+        # The default name of a venue.
+        name = os.path.basename(document) if isinstance(document, str | os.PathLike) else "venue"
+        media, content = _form("file", [content], options, file_name=name)
     else:
         media = _JSON if isinstance(document, Mapping) else _FILE
     headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}
@@ -175,9 +198,9 @@ def plan_request(
 
 def query_request(
     path: str,
-    panoramas: Sequence[Panorama],
+    photographs: Sequence[Photograph],
     values: Mapping[str, object],
-    options: QueryOptions | None = None,
+    options: QueryOptions | ViewOptions | None = None,
     *,
     params: Mapping[str, str] | None = None,
     accept: str = _JSON,
@@ -189,16 +212,16 @@ def query_request(
         ValueError: a number is not finite.
     """
     known = dict(options or {})
-    if unknown := known.keys() - QueryOptions.__annotations__.keys():
+    if unknown := known.keys() - (QueryOptions.__optional_keys__ | QueryOptions.__required_keys__):
         raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
     if isinstance(rooms := known.get("rooms"), str):
         known["rooms"] = [rooms]
-    media, content = _form("panorama", [_picture(panorama) for panorama in panoramas], {**values, **known})
+    media, content = _form("photo", [_picture(photograph) for photograph in photographs], {**values, **known})
     return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content)
 
 
 def geopose_request(
-    panorama: Panorama,
+    photograph: Photograph,
     params: Mapping[str, Any],
     latitude: float | None,
     longitude: float | None,
@@ -208,7 +231,7 @@ def geopose_request(
 
     Raises:
         ValueError: only one of latitude and longitude is given, an accuracy is given without them, a number is not
-            finite, or the panorama is not a picture file.
+            finite, or the photograph is not a picture file.
     """
     if (latitude is None) != (longitude is None):
         raise ValueError(f"latitude is {latitude} and longitude is {longitude}; give both or neither")
@@ -220,7 +243,7 @@ def geopose_request(
     now_ms = time.time_ns() // 1_000_000
     kinds = ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
     common = {"timestamp": now_ms, "privacy": {f"data{kind}": [] for kind in kinds}}
-    content = _picture(panorama)
+    content = _picture(photograph)
     camera = {
         "sensorId": "camera",
         "sequenceNumber": 0,
@@ -270,7 +293,9 @@ def _safety(if_match: str | None, safety: Safety = Safety.ANY) -> Safety:
     return safety if if_match is None else Safety.UNSENT
 
 
-def _form(name: str, contents: Sequence[bytes], values: Mapping[str, object]) -> tuple[str, bytes]:
+def _form(
+    name: str, contents: Sequence[bytes], values: Mapping[str, object], *, file_name: str | None = None
+) -> tuple[str, bytes]:
     """Return media type and content of a form with files, all in the field `name`."""
     # Derived from the content, so that the same request has the same bytes.
     boundary = hashlib.sha256(b"".join(contents)).hexdigest()
@@ -279,18 +304,18 @@ def _form(name: str, contents: Sequence[bytes], values: Mapping[str, object]) ->
         "http://service/",
         headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
         data=text_values(values),
-        files=[(name, (name, content, _FILE)) for content in contents],
+        files=[(name, (file_name or name, content, _FILE)) for content in contents],
     )
     return encoded.headers["content-type"], encoded.read()
 
 
-def _picture(panorama: Panorama) -> bytes:
-    if isinstance(panorama, bytes):
-        return panorama
-    if isinstance(panorama, str | os.PathLike):
-        return Path(panorama).read_bytes()
+def _picture(photograph: Photograph) -> bytes:
+    if isinstance(photograph, bytes):
+        return photograph
+    if isinstance(photograph, str | os.PathLike):
+        return Path(photograph).read_bytes()
     buffer = io.BytesIO()
-    panorama.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    photograph.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()
 
 
@@ -298,7 +323,7 @@ def _image_format(content: bytes) -> str:
     for prefix, name in _IMAGE_FORMATS.items():
         if content.startswith(prefix):
             return name
-    raise ValueError(f"panorama begins with {content[:4]!r}; it must be a JPEG, PNG or WebP file")
+    raise ValueError(f"the photograph begins with {content[:4]!r}; it must be a JPEG, PNG or WebP file")
 
 
 def _check_finite(name: str, value: object) -> None:

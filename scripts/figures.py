@@ -1,4 +1,4 @@
-"""Tables of docs/results.md and docs/reference/paper-tables.md, from measured figures in docs/ and the manifest."""
+"""Tables of the documentation, from measured figures in docs/ and the manifest."""
 
 from __future__ import annotations
 
@@ -52,6 +52,96 @@ def accuracy_table() -> str:
     return "\n".join(rows)
 
 
+_TERM_ROWS = {
+    "all": "all",
+    "without_openings": "without openings",
+    "without_see_through": "without seeing through openings",
+    "without_ceiling": "without ceilings",
+    "without_room_type": "without room types",
+    "walls_alone": "walls alone",
+}
+
+
+def terms_table() -> str:
+    """Return the share within 1 m with and without terms of the matching cost as a Markdown table."""
+    rows = [
+        "| terms | test, known heading | test, unknown | out-of-distribution, known | out-of-distribution, unknown |",
+        "|---|---|---|---|---|",
+    ]
+    homes = _bench()["terms"]
+    for name, title in _TERM_ROWS.items():
+        cells = (homes[split][name][heading] for split in homes for heading in ("known_heading", "unknown_heading"))
+        rows.append(_row(title, *(_percent(scores["within_1m"]) for scores in cells)))
+    return "\n".join(rows)
+
+
+_VIEW_ROWS = {
+    "view_60_unknown_heading": "60°, unknown heading",
+    "view_80_unknown_heading": "80°, unknown heading",
+    "view_80_known_tilt": "80°, unknown heading, tilt stated",
+    "view_80_unknown_field": "80°, unknown heading, nothing stated",
+    "view_106_unknown_heading": "106°, unknown heading",
+    "view_80_heading_within_10_deg": "80°, heading known within 10°",
+    "heldout_view_80_unknown_heading": "out-of-distribution, 80°, unknown heading",
+    "heldout_view_106_unknown_heading": "out-of-distribution, 106°, unknown heading",
+}
+
+_TURN_ROWS = {
+    "known_angles": "three of 80° from one spot, known angles between them, unknown heading",
+    "unknown_angles": "three of 80° from one spot, unknown angles",
+}
+
+_UNINFORMATIVE_ROWS = {
+    "blank_wall": "wall without openings, 50°",
+    "ceiling": "ceiling, 80°, 60° upwards",
+    "landscape": "drawn landscape, 80°",
+}
+
+_SPEED_ROWS = {
+    "known_heading": "sphere, known heading",
+    "unknown_heading": "sphere, unknown heading",
+    "phone": "photograph of 80° and 12 megapixels, unknown heading",
+}
+
+
+def views_table() -> str:
+    """Return accuracy and calibration of views in furnished synthetic homes as a Markdown table."""
+    rows = [
+        "| views of furnished homes | < 1 m [95 %] | < 1 m and 30° | among five | median | calibration error | n |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, title in _VIEW_ROWS.items():
+        scores = _bench()["views"][name]
+        low, high = scores["within_1m_interval"]
+        rows.append(
+            _row(
+                title,
+                f"{_percent(scores['within_1m'])} [{100 * low:.0f}, {100 * high:.0f}]",
+                _percent(scores["within_1m_30deg"]),
+                _percent(scores["among_5"]),
+                f"{scores['median_cm']:.0f} cm",
+                f"{scores['expected_calibration_error']:.3f}",
+                f"{scores['n']}",
+            )
+        )
+    for name, title in _TURN_ROWS.items():
+        scores = _bench()["turns"][name]
+        shares = _percent(scores["within_1m"]), _percent(scores["within_1m_30deg"]), "–"
+        error = f"{scores['expected_calibration_error']:.3f}"
+        rows.append(_row(title, *shares, f"{scores['median_cm']:.0f} cm", error, f"{scores['n']}"))
+    return "\n".join(rows)
+
+
+def uninformative_table() -> str:
+    """Return the confidence of photographs that cannot tell the place as a Markdown table."""
+    rows = ["| photograph | confidence above 0.5 | median | highest | n |", "|---|---|---|---|---|"]
+    for name, title in _UNINFORMATIVE_ROWS.items():
+        found = _bench()["uninformative"][name]
+        values = _percent(found["above_half"]), f"{found['median']:.2f}", f"{found['highest']:.2f}", f"{found['n']}"
+        rows.append(_row(title, *values))
+    return "\n".join(rows)
+
+
 def speed_table() -> str:
     """Return latency and memory of the service as a Markdown table."""
     service = _bench()["service"]
@@ -59,7 +149,7 @@ def speed_table() -> str:
     rows = [
         "| what | measured |",
         "|---|---|",
-        *(_latency(heading, service) for heading in ("known", "unknown")),
+        *(_latency(title, service[name]) for name, title in _SPEED_ROWS.items()),
         _row("memory: service with one plan; its LPO worker", f"{service['service_resident_mb']:.0f} MB; {memory}"),
         _row("model bundle", f"{_bundle_mb():.1f} MB"),
     ]
@@ -97,11 +187,10 @@ def _bundle_mb() -> float:
     return sum(entry["bytes"] for entry in manifest["files"].values()) / 1e6
 
 
-def _latency(heading: str, service: dict[str, Any]) -> str:
-    measured = service[f"{heading}_heading"]
+def _latency(title: str, measured: dict[str, Any]) -> str:
     stages = measured["median_stage_ms"]
     parts = ", ".join(f"{name} {stages[name]:.0f}" for name in ("decode", "encode", "retrieve", "lpo"))
     return _row(
-        f"`/localise`, {heading} heading, one client: p50, p95 (median of stages)",
+        f"`/localise`, {title}, one client: p50, p95 (median of stages)",
         f"{measured['p50_ms']:.0f} ms, {measured['p95_ms']:.0f} ms ({parts} ms)",
     )

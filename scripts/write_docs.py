@@ -15,7 +15,15 @@ from pathlib import Path
 import yaml
 
 from lalaloc_core.cli import entry_point
-from scripts.figures import accuracy_table, neighbours_table, paper_tables, speed_table
+from scripts.figures import (
+    accuracy_table,
+    neighbours_table,
+    paper_tables,
+    speed_table,
+    terms_table,
+    uninformative_table,
+    views_table,
+)
 from service import cli as service_cli
 from service.openapi import openapi_text
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
@@ -146,6 +154,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "problems": problems_table,
     "cli": commands,
     "accuracy": accuracy_table,
+    "terms": terms_table,
+    "views": views_table,
+    "uninformative": uninformative_table,
     "speed": speed_table,
     "neighbours": neighbours_table,
     "paper": paper_tables,

@@ -68,7 +68,7 @@ class AsyncTransport:
 
     async def limits(self) -> Mapping[str, Any]:
         """Return the service's limits by name."""
-        return parse(dict[str, Any], await self._content(Request("GET", "/limits")))
+        return parse(dict[str, Any], await self.content(Request("GET", "/limits")))
 
     async def _fetch_max_queries(self) -> int:
         try:
@@ -78,12 +78,12 @@ class AsyncTransport:
             return _DEFAULT_MAX_QUERIES
         return limit if isinstance(limit, int) and limit > 0 else _DEFAULT_MAX_QUERIES
 
-    async def _query(self, make: Callable[P, Request], *args: P.args, **kwargs: P.kwargs) -> bytes:
+    async def query(self, make: Callable[P, Request], *args: P.args, **kwargs: P.kwargs) -> bytes:
         """Build a query and send it as soon as the concurrency limit allows both; return the answer's content."""
         async with self._concurrency.hold():
             # Reading and encoding pictures blocks.
             request = await run_blocking(make, *args, **kwargs)
-            return await self._content(request)
+            return await self.content(request)
 
     async def _stored(self, kind: type[StoredT], request: Request, retry: RetryPolicy | None = None) -> StoredT:
         """Send a request and return the stored object in the answer, with its entity tag."""
@@ -94,13 +94,14 @@ class AsyncTransport:
         """Request a listing page by page."""
         cursor = None
         while True:
-            page = parse(kind, await self._content(Request("GET", path, text_values({**params, "cursor": cursor}))))
+            page = parse(kind, await self.content(Request("GET", path, text_values({**params, "cursor": cursor}))))
             yield page
             cursor = page.next_cursor
             if cursor is None:
                 return
 
-    async def _content(self, request: Request) -> bytes:
+    async def content(self, request: Request) -> bytes:
+        """Send a request and return the answer's content."""
         return (await self._send(request)).content
 
     async def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:

@@ -15,6 +15,7 @@ from httpx_sse import EventSource
 
 from lalaloc_client.answers import GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.blocking.backend import run_blocking, sleep
+from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
 from lalaloc_client.model import (
@@ -34,12 +35,13 @@ from lalaloc_client.requests import (
     PICTURE_MEDIA,
     Covariance,
     Document,
-    Panorama,
+    Photograph,
     Picture,
     PictureFormat,
     QueryOptions,
     Request,
     SequenceRefine,
+    ViewOptions,
     geopose_request,
     json_request,
     plan_request,
@@ -49,6 +51,7 @@ from lalaloc_client.requests import (
     text_values,
 )
 from lalaloc_client.retry import Safety
+from lalaloc_client.tracking import SessionOptions
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 # Pause between two streams of events until the service sends its own, as it does at the start of each stream.
@@ -72,7 +75,7 @@ class Client(Transport):
     def ready(self) -> Readiness:
         """Return whether the service can answer at full quality."""
         # 503 means "not ready", which is an answer.
-        return parse(Readiness, self._content(Request("GET", "/readyz", answers=frozenset({200, 503}))))
+        return parse(Readiness, self.content(Request("GET", "/readyz", answers=frozenset({200, 503}))))
 
     # Floor plans
 
@@ -125,7 +128,7 @@ class Client(Transport):
 
     def original(self, floorplan_id: str) -> bytes:
         """Return the file of a plan's current revision exactly as it was uploaded."""
-        return self._content(Request("GET", f"{resource_path('floorplans', floorplan_id)}/original"))
+        return self.content(Request("GET", f"{resource_path('floorplans', floorplan_id)}/original"))
 
     def preview(
         self,
@@ -143,12 +146,12 @@ class Client(Transport):
         """
         params = preview_params(x_m, y_m, heading_deg, covariance_m2)
         path = f"{resource_path('floorplans', floorplan_id)}/preview.svg"
-        return (self._content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
+        return (self.content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
 
     def export(self, floorplan_id: str, file_format: str) -> bytes:
         """Return a plan as a file: `native`, `geojson`, `imdf` (for plans with an anchor), `dxf` or `svg`."""
         path = f"{resource_path('floorplans', floorplan_id)}/export"
-        return self._content(Request("GET", path, {"format": file_format}))
+        return self.content(Request("GET", path, {"format": file_format}))
 
     def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
         """Return the walls and openings of a plan, room by room, from which a camera's view can be drawn.
@@ -156,12 +159,12 @@ class Client(Transport):
         `revision` is an older revision, while the service keeps it. Default: the current one.
         """
         path = f"{resource_path('floorplans', floorplan_id)}/layout"
-        return parse(Layout, self._content(Request("GET", path, text_values({"revision": revision}))))
+        return parse(Layout, self.content(Request("GET", path, text_values({"revision": revision}))))
 
     def mesh(self, floorplan_id: str) -> bytes:
         """Return floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""
         path = f"{resource_path('floorplans', floorplan_id)}/mesh.glb"
-        return self._content(Request("GET", path, headers={"Accept": "model/gltf-binary"}))
+        return self.content(Request("GET", path, headers={"Accept": "model/gltf-binary"}))
 
     def events(self, floorplan_id: str) -> Iterator[PlanEvent]:
         """Yield the progress of a plan until it is ready, failed or deleted.
@@ -240,6 +243,28 @@ class Client(Transport):
         document = _venue_document(plans, name, anchor)
         return self._stored(Venue, json_request("POST", "/venues", document, idempotency_key=key))
 
+    def upload_venue(
+        self,
+        file: Document,
+        *,
+        name: str | None = None,
+        options: Mapping[str, object] | None = None,
+        idempotency_key: str | None = None,
+    ) -> Venue:
+        """Store a plan of every level of a file, and a venue of these plans; see `venue_plans`.
+
+        Args:
+            file: as for `upload_floorplan`.
+            name: name of the venue, which also begins the names of several plans: "Duplex – Level 1". Default: the name
+                of the file.
+            options: import options, as for `upload_floorplan`, without `level`.
+            idempotency_key: as for `upload_floorplan`.
+        """
+        key = idempotency_key or uuid.uuid4().hex
+        values = dict(options or {}, name=name)
+        request = run_blocking(plan_request, "POST", "/venues", file, values, idempotency_key=key)
+        return self._stored(Venue, request)
+
     def replace_venue(
         self,
         venue_id: str,
@@ -304,24 +329,24 @@ class Client(Transport):
     # Queries
 
     def localise(
-        self, floorplan_id: str, panorama: Panorama, *, posterior: bool = False, **options: Unpack[QueryOptions]
+        self, floorplan_id: str, panorama: Photograph, *, posterior: bool = False, **options: Unpack[QueryOptions]
     ) -> Localisation:
-        """Localise a panorama in a plan.
+        """Localise a photograph in a plan.
 
         Args:
             floorplan_id: id of the plan.
-            panorama: the full sphere, twice as wide as high: bytes or path of a JPEG, PNG or WebP file, or a PIL image,
-                which is sent as JPEG.
+            panorama: the photograph: bytes or path of a JPEG, PNG, WebP or HEIC file, or a PIL image, which is sent as
+                JPEG without metadata. Models without an encoder of views need full 360° spheres.
             posterior: include the probability of every place of the plan in the answer.
             **options: see `QueryOptions`.
         """
         values = {"floorplan_id": floorplan_id, "include": "posterior" if posterior else None}
-        return parse(Localisation, self._query(query_request, "/localise", [panorama], values, options))
+        return parse(Localisation, self.query(query_request, "/localise", [panorama], values, options))
 
     def localise_in_venue(
-        self, venue_id: str, panorama: Panorama, *, level: float | None = None, **options: Unpack[QueryOptions]
+        self, venue_id: str, panorama: Photograph, *, level: float | None = None, **options: Unpack[QueryOptions]
     ) -> Localisation:
-        """Localise a panorama in the plans of a venue.
+        """Localise a photograph in the plans of a venue.
 
         Args:
             venue_id: id of the venue.
@@ -331,13 +356,16 @@ class Client(Transport):
                 in the common frame of its plans.
         """
         values = {"venue_id": venue_id, "level": level}
-        return parse(Localisation, self._query(query_request, "/localise", [panorama], values, options))
+        return parse(Localisation, self.query(query_request, "/localise", [panorama], values, options))
 
     def localise_sequence(
         self,
         floorplan_id: str,
-        panoramas: Sequence[Panorama],
+        panoramas: Sequence[Photograph],
         *,
+        motion: Literal["walk", "turn"] | None = None,
+        relative_heading_deg: Sequence[float | None] | None = None,
+        relative_heading_std_deg: float | None = None,
         motions: Sequence[Mapping[str, float] | None] | None = None,
         headings_deg: Sequence[float | None] | None = None,
         heading_tolerance_deg: float | None = None,
@@ -345,24 +373,34 @@ class Client(Transport):
         camera_height_std_m: float | None = None,
         refine: SequenceRefine | None = None,
         top_k: int | None = None,
+        **options: Unpack[ViewOptions],
     ) -> SequenceLocalisation:
-        """Localise several panoramas of one visit jointly.
+        """Localise several photographs of one visit jointly.
 
         Args:
             floorplan_id: id of the plan.
-            panoramas: panoramas in the order in which they were taken, each as for `localise`.
-            motions: measurements between consecutive panoramas, any of {"distance_m": 2.4, "distance_std_m": 0.1,
-                "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2}, or None: the turn of
-                the heading, clockwise, and the direction of the motion relative to the first heading.
-            headings_deg: heading of each panorama, None where unknown.
+            panoramas: photographs in the order in which they were taken, each as for `localise`.
+            motion: `turn` for photographs from one spot, else `walk`, the default.
+            relative_heading_deg: for `turn`, headings relative to each other, clockwise, None where unknown. Default:
+                searched.
+            relative_heading_std_deg: their standard deviation. Default: 2.
+            motions: for `walk`, measurements between consecutive photographs, any of {"distance_m": 2.4,
+                "distance_std_m": 0.1, "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2},
+                or None: the turn of the heading, clockwise, and the direction of the motion relative to the first
+                heading.
+            headings_deg: heading of each photograph, None where unknown.
             heading_tolerance_deg: maximum error of the headings. Default: 0.
-            camera_height_m: camera height, common to all panoramas, as in `QueryOptions`.
+            camera_height_m: camera height, common to all photographs, as in `QueryOptions`.
             camera_height_std_m: its standard deviation, as in `QueryOptions`.
             refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
-            top_k: number of candidates per panorama. Default: set by the service.
+            top_k: number of candidates per photograph. Default: set by the service.
+            **options: camera of all photographs, see `ViewOptions`.
         """
         values = {
             "floorplan_id": floorplan_id,
+            "motion": motion,
+            "relative_heading_deg": relative_heading_deg,
+            "relative_heading_std_deg": relative_heading_std_deg,
             "motions": motions,
             "headings_deg": headings_deg,
             "heading_tolerance_deg": heading_tolerance_deg,
@@ -371,19 +409,28 @@ class Client(Transport):
             "refine": refine,
             "top_k": top_k,
         }
-        content = self._query(query_request, "/localise/sequence", panoramas, values)
+        content = self.query(query_request, "/localise/sequence", panoramas, values, options)
         return parse(SequenceLocalisation, content)
+
+    def track(self, floorplan_id: str, **options: Unpack[SessionOptions]) -> Tracker:
+        """Return a tracker, which follows a camera from photograph to photograph.
+
+        Args:
+            floorplan_id: id of the plan.
+            **options: see `SessionOptions`.
+        """
+        return Tracker(self, floorplan_id, options)
 
     def picture(
         self,
         floorplan_id: str,
-        panorama: Panorama,
+        panorama: Photograph,
         picture: Picture = "both",
         *,
         picture_format: PictureFormat = "png",
         **options: Unpack[QueryOptions],
     ) -> bytes:
-        """Localise a panorama in a plan and return the answer as a picture 1600 pixels wide.
+        """Localise a photograph in a plan and return the answer as a picture 1600 pixels wide.
 
         Args:
             floorplan_id: id of the plan.
@@ -397,11 +444,11 @@ class Client(Transport):
             raise ValueError(f"picture_format is {picture_format!r}; it must be one of {', '.join(PICTURE_MEDIA)}")
         values = {"floorplan_id": floorplan_id}
         media, params = PICTURE_MEDIA[picture_format], {"picture": picture}
-        return self._query(query_request, "/localise", [panorama], values, options, params=params, accept=media)
+        return self.query(query_request, "/localise", [panorama], values, options, params=params, accept=media)
 
     def geopose(
         self,
-        panorama: Panorama,
+        panorama: Photograph,
         *,
         floorplan_id: str | None = None,
         venue_id: str | None = None,
@@ -409,7 +456,7 @@ class Client(Transport):
         longitude: float | None = None,
         accuracy_m: float | None = None,
     ) -> GeoPoseAnswer:
-        """Localise a panorama on Earth by the OSCP GeoPose protocol.
+        """Localise a photograph on Earth by the OSCP GeoPose protocol.
 
         Args:
             panorama: as for `localise`.
@@ -420,12 +467,12 @@ class Client(Transport):
             accuracy_m: maximum error of that place. Default: unknown.
         """
         params = text_values({"floorplan_id": floorplan_id, "venue_id": venue_id})
-        content = self._query(geopose_request, panorama, params, latitude, longitude, accuracy_m)
+        content = self.query(geopose_request, panorama, params, latitude, longitude, accuracy_m)
         return parse(GeoPoseAnswer, content)
 
     def get_answer(self, answer_id: str) -> Localisation:
         """Return a stored answer by its `answer_id`."""
-        return parse(Localisation, self._content(Request("GET", resource_path("answers", answer_id))))
+        return parse(Localisation, self.content(Request("GET", resource_path("answers", answer_id))))
 
     def forget_answer(self, answer_id: str) -> None:
         """Delete a stored answer."""

@@ -69,7 +69,7 @@ class Transport:
 
     def limits(self) -> Mapping[str, Any]:
         """Return the service's limits by name."""
-        return parse(dict[str, Any], self._content(Request("GET", "/limits")))
+        return parse(dict[str, Any], self.content(Request("GET", "/limits")))
 
     def _fetch_max_queries(self) -> int:
         try:
@@ -79,12 +79,12 @@ class Transport:
             return _DEFAULT_MAX_QUERIES
         return limit if isinstance(limit, int) and limit > 0 else _DEFAULT_MAX_QUERIES
 
-    def _query(self, make: Callable[P, Request], *args: P.args, **kwargs: P.kwargs) -> bytes:
+    def query(self, make: Callable[P, Request], *args: P.args, **kwargs: P.kwargs) -> bytes:
         """Build a query and send it as soon as the concurrency limit allows both; return the answer's content."""
         with self._concurrency.hold():
             # Reading and encoding pictures blocks.
             request = run_blocking(make, *args, **kwargs)
-            return self._content(request)
+            return self.content(request)
 
     def _stored(self, kind: type[StoredT], request: Request, retry: RetryPolicy | None = None) -> StoredT:
         """Send a request and return the stored object in the answer, with its entity tag."""
@@ -95,13 +95,14 @@ class Transport:
         """Request a listing page by page."""
         cursor = None
         while True:
-            page = parse(kind, self._content(Request("GET", path, text_values({**params, "cursor": cursor}))))
+            page = parse(kind, self.content(Request("GET", path, text_values({**params, "cursor": cursor}))))
             yield page
             cursor = page.next_cursor
             if cursor is None:
                 return
 
-    def _content(self, request: Request) -> bytes:
+    def content(self, request: Request) -> bytes:
+        """Send a request and return the answer's content."""
         return (self._send(request)).content
 
     def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:
