@@ -1,7 +1,7 @@
 // Builds the web pages into service/web, with the digest of their sources.
 import { createHash } from "node:crypto";
 import { copyFileSync, mkdirSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
-import { dirname, join, relative, sep } from "node:path";
+import { basename, dirname, join, relative, sep } from "node:path";
 import { fileURLToPath } from "node:url";
 
 import { build } from "esbuild";
@@ -9,8 +9,7 @@ import { build } from "esbuild";
 const here = dirname(fileURLToPath(import.meta.url));
 const root = dirname(here);
 const out = join(root, "service", "web");
-// Shown on the first visit.
-const examples = ["flat.json", "living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg"];
+const examples = ["flat.json", "living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg", "real/rooms.json", "real/lythwood_room.jpg"];
 
 function files(folder) {
   return readdirSync(folder, { recursive: true, withFileTypes: true })
@@ -48,7 +47,7 @@ for (const name of ["index.html", "docs.html", "icon.svg"]) copyFileSync(join(he
 for (const name of ["swagger-ui-bundle.js", "swagger-ui-bundle.js.LICENSE.txt", "swagger-ui.css"]) {
   copyFileSync(join(here, "node_modules", "swagger-ui-dist", name), join(out, name));
 }
-for (const name of examples) copyFileSync(join(root, "examples", name), join(out, `example-${name}`));
+for (const name of examples) copyFileSync(join(root, "examples", name), join(out, `example-${basename(name)}`));
 const built = readdirSync(out).sort();
 const digests = Object.fromEntries(built.map((name) => [name, digest(join(out, name))]));
 writeFileSync(join(out, "built.json"), JSON.stringify({ sources: sum.digest("hex"), files: digests }, null, 1) + "\n");

@@ -1,13 +1,20 @@
 /** Answer as text: place, confidence, other candidates, timings, and code for the same query. */
 
+import {
+  accuracyWords, adviceWords, confidenceWords, HEADING_SOURCES, headingWords, milliseconds, percent, seenWords, STAGES, viewWords,
+} from "./answer_words";
 import { button, byId, h, show } from "./dom";
 import { say } from "./notices";
 import type { Photo } from "./photos";
+import { type Place, placesOf, remainder } from "./places";
+import { plainWords } from "./plain_words";
 import { curlSnippet, pythonSnippet } from "./snippets";
-import type { Answer, Candidate } from "./types";
+import type { Answer } from "./types";
 import { planLabel } from "./venues";
 
 const MAX_PLANS = 3;
+// From this probability on, the answer says in words that the photograph can show another place.
+const NOTABLE_ELSEWHERE = 0.1;
 
 export interface AnswerActions {
   /** Move the marker to a candidate. */
@@ -20,11 +27,13 @@ export interface AnswerActions {
 export function showAnswer(answer: Answer | null, photo: Photo | null, actions: AnswerActions): void {
   const panel = byId("answer");
   panel.hidden = answer === null;
+  // The answer is first on narrow screens.
+  document.body.classList.toggle("answered", answer !== null);
   if (answer === null) {
     show(byId("answer-body"));
     return;
   }
-  show(byId("answer-body"), summary(answer), ...warnings(answer), candidates(answer, actions), facts(answer), sharing(answer, photo, actions));
+  show(byId("answer-body"), summary(answer), places(answer, actions), ...remarks(answer), h("div", { class: "after" }, facts(answer), sharing(answer, photo, actions)));
 }
 
 /** Mark the selected candidate. */
@@ -35,14 +44,14 @@ export function markSelected(index: number | null): void {
 }
 
 function summary(answer: Answer): HTMLElement {
-  const share = answer.confidence ?? 0;
-  const { x_m, y_m } = answer.position;
+  const { x_m, y_m } = answer.position, share = answer.confidence ?? 0;
   const accuracy = accuracyWords(answer);
   return h("div", { class: "verdict" },
     h("p", { class: "words" }, confidenceWords(answer.confidence)),
     h("p", { class: "room" }, answer.room),
     answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
-    h("p", { class: "where" }, `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m`, accuracy && h("span", { title: "One standard deviation, along the longer axis" }, ` ${accuracy}`)),
+    h("p", { class: "where" }, `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`),
+    h("p", { class: "hint" }, `Heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}. ± is a 95 % interval.`),
     answer.confidence !== null && h("div", { class: "sure" },
       h("meter", { min: 0, max: 1, value: share, "aria-label": "Confidence" }),
       h("span", {}, `${percent(share)} probability of an error below 1 m`)));
@@ -54,24 +63,49 @@ function planOf(answer: Answer, place: { floorplan_id: string; level: number | n
   return plan === undefined ? `level ${place.level}` : planLabel(plan);
 }
 
-function warnings(answer: Answer): HTMLElement[] {
-  return answer.warnings.map((warning) => h("p", { class: "warning" }, warning));
+/** State what was assumed, and what the user can do about an uncertain answer. */
+function remarks(answer: Answer): HTMLElement[] {
+  const { view, together } = answer, advice = adviceWords(answer), elsewhere = answer.probability_elsewhere ?? 0;
+  const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) => h("p", { class: "warning" }, plainWords(warning)));
+  return [
+    ...(advice === null ? [] : [h("p", { class: "advice" }, advice)]),
+    ...(together === undefined ? [] : [h("p", { class: "assumed" }, `From ${together.photographs} photographs together`,
+      together.confidence === null ? "." : `: ${percent(together.confidence)} probability that all of their places are right within 1 m.`)]),
+    ...(elsewhere < NOTABLE_ELSEWHERE ? [] : [h("p", { class: "assumed" }, `${percent(elsewhere)} probability that the photograph shows `,
+      "no place of this plan: another floor or building, or rooms that have changed.")]),
+    ...(view == null ? [] : [h("p", { class: "assumed" }, viewWords(view))]),
+    ...warnings,
+  ];
 }
 
-function candidates(answer: Answer, { select }: AnswerActions): HTMLElement {
-  const row = (candidate: Candidate, index: number): HTMLElement => {
-    const share = candidate.probability;
-    return h("li", {}, h("button", { type: "button", "data-rank": index, "aria-pressed": String(index === 0), onclick: () => select(index) },
-      h("span", { class: "rank" }, index + 1),
-      h("span", { class: "name" }, candidate.room, answer.venue_id != null && h("small", {}, planOf(answer, candidate))),
-      h("meter", { min: 0, max: 1, value: share ?? 0, "aria-hidden": "true" }),
-      h("span", { class: "share" }, share === null ? "" : percent(share))));
-  };
-  return h("div", { class: "places" }, h("h3", {}, "Candidates, most probable first"), h("ol", {}, ...answer.candidates.map(row)));
+/** List the places, and the probability of all others. */
+function places(answer: Answer, { select }: AnswerActions): HTMLElement {
+  const listed = placesOf(answer), left = remainder(answer, listed), elsewhere = answer.probability_elsewhere ?? 0;
+  const row = (place: Place, rank: number): HTMLElement => h("li", {},
+    h("button", { type: "button", "data-rank": place.index, "aria-pressed": String(rank === 0), onclick: () => select(place.index) },
+      ...cells(rank + 1, h("span", { class: "name" }, place.candidate.room, answer.venue_id != null && h("small", {}, planOf(answer, place.candidate))), place.probability)),
+    place.others.length > 0 && h("div", { class: "ways" }, "or the camera faces ", ...place.others.map((index) => otherWay(answer, index, select))));
+  return h("div", { class: "places" }, h("h3", {}, "Possible places"), h("ol", {}, ...listed.map(row)),
+    h("ul", {}, left !== null && h("li", { class: "rest" }, ...cells("", "other places of the plan", left)),
+      elsewhere >= 0.005 && h("li", { class: "rest" }, ...cells("", answer.venue_id == null ? "not in this plan" : "in none of the plans", elsewhere))));
+}
+
+function cells(rank: number | string, name: HTMLElement | string, share: number | null): HTMLElement[] {
+  return [
+    h("span", { class: "rank" }, rank), h("span", { class: "name" }, name),
+    h("meter", { min: 0, max: 1, value: share ?? 0, "aria-hidden": "true" }),
+    h("span", { class: "share" }, share === null ? "" : percent(share)),
+  ];
+}
+
+/** Return a button for another heading at a place. */
+function otherWay(answer: Answer, index: number, select: (index: number) => void): HTMLElement {
+  const { heading_deg, probability } = answer.candidates[index]!;
+  const share = probability === null ? "" : ` (${percent(probability)})`;
+  return h("button", { type: "button", "data-rank": index, "aria-pressed": "false", onclick: () => select(index) }, `${headingWords(heading_deg, null)}${share}`);
 }
 
 function facts(answer: Answer): HTMLElement {
-  const spread = answer.heading_std_deg === null ? "" : ` ± ${answer.heading_std_deg.toFixed(1)}°`;
   const stages = Object.entries(answer.timings_ms).filter(([name, spent]) => name !== "total" && spent > 0)
     .map(([name, spent]) => `${name} ${milliseconds(spent)}`);
   const plans = (answer.plans ?? []).filter(({ probability }) => probability !== null).slice(0, MAX_PLANS)
@@ -80,23 +114,26 @@ function facts(answer: Answer): HTMLElement {
   const pairs: [string, string][] = [
     ...(plans.length > 0 ? [["Plans", plans.join("; ")] as [string, string]] : []),
     ...(earth ? [["On Earth", `${earth.lat.toFixed(6)}, ${earth.lon.toFixed(6)}`] as [string, string]] : []),
-    ["Heading", `${answer.heading_deg.toFixed(1)}°${spread}, ${HEADING_SOURCES[answer.heading_source]}`],
+    ["Heading", `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source]}`],
+    ...(answer.view == null ? [] : [["Seen", seenWords(answer.view)] as [string, string]]),
     ["Camera height", `${answer.camera_height_m.toFixed(2)} m (best fit)`],
     ["Time", `${milliseconds(answer.timings_ms.total ?? 0)} (${stages.join(", ")})`],
     ["Method", `${STAGES[answer.stage]}, model ${answer.model.name} ${answer.model.version}`],
   ];
-  return h("dl", { class: "facts" }, ...pairs.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  return h("details", { class: "how" }, h("summary", {}, "How it was found"),
+    h("dl", { class: "facts" }, ...pairs.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])));
 }
 
 function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): HTMLElement {
-  const file = photo?.file.name.replace(/^example-/, "examples/") ?? "photo.jpg";
-  const fields = photo?.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
+  const files = (photo?.asked.files ?? []).map(({ name }) => name.replace(/^example-/, "examples/"));
+  const fields = photo?.asked.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
+  const names = files.length > 0 ? files : ["photo.jpg"];
   const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
   return h("div", { class: "sharing" },
-    button("Copy as curl", () => void copy(curlSnippet(fields, file), "curl command"), { id: "copy-curl" }),
-    button("Copy as Python", () => void copy(pythonSnippet(fields, file), "Python code"), { id: "copy-python" }),
-    // The service draws answers for single plans and does not store photographs.
-    photo !== null && answer.venue_id == null && button("Save picture", () => void save(photo), { id: "save-picture", title: "The photograph with the layout, and the plan with the place, as PNG" }),
+    button("Copy as curl", () => void copy(curlSnippet(fields, names), "curl command"), { id: "copy-curl" }),
+    button("Copy as Python", () => void copy(pythonSnippet(fields, names), "Python code"), { id: "copy-python" }),
+    // The service draws answers to single photographs in single plans and does not store photographs.
+    photo !== null && answer.venue_id == null && answer.together === undefined && button("Save picture", () => void save(photo), { id: "save-picture", title: "The photograph with the layout, and the plan with the place, as PNG" }),
     link !== null && button("Copy link", () => void copy(link, "link"), { id: "copy-link", title: "Opens this answer again while the service stores it" }),
     h("pre", { class: "copied", id: "copied", tabindex: 0, hidden: true, "aria-label": "Copied text" }));
 }
@@ -114,41 +151,3 @@ async function copy(text: string, name: string): Promise<void> {
     say(`Select and copy the ${name} below.`);
   }
 }
-
-/** Describe a confidence. */
-function confidenceWords(confidence: number | null): string {
-  if (confidence === null) return "Unknown confidence: the model is not calibrated";
-  if (confidence >= 0.95) return "Almost certainly here";
-  if (confidence >= 0.8) return "Very likely here";
-  if (confidence >= 0.5) return "Probably here";
-  if (confidence >= 0.2) return "Possibly here";
-  return "Uncertain: possibly another place, or not in this plan";
-}
-
-const percent = (share: number): string =>
-  share > 0 && share < 0.01 ? "under 1 %" : share > 0.99 && share < 1 ? "over 99 %" : `${Math.round(100 * share)} %`;
-
-const milliseconds = (duration: number): string =>
-  duration >= 1000 ? `${(duration / 1000).toFixed(1)} s` : `${Math.round(duration)} ms`;
-
-/** Return the standard deviation of the position along the longer axis of the ellipse. */
-function accuracyWords(answer: Answer): string | null {
-  if (answer.covariance_m2 === null) return null;
-  const [[xx, xy], [, yy]] = answer.covariance_m2;
-  const deviation = Math.sqrt(0.5 * (xx + yy) + Math.hypot(0.5 * (xx - yy), xy));
-  return deviation < 1 ? `± ${Math.max(1, Math.round(100 * deviation))} cm` : `± ${deviation.toFixed(1)} m`;
-}
-
-/** Origin of a heading. */
-const HEADING_SOURCES: Record<Answer["heading_source"], string> = {
-  given: "as given",
-  panorama: "from the photograph’s metadata",
-  searched: "estimated from the picture",
-};
-
-/** Last stage of an answer; without LPO it is coarser. */
-const STAGES: Record<Answer["stage"], string> = {
-  lpo: "refined pose (LPO)",
-  vdr: "dense sampling (VDR), not refined",
-  retrieval: "nearest pose of the pose grid, not refined",
-};

@@ -1,6 +1,6 @@
 /** Client of the service's API; every request of the pages adds the API key here. */
 
-import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
+import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, SequenceAnswer, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
 
 const KEY = "lalaloc-key";
 
@@ -13,6 +13,8 @@ export class ServiceError extends Error {
     readonly faults: Fault[] = [],
     readonly slug = "",
     readonly retryAfterS: number | null = null,
+    /** Levels of a plan file, of which the request must name one. */
+    readonly levels: string[] = [],
   ) {
     super(detail ? `${title}: ${detail}` : title);
   }
@@ -25,7 +27,7 @@ export const key = {
   remove: (): void => sessionStorage.removeItem(KEY),
 };
 
-type AskForKey = (reason: string) => Promise<boolean>;
+type AskForKey = () => Promise<boolean>;
 let askForKey: AskForKey | null = null;
 
 /** Register the dialog that asks for a key; its promise is false if the user gives none. */
@@ -49,7 +51,7 @@ export async function request(path: string, options: RequestInit = {}): Promise<
     if (response.ok || response.status === 304) return response;
     const failure = await errorOf(response);
     const hasChanged = key.get() !== sent && key.get() !== null;
-    if (response.status !== 401 || askForKey === null || (!hasChanged && !(await askForKey(failure.detail)))) throw failure;
+    if (response.status !== 401 || askForKey === null || (!hasChanged && !(await askForKey()))) throw failure;
   }
 }
 
@@ -58,7 +60,7 @@ async function errorOf(response: Response): Promise<ServiceError> {
   try {
     const problem: Problem = await response.json();
     const slug = String(problem.type ?? "").split(":").pop() ?? "";
-    return new ServiceError(response.status, problem.title, problem.detail, problem.errors ?? [], slug, after || null);
+    return new ServiceError(response.status, problem.title, problem.detail, problem.errors ?? [], slug, after || null, problem.levels ?? []);
   } catch {
     return new ServiceError(response.status, `The service answered ${response.status}`, response.statusText);
   }
@@ -75,10 +77,10 @@ async function planOf(response: Response): Promise<Plan> {
 const path = (id: string): string => `/floorplans/${encodeURIComponent(id)}`;
 const revisionQuery = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
 
-function form(fields: Record<string, string>, name: string, file: File): FormData {
+function form(fields: Record<string, string>, name: string, ...files: File[]): FormData {
   const body = new FormData();
   for (const [field, value] of Object.entries(fields)) body.set(field, value);
-  body.set(name, file);
+  for (const file of files) body.append(name, file);
   return body;
 }
 
@@ -123,15 +125,20 @@ export const api = {
     await request(path(id), { method: "DELETE" });
   },
 
-  async localise(fields: Record<string, string>, panorama: File, signal?: AbortSignal): Promise<Answer> {
-    return json("/localise", { method: "POST", body: form(fields, "panorama", panorama), signal });
+  async localise(fields: Record<string, string>, photo: File, signal?: AbortSignal): Promise<Answer> {
+    return json("/localise", { method: "POST", body: form(fields, "photo", photo), signal });
+  },
+
+  /** Localise photographs of one visit, in the order in which they were taken. */
+  async localiseSequence(fields: Record<string, string>, photos: File[], signal?: AbortSignal): Promise<SequenceAnswer> {
+    return json("/localise/sequence", { method: "POST", body: form(fields, "photo", ...photos), signal });
   },
 
   /** Return the answer to a query as a picture: the photograph with the layout, and the plan with the place. */
-  async picture(fields: Record<string, string>, panorama: File): Promise<Blob> {
+  async picture(fields: Record<string, string>, photo: File): Promise<Blob> {
     const { include: _, ...query } = fields;
     const response = await request("/localise", {
-      method: "POST", headers: { Accept: "image/png" }, body: form(query, "panorama", panorama),
+      method: "POST", headers: { Accept: "image/png" }, body: form(query, "photo", photo),
     });
     return response.blob();
   },
@@ -145,6 +152,11 @@ export const api = {
   async createVenue(name: string, plans: VenuePlanDocument[]): Promise<Venue> {
     const headers = { "Content-Type": "application/json" };
     return json("/venues", { method: "POST", headers, body: JSON.stringify({ name, plans }) });
+  },
+
+  /** Upload a file with several levels: each becomes a plan, and all of them a venue. */
+  async uploadLevels(file: File, fields: Record<string, string>): Promise<{ id: string; name: string }> {
+    return json("/venues", { method: "POST", body: form(fields, "file", file) });
   },
 
   async venue(id: string): Promise<Venue> {

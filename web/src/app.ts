@@ -1,27 +1,32 @@
 /** Page at /: one plan, photographs, and where they were taken. */
 
-import { showAnswer, markSelected } from "./answer_panel";
-import { ellipse, otherCandidates } from "./answer_overlay";
+import { showAll } from "./all_answers";
+import { markSelected, showAnswer } from "./answer_panel";
+import { companions, ellipse, otherPlaces } from "./answer_overlay";
 import { api } from "./api";
-import { byId, download, h, s, show } from "./dom";
+import { byId, download, s, show } from "./dom";
 import { Editor } from "./editor/editor";
-import { exampleFiles, examplePlan } from "./example";
+import { exampleFiles, examplePlan, FLAT } from "./example";
 import { heatMap } from "./heat";
-import { HintForm, hintFields } from "./hints";
+import { connectGuide, hideGuide } from "./guide";
+import { HintForm } from "./hints";
 import { connectKeyDialog } from "./key_dialog";
 import { layoutLines, roomAt } from "./layout";
-import { clearError, showError } from "./notices";
+import { clearError, InputError, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
+import { showWarnings } from "./plan_warnings";
 import { Plans } from "./plans";
-import { PoseMarker } from "./pose_marker";
+import { PoseMarker, showCursor } from "./pose_marker";
+import { askSingle, askTogether } from "./query";
 import type { Answer, Layout, Plan, PlanDocument, Pose, Venue } from "./types";
 import { Venues } from "./venues";
 import { Viewport } from "./viewport";
 
-// For tests that compare them with the service's renderer.
+// For tests.
 export { layoutLines, layoutView } from "./layout";
+export { placesOf, remainder } from "./places";
 
 const DEFAULT_CAMERA_HEIGHT_M = 1.5;
 
@@ -36,7 +41,8 @@ class Page {
   private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), showPlan: (planId) => void this.plans.choose(planId) });
   private readonly plans = new Plans({
     chosen: (plan) => this.onPlan(plan), started: () => this.onStarted(), picked: () => this.venues.leave(),
-    listed: (plans) => this.venues.offer(plans), searched: (name) => void this.venues.load(name),
+    listed: (plans) => this.venues.offer(plans), imported: (venue) => void this.venues.take(venue), searched: (name) => void this.venues.load(name),
+    example: (plan, photos) => this.onExamplePicked(plan, photos),
   });
   private readonly photos = new Photos((photo, isOther) => this.onPhoto(photo, isOther));
   private readonly hints = new HintForm(this.svg, (hints) => this.photos.setHints(hints));
@@ -68,20 +74,22 @@ class Page {
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.localise());
+    connectGuide();
+    showCursor(this.svg);
     byId("find-all").addEventListener("click", () => void this.localiseAll());
     addEventListener("hashchange", () => void this.open());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
     await this.panorama.setPicture(null);
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
-    const example = await examplePlan();
+    const example = await examplePlan(FLAT);
     // The user may have chosen a plan while the example was loading.
     if (this.hasStarted) return;
     const known = stored.find((plan) => plan.name === example.name);
     if (known !== undefined || stored.length === 0) {
       if (known === undefined) this.onExample(example);
       else await this.plans.choose(known.id);
-      const files = await exampleFiles();
+      const files = await exampleFiles(FLAT);
       if (!this.hasStarted && this.photos.list.length === 0) this.photos.add(files);
     } else await this.plans.choose(stored[0]!.id);
   }
@@ -125,15 +133,23 @@ class Page {
     this.drawBase();
   }
 
+  private onExamplePicked(plan: PlanDocument | null, photos: File[]): void {
+    if (plan !== null) this.onExample(plan);
+    const shown = this.photos.list.find(({ file }) => file.name === photos[0]?.name);
+    if (shown === undefined) this.photos.add(photos);
+    else this.photos.choose(shown);
+  }
+
   private onVenue(venue: Venue | null): void {
     if (venue === null) this.cancelQuery();
     else this.onStarted();
-    byId("hints").hidden = venue !== null;
+    this.photos.offerGroups(venue === null);
+    this.offerHints();
     this.photos.forgetHints();
     this.photos.forgetAnswers();
     this.hints.show(this.photos.current?.hints ?? null);
     this.setAnswer(null);
-    if (venue !== null && venue.plans === 0) showError(byId("plan-error"), new Error("This venue has no plans."));
+    if (venue !== null && venue.plans === 0) showError(byId("plan-error"), new InputError("This venue has no plans."));
   }
 
   private onPlan(plan: Plan | null): void {
@@ -147,10 +163,8 @@ class Page {
       `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
     byId("preparing").hidden = plan?.status !== "preparing";
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
-    if (plan?.status === "failed") showError(byId("plan-error"), new Error(`The plan could not be prepared: ${plan.reason}`));
-    const report = plan?.import_report;
-    const draft = report?.is_draft ? [DRAFT] : [];
-    showWarnings([...draft, ...(plan?.warnings ?? []), ...(report?.unsure ?? [])]);
+    if (plan?.status === "failed") showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
+    showWarnings(plan);
     if (isSame) return;
     this.layout = null;
     this.photos.compass.setNorth(plan?.plan.north_deg ?? null);
@@ -229,10 +243,16 @@ class Page {
     if (isOther) {
       // A link shows an answer without its photograph; a photograph added to it is assumed to be the one.
       if (photo !== null && photo.answer === null && this.answer !== null && this.answeredPhoto === null) photo.answer = this.answer;
-      void this.panorama.setPicture(photo?.file ?? null).then(() => this.drawAnswer())
+      void this.panorama.setPicture(photo?.file ?? null).then(() => { this.panorama.setView(this.photos.current?.answer?.view ?? null); this.drawAnswer(); })
         .catch((error: unknown) => { if (this.photos.current === photo) showError(byId("photo-error"), error); });
-    } else if (photo !== null) photo.answer = null;
+    }
+    this.offerHints();
     this.setAnswer(photo?.answer ?? null, photo);
+  }
+
+  /** Sequences and venues are searched without hints. */
+  private offerHints(): void {
+    byId("hints").hidden = this.venues.current !== null || this.photos.group !== null;
   }
 
   private answeredPhoto: Photo | null = null;
@@ -246,7 +266,9 @@ class Page {
     this.answeredPhoto = photo;
     this.selected = 0;
     this.moved = null;
+    this.panorama.setView(photo === null ? null : answer?.view ?? null);
     showAnswer(answer, photo, { select: (index) => this.select(index), save: (answered) => this.savePicture(answered) });
+    showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
     this.drawAnswer();
     // The answer of a venue can lie in another plan than the one shown.
     if (answer !== null) this.select(0);
@@ -264,10 +286,12 @@ class Page {
     const candidate = answer?.candidates[this.selected];
     if (answer === null || drawn === null || candidate === undefined || candidate.floorplan_id !== plan?.id) {
       this.panorama.setLines([], 0);
+      this.photos.compass.setFound(null);
       byId("fit-state").textContent = answer === null ? "" : "The selected place lies in another plan of the venue.";
       return;
     }
-    show(this.overlay, isHere && ellipse(answer), otherCandidates(answer, plan.id, this.box, (index) => this.select(index)), this.marker.element);
+    show(this.overlay, isHere && ellipse(answer), companions(this.photos.list, this.answeredPhoto, plan.id, this.box, (photo) => this.photos.choose(photo)),
+      otherPlaces(answer, plan.id, this.box, (index) => this.select(index)), this.marker.element);
     if (hasFocus) this.marker.element.focus({ preventScroll: true });
     if (this.moved === null) this.select(this.selected);
     else this.drawLines(this.moved);
@@ -298,6 +322,7 @@ class Page {
 
   private drawLines(pose: Pose): void {
     const state = byId("fit-state");
+    this.photos.compass.setFound(pose.heading_deg);
     if (this.layout === null) return;
     const room = roomAt(this.layout.rooms, pose.x_m, pose.y_m);
     const height = this.answer?.camera_height_m ?? this.plan?.plan.camera_height_m ?? DEFAULT_CAMERA_HEIGHT_M;
@@ -312,22 +337,27 @@ class Page {
     if (photo === null) return;
     this.cancelQuery();
     const { signal } = (this.query = new AbortController());
-    photo.answer = null;
+    const { group } = this.photos;
+    for (const asked of group?.photos ?? [photo]) asked.answer = null;
     this.setAnswer(null);
     clearError(byId("photo-error"), this.fields);
     this.find.setAttribute("aria-busy", "true");
     try {
-      const venue = this.venues.current;
-      photo.fields = fieldsOf(venue, venue === null ? this.plan ?? (await this.storeExample(signal)) : null, photo);
+      const place = this.venues.current ?? this.plan ?? (await this.storeExample(signal));
       if (signal.aborted) return;
-      const fields = venue === null ? { ...photo.fields, include: "posterior" } : photo.fields;
-      const answer = await api.localise(fields, photo.file, signal);
-      if (answer.floorplan_revision !== this.plan?.revision) await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
+      if (group === null) await askSingle(place, photo, signal);
+      else await askTogether(place as Plan, group, signal);
       // The user may have chosen another plan in the meantime.
+      if (signal.aborted || photo.answer === null) return;
+      const { floorplan_id, floorplan_revision } = photo.answer;
+      if (floorplan_revision !== this.plan?.revision) await this.plans.choose(floorplan_id, floorplan_revision);
       if (signal.aborted) return;
-      photo.answer = answer;
-      if (this.photos.current === photo) this.setAnswer(answer, photo);
+      const { current } = this.photos;
+      if (current !== null && (current === photo || group !== null)) this.setAnswer(current.answer, current);
       this.photos.drawStrip();
+      byId<HTMLDetailsElement>("settings").open = false;
+      hideGuide();
+      byId("answer").scrollIntoView({ block: "nearest" });
     } catch (error) {
       if (!signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {
@@ -338,7 +368,7 @@ class Page {
   private async savePicture(photo: Photo): Promise<void> {
     clearError(byId("photo-error"), this.fields);
     try {
-      download(await api.picture(photo.fields, photo.file), `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
+      download(await api.picture(photo.asked.fields, photo.file), `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
     } catch (error) {
       showError(byId("photo-error"), error, this.fields);
     }
@@ -354,32 +384,12 @@ class Page {
   }
 
   private async storeExample(signal: AbortSignal): Promise<Plan> {
-    if (this.document === null) throw new Error("Choose or upload a floor plan first.");
+    if (this.document === null) throw new InputError("Choose or upload a floor plan first.");
     const plan = await api.createPlan(this.document);
     if (!signal.aborted) this.plans.take(plan);
     await this.plans.load();
     return plan;
   }
-}
-
-const DRAFT = "This plan is a draft, derived from a picture or from lines: check it, and correct it with “Edit”. When all doors or "
-  + "all windows are right, tick them in the editor: only then the search uses them.";
-const MAX_WARNINGS = 4;
-
-/** Show warnings about the plan; the rest of a long list opens with a click. */
-function showWarnings(texts: string[]): void {
-  const items = texts.map((text) => h("li", {}, text));
-  const rest = items.splice(MAX_WARNINGS);
-  show(byId("plan-warnings"), ...items,
-    rest.length > 0 && h("li", {}, h("details", {}, h("summary", {}, `${rest.length} more`), h("ul", {}, ...rest))));
-}
-
-function fieldsOf(venue: Venue | null, plan: Plan | null, photo: Photo): Record<string, string> {
-  const fields: Record<string, string> = venue !== null ? { venue_id: venue.id } : { floorplan_id: plan?.id ?? "", ...hintFields(photo.hints) };
-  if (photo.heading !== null) fields.heading_deg = String(photo.heading);
-  if (photo.tolerance !== 0) fields.heading_tolerance_deg = String(photo.tolerance);
-  if (photo.cameraHeight !== null) fields.camera_height_m = String(photo.cameraHeight);
-  return fields;
 }
 
 void new Page().start();

@@ -9,7 +9,10 @@ export class Compass {
   private readonly north = s("g", { class: "to-north" }, s("path", { d: "M0 -50L4 -43L-4 -43Z" }), s("text", { y: -24, "font-size": 11 }, "N"));
   private readonly dial: SVGSVGElement;
   private readonly text = h("span", { class: "dial-text" });
+  /** Heading in the form; null if unknown. */
   private heading: number | null = null;
+  /** Heading of the answer, which is shown while none is given. */
+  private found: number | null = null;
 
   constructor(private readonly turned: (headingDeg: number | null) => void) {
     const marks = ["+y", "+x", "−y", "−x"].map((name, quarter) => {
@@ -28,13 +31,25 @@ export class Compass {
     this.setNorth(null);
   }
 
-  /** Show a heading; null means unknown. */
+  /** Show a given heading; null means unknown. */
   set(headingDeg: number | null): void {
     this.heading = headingDeg;
-    this.element.classList.toggle("unknown", headingDeg === null);
-    this.needle.setAttribute("transform", `rotate(${headingDeg ?? 0})`);
-    const text = headingDeg === null ? "unknown" : `${Math.round(headingDeg)}°`;
-    this.dial.setAttribute("aria-valuenow", String(Math.round(headingDeg ?? 0)));
+    this.draw();
+  }
+
+  /** Show the heading of an answer while none is given; null means no answer. */
+  setFound(headingDeg: number | null): void {
+    this.found = headingDeg;
+    this.draw();
+  }
+
+  private draw(): void {
+    const shown = this.heading ?? this.found, isFound = this.heading === null && shown !== null;
+    this.element.classList.toggle("unknown", shown === null);
+    this.element.classList.toggle("found", isFound);
+    this.needle.setAttribute("transform", `rotate(${shown ?? 0})`);
+    const text = shown === null ? "unknown" : `${isFound ? "found " : ""}${Math.round(shown) % 360}°`;
+    this.dial.setAttribute("aria-valuenow", String(Math.round(shown ?? 0)));
     this.dial.setAttribute("aria-valuetext", text);
     this.text.textContent = text;
   }
@@ -62,7 +77,7 @@ export class Compass {
   private onKey(event: KeyboardEvent): void {
     const steps: Record<string, number> = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 };
     const step = steps[event.key];
-    if (step !== undefined) this.turn(this.heading === null ? 0 : this.heading + step);
+    if (step !== undefined) this.turn(Math.round(this.heading ?? this.found ?? -step) + step);
     else if (event.key === "Home") this.turn(0);
     else if (event.key === "Delete" || event.key === "Escape") this.turn(null);
     else return;

@@ -1,17 +1,23 @@
-/** Example flat and its photographs, shown on the first visit. */
+/** Example plans with photographs: a rendered flat, shown on the first visit, and photographed rooms. */
 
 import type { PlanDocument } from "./types";
 
-const PHOTOS = ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"];
-
-/** Return the plan of the example flat. */
-export async function examplePlan(): Promise<PlanDocument> {
-  return (await fetch("/web/example-flat.json")).json();
+export interface Example {
+  plan: string;
+  photos: readonly string[];
 }
 
-/** Return the photographs of the example flat. */
-export async function exampleFiles(): Promise<File[]> {
-  return Promise.all(PHOTOS.map(async (name) => {
+export const FLAT: Example = { plan: "flat.json", photos: ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"] };
+export const ROOMS: Example = { plan: "rooms.json", photos: ["lythwood_room.jpg"] };
+
+/** Return the plan of an example. */
+export async function examplePlan({ plan }: Example): Promise<PlanDocument> {
+  return (await fetch(`/web/example-${plan}`)).json();
+}
+
+/** Return the photographs of an example. */
+export async function exampleFiles({ photos }: Example): Promise<File[]> {
+  return Promise.all(photos.map(async (name) => {
     const response = await fetch(`/web/example-${name}`);
     return new File([await response.blob()], name, { type: "image/jpeg" });
   }));

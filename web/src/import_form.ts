@@ -24,8 +24,12 @@ export class ImportForm {
   private readonly picture = new PictureScale();
   private file: File | null = null;
 
-  /** `again` uploads the file with the values of the form. */
-  constructor(private readonly again: (file: File, fields: Record<string, string>) => void) {
+  /** `again` uploads the file with the values of the form, `all` uploads all of its levels, `cancelled` gives up. */
+  constructor(
+    private readonly again: (file: File, fields: Record<string, string>) => void,
+    private readonly all: (file: File, fields: Record<string, string>) => void,
+    private readonly cancelled: () => void,
+  ) {
     this.inputs.set("units", h("select", {}, h("option", { value: "" }, "from the file"), ...UNITS.map((unit) => h("option", {}, unit))));
     for (const [name, , hint] of FIELDS) this.inputs.set(name, h("input", { type: "text", placeholder: hint, autocomplete: "off" }));
     this.picture.metres.addEventListener("keydown", (event) => { if (event.key === "Enter") this.send(); });
@@ -36,8 +40,8 @@ export class ImportForm {
     return { ...Object.fromEntries(this.inputs), known_distance: this.picture.metres };
   }
 
-  /** Show the form for a file, open if the file cannot be read without it. */
-  ask(file: File, isNeeded: boolean): void {
+  /** Show the form for a file, open if the file cannot be read without it; `levels` are those to choose from. */
+  ask(file: File, isNeeded: boolean, levels: string[] = []): void {
     const isPicture = PICTURES.test(file.type);
     if (isPicture && file !== this.file) {
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
@@ -49,14 +53,16 @@ export class ImportForm {
       input.id = `import-${name}`;
       return h("div", {}, h("label", { for: input.id }, label), input);
     });
-    const heading = !isNeeded ? `Import “${file.name}” again with other options` :
-      isPicture ? `Set the scale of “${file.name}”` : `Import options for “${file.name}”`;
+    const heading = levels.length > 0 ? `“${file.name}” has ${levels.length} levels: choose one, or import all` :
+      !isNeeded ? `Import “${file.name}” again with other options` : isPicture ? `Set the scale of “${file.name}”` : `Import options for “${file.name}”`;
+    const again = button(isPicture && isNeeded ? "Read the picture" : "Import again", () => this.send(), { id: "import-again", class: isNeeded ? "primary" : null });
+    const whole = button("Import all levels as a venue", () => this.sendAll(), { id: "import-levels", class: "primary" });
+    const ask = h("div", { class: "ask" }, levels.length === 0 ? again : whole, button("Cancel", () => this.cancelled()));
+    const fields = h("div", { class: "fields" }, ...shown);
+    const level = (name: string): HTMLElement => h("li", {}, button(name, () => this.sendLevel(name)));
     show(byId("import-form"), h("details", { open: isNeeded }, h("summary", {}, heading),
-      isPicture && this.picture.element,
-      h("div", { class: "fields" }, isPicture && h("p", { class: "hint" }, "Or enter the scale, and other facts:"), ...shown),
-      h("div", { class: "ask" },
-        button(isPicture && isNeeded ? "Import the picture" : "Import again", () => this.send(), { id: "import-again", class: isNeeded ? "primary" : null }),
-        button("Cancel", () => this.close()))));
+      ...(levels.length > 0 ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask] :
+        isPicture ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)] : [fields, ask])));
   }
 
   /** Close the form and forget its values. */
@@ -67,19 +73,32 @@ export class ImportForm {
     show(byId("import-form"));
   }
 
+  private sendLevel(level: string): void {
+    this.inputs.get("level")!.value = level;
+    this.send();
+  }
+
+  private sendAll(): void {
+    if (this.file === null) return;
+    const { level: _, ...fields } = this.values;
+    this.all(this.file, fields);
+  }
+
+  /** Filled fields of the form. */
+  private get values(): Record<string, string> {
+    return Object.fromEntries([...this.inputs].map(([name, input]): [string, string] => [name, input.value.trim()]).filter(([, value]) => value !== ""));
+  }
+
   private send(): void {
     if (this.file === null) return;
     const isPicture = PICTURES.test(this.file.type);
-    const values = Object.fromEntries([...this.inputs].filter(([name]) => !isPicture || OF_PICTURES.includes(name))
-      .map(([name, input]): [string, string] => [name, input.value.trim()]).filter(([, value]) => value !== ""));
+    const values = Object.fromEntries(Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)));
     const distance = this.picture.knownDistance;
     if (isPicture && distance !== null) values.known_distance = distance;
     // A picture contains no name.
     if (isPicture) values.name = this.file.name.replace(/\.[^.]*$/, "").slice(0, MAX_NAME_LENGTH) || this.file.name;
     if (isPicture && distance === null && values.metres_per_pixel === undefined && values.scale === undefined) {
-      showError(byId("plan-error"), new Error("The scale of the picture is missing: put the ends of the line on two points and enter their distance in metres."));
-      this.picture.metres.setAttribute("aria-invalid", "true");
-      this.picture.metres.focus();
+      this.picture.askForDistance();
       return;
     }
     this.again(this.file, values);

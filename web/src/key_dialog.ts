@@ -29,9 +29,9 @@ export function connectKeyDialog(): void {
     if (!dialog.open) dialog.showModal();
     field.focus();
   };
-  onKeyNeeded((detail) => {
+  onKeyNeeded(() => {
     opener.dataset.needed = "yes";
-    open(key.get() === null ? "This service requires an API key." : `The key was rejected: ${detail}`);
+    open(key.get() === null ? "This service requires an API key." : "This key is not valid. Enter another one.");
     return new Promise((resolve) => waiting.push(resolve));
   });
   opener.addEventListener("click", () => open("A new key replaces the current one."));

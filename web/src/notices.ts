@@ -2,6 +2,10 @@
 
 import { ServiceError } from "./api";
 import { h, show } from "./dom";
+import { labelOf, plainWords } from "./plain_words";
+
+/** Request of the user that the page cannot follow; the message says what to do. */
+export class InputError extends Error {}
 
 /** Show an error in an element with the role alert and mark the fields that cause it. */
 export function showError(place: HTMLElement, error: unknown, fields: Record<string, HTMLElement> = {}): void {
@@ -9,19 +13,33 @@ export function showError(place: HTMLElement, error: unknown, fields: Record<str
   const failure = error instanceof ServiceError ? error : null;
   const text = error instanceof Error ? error.message : String(error);
   const faults = failure?.faults ?? [];
+  const title = failure?.title ?? (error instanceof InputError ? null : "Something went wrong");
   show(place,
-    h("strong", {}, failure?.title ?? "Something went wrong"),
-    h("p", {}, plainText(failure) ?? failure?.detail ?? text),
-    faults.length > 0 && h("ul", {}, ...faults.map((fault) => h("li", {}, h("code", {}, fault.field), ` ${fault.message}`))),
+    title !== null && h("strong", {}, title),
+    h("p", {}, plainText(failure) ?? plainWords(failure?.detail ?? text)),
+    faults.length > 0 && h("ul", {}, ...faults.map((fault) => h("li", {}, h("strong", {}, labelOf(fault.field)), ` ${plainWords(fault.message)}`))),
     failure?.retryAfterS ? h("p", {}, `Try again in ${failure.retryAfterS} s.`) : null);
   place.hidden = false;
   place.scrollIntoView({ block: "nearest" });
   for (const fault of faults) {
     const field = fields[fault.field];
-    if (field === undefined) continue;
-    field.setAttribute("aria-invalid", "true");
-    field.setAttribute("aria-describedby", place.id);
+    if (field !== undefined) markInvalid(field, place);
   }
+}
+
+/** Mark a field as the cause of an error, and unfold the forms around it. */
+function markInvalid(field: HTMLElement, place: HTMLElement): void {
+  field.setAttribute("aria-invalid", "true");
+  field.setAttribute("aria-describedby", place.id);
+  for (let fold = field.closest("details"); fold !== null; fold = fold.parentElement?.closest("details") ?? null) fold.open = true;
+}
+
+/** Show an error beside the one field that causes it. */
+export function showFieldError(place: HTMLElement, field: HTMLElement, text: string): void {
+  place.textContent = text;
+  place.hidden = false;
+  markInvalid(field, place);
+  field.focus();
 }
 
 /** Remove an error and its marks. */

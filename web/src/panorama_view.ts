@@ -1,21 +1,26 @@
-/** Photograph, in a panorama viewer or flat, with the lines of the layout over it. */
+/** Photograph, full spheres in a panorama viewer, with the lines of the layout over it. */
 
+import { throughCamera } from "./camera";
 import { button, h, show } from "./dom";
 import { type LayoutLine, radians } from "./layout";
+import { InputError } from "./notices";
 import { equirectangular, type Gaze, perspective, type Size } from "./projection";
-import type { OpeningKind, Point } from "./types";
+import type { OpeningKind, Point, ViewAnswer } from "./types";
 
 type Sphere = import("./sphere").Sphere;
-type Shape = "around" | "whole";
+/** A full sphere from inside, the same as a flat picture, or another photograph. */
+type Shape = "around" | "whole" | "flat";
 
-// Colours by Okabe and Ito, distinct for every kind of colour vision; dashes differ as well.
-const STROKES: Record<"edge" | OpeningKind, { colour: string; dash: number[]; name: string }> = {
-  edge: { colour: "#ffe14d", dash: [], name: "walls" },
-  door: { colour: "#56b4e9", dash: [10, 4], name: "doors" },
-  window: { colour: "#ff9d5c", dash: [3, 3], name: "windows" },
-  passage: { colour: "#ffffff", dash: [12, 4, 3, 4], name: "passages" },
+// Dashes tell lines apart as well as colours, which are in the style sheet.
+const STROKES: Record<"edge" | OpeningKind, { variable: string; dash: number[]; name: string }> = {
+  edge: { variable: "--over-wall", dash: [], name: "walls" },
+  door: { variable: "--over-door", dash: [10, 4], name: "doors" },
+  window: { variable: "--over-window", dash: [3, 3], name: "windows" },
+  passage: { variable: "--over-passage", dash: [12, 4, 3, 4], name: "passages" },
 };
 const TURN_BY = radians(10);
+// Photo sphere metadata stand before the pixels.
+const METADATA_BYTES = 2 ** 18;
 
 export class PanoramaView {
   private readonly canvas = h("canvas", { class: "overlay", "aria-hidden": "true" });
@@ -25,9 +30,11 @@ export class PanoramaView {
   });
   private readonly picture = h("img", { class: "whole", alt: "" });
   private readonly holder = h("div", { class: "sphere" });
-  private readonly shapes: Record<Shape, HTMLButtonElement>;
+  private readonly shapes: Record<"around" | "whole", HTMLButtonElement>;
+  private readonly choices: HTMLElement;
   private sphere: Sphere | null = null;
   private shape: Shape = "around";
+  private view: ViewAnswer | null = null;
   private url: string | null = null;
   /** Settles when the viewer has loaded its latest picture or failed to. */
   private loading: Promise<void> = Promise.resolve();
@@ -43,10 +50,12 @@ export class PanoramaView {
     };
     const lines = h("input", { type: "checkbox", id: "lines-shown", checked: true });
     lines.addEventListener("change", () => { this.shown = lines.checked; this.draw(); });
+    this.choices = h("div", { class: "segmented", role: "group", "aria-label": "View of the photograph" },
+      this.shapes.around, this.shapes.whole);
     const bar = h("div", { class: "bar" },
-      h("div", { class: "segmented", role: "group", "aria-label": "View of the photograph" },
-        this.shapes.around, this.shapes.whole),
+      this.choices,
       h("label", { class: "inline" }, lines, "Layout"),
+      button("Full screen", () => void (document.fullscreenElement === null ? root.requestFullscreen() : document.exitFullscreen()), { id: "full-screen" }),
       legend());
     this.stage.append(this.holder, this.picture, this.canvas);
     show(root, this.stage, bar);
@@ -70,8 +79,10 @@ export class PanoramaView {
       await this.picture.decode();
     } catch {
       this.stage.classList.add("empty");
-      throw new Error("The browser cannot show this file as a picture.");
+      throw new InputError("The browser cannot show this file as a picture; the service may still read it.");
     }
+    const sphere = await isSphere(file!, this.picture);
+    if (sphere === (this.shape === "flat")) this.shape = sphere ? "around" : "flat";
     await this.refresh();
   }
 
@@ -80,6 +91,16 @@ export class PanoramaView {
     this.lines = lines;
     this.heading = radians(headingDeg);
     this.draw();
+  }
+
+  /** Set what the service assumed about the photograph; null before an answer. */
+  setView(view: ViewAnswer | null): void {
+    this.view = view;
+    // The service knows better than `isSphere`.
+    const isPart = view !== null && view.hfov.source === "given" && view.hfov.value_deg < 360;
+    const isFlat = view !== null && (view.camera !== null || view.projection === "cylindrical" || isPart);
+    if (isFlat && this.shape !== "flat") this.setShape("flat");
+    else this.draw();
   }
 
   private setShape(shape: Shape): void {
@@ -113,6 +134,7 @@ export class PanoramaView {
       }
     }
     this.stage.dataset.shape = this.shape;
+    this.choices.hidden = this.shape === "flat";
     for (const [name, control] of Object.entries(this.shapes)) control.setAttribute("aria-pressed", String(name === this.shape));
     this.draw();
   }
@@ -138,16 +160,20 @@ export class PanoramaView {
     const context = this.canvas.getContext("2d");
     if (context === null || this.url === null) return;
     const gaze = this.gaze();
-    this.gazed(gaze.yaw, this.shape === "whole" ? 2 * Math.PI : 2 * Math.atan(Math.tan(0.5 * gaze.verticalFov) *
-      (size.width / Math.max(size.height, 1))));
+    this.gazed(gaze.yaw, this.fieldOfView(gaze, size));
     if (!this.shown) return;
     context.scale(sharp, sharp);
+    if (this.shape === "flat") {
+      const { width, height } = this.flatSize(size);
+      context.translate(0.5 * (size.width - width), 0.5 * (size.height - height));
+    }
     context.lineJoin = context.lineCap = "round";
+    const style = getComputedStyle(this.canvas);
     const paths = this.lines.map((line) => ({ line, paths: this.projected(line, gaze, size) }));
     for (const halo of [true, false]) {
       for (const { line, paths: pieces } of paths) {
-        const { colour, dash } = STROKES[line.kind];
-        context.strokeStyle = halo ? "rgba(0, 0, 0, 0.55)" : colour;
+        const { variable, dash } = STROKES[line.kind];
+        context.strokeStyle = halo ? "rgba(0, 0, 0, 0.55)" : style.getPropertyValue(variable).trim();
         context.lineWidth = halo ? 5 : 2.5;
         context.setLineDash(halo ? [] : dash);
         for (const piece of pieces) {
@@ -161,12 +187,33 @@ export class PanoramaView {
 
   private projected(line: LayoutLine, gaze: Gaze, size: Size): Point[][] {
     const relative = line.points.map(([azimuth, elevation]): Point => [azimuth - this.heading, elevation]);
+    if (this.shape === "flat") return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
     return this.shape === "around" ? perspective([relative], gaze, size) : equirectangular([relative], size);
+  }
+
+  /** Return the size of a flat photograph, which the stage contains. */
+  private flatSize(stage: Size): Size {
+    const { naturalWidth: width, naturalHeight: height } = this.picture;
+    const share = Math.min(stage.width / Math.max(width, 1), stage.height / Math.max(height, 1));
+    return { width: share * width, height: share * height };
+  }
+
+  private fieldOfView(gaze: Gaze, size: Size): number {
+    if (this.shape === "flat") return this.view === null ? 1 : radians(this.view.hfov.value_deg);
+    if (this.shape === "whole") return 2 * Math.PI;
+    return 2 * Math.atan(Math.tan(0.5 * gaze.verticalFov) * (size.width / Math.max(size.height, 1)));
   }
 
   private gaze(): Gaze {
     return this.shape === "around" && this.sphere !== null ? this.sphere.gaze() : { yaw: 0, pitch: 0, verticalFov: 1 };
   }
+}
+
+/** Guess whether a photograph is a full sphere, or a part that its metadata place on one. */
+async function isSphere(file: Blob, { naturalWidth, naturalHeight }: HTMLImageElement): Promise<boolean> {
+  if (Math.abs(naturalWidth / naturalHeight - 2) <= 0.02) return true;
+  const head = await file.slice(0, METADATA_BYTES).text();
+  return head.includes("GPano:") && head.includes("equirectangular");
 }
 
 function legend(): HTMLElement {

@@ -3,42 +3,60 @@
 import { Compass } from "./compass";
 import { byId, h, show } from "./dom";
 import { NO_HINTS } from "./hints";
-import { clearError, showError } from "./notices";
-import type { Answer, Hints } from "./types";
+import { clearError, InputError, showError } from "./notices";
+import type { Answer, Hints, Together } from "./types";
 
 export interface Photo {
   file: File;
   url: string;
-  heading: number | null;
-  tolerance: number;
-  cameraHeight: number | null;
+  /** Filled fields of the form, by their names in the request. */
+  settings: Record<string, string>;
   hints: Hints;
   answer: Answer | null;
-  /** Fields of the query, for code snippets. */
-  fields: Record<string, string>;
+  /** Fields and photographs of the latest query, for code snippets. */
+  asked: { fields: Record<string, string>; files: File[] };
 }
 
-const PICTURES = /^image\/(jpeg|png|webp)$/;
+/** Photographs of one visit that are localised together. */
+export interface Group {
+  motion: Together["motion"];
+  photos: readonly Photo[];
+}
+
+// Fields of the form by their names in the request.
+const SETTINGS = {
+  heading_deg: "heading", heading_tolerance_deg: "tolerance", camera_height_m: "camera-height", hfov_deg: "field-of-view",
+  projection: "projection", pitch_deg: "pitch", roll_deg: "roll",
+} as const;
+type Setting = keyof typeof SETTINGS;
+const NAMES = Object.keys(SETTINGS) as Setting[];
+
+const PICTURES = /^image\/(jpeg|png|webp|heic|heif)$/;
+// Some systems do not know the type of phones' files.
+const PHONE_FILES = /\.hei[cf]$/i;
+const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
 
 /** Form of the chosen photograph, and the strip of all photographs. */
 export class Photos {
   readonly compass: Compass;
   private readonly strip = byId("photo-strip");
   private readonly error = byId("photo-error");
-  private readonly heading = byId<HTMLInputElement>("heading");
-  private readonly tolerance = byId<HTMLInputElement>("tolerance");
-  private readonly height = byId<HTMLInputElement>("camera-height");
+  private readonly inputs = Object.fromEntries(NAMES.map((name) =>
+    [name, byId<HTMLInputElement | HTMLSelectElement>(SETTINGS[name])])) as Record<Setting, HTMLInputElement | HTMLSelectElement>;
+  private readonly choice = byId<HTMLFieldSetElement>("together");
   private readonly all: Photo[] = [];
   private chosen: Photo | null = null;
+  private offersGroups = true;
 
   /** `changed` is called when another photograph is chosen or its settings change. */
   constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
     this.compass = new Compass((degrees) => {
-      this.heading.value = degrees === null ? "" : String(degrees);
+      this.inputs.heading_deg.value = degrees === null ? "" : String(degrees);
       this.read();
     });
     byId("compass-place").append(this.compass.element);
-    for (const field of [this.heading, this.tolerance, this.height]) field.addEventListener("input", () => this.read());
+    for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
+    this.choice.addEventListener("change", () => this.onMotion());
     const input = byId<HTMLInputElement>("photo-file");
     input.addEventListener("change", () => {
       this.add([...(input.files ?? [])]);
@@ -56,21 +74,33 @@ export class Photos {
   }
 
   get fields(): Record<string, HTMLElement> {
-    return { heading_deg: this.heading, heading_tolerance_deg: this.tolerance, camera_height_m: this.height };
+    return { ...this.inputs, headings_deg: this.inputs.heading_deg };
+  }
+
+  /** All photographs, if they are to be localised together; null if each is localised by itself. */
+  get group(): Group | null {
+    const motion = this.choice.hidden ? "" : this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "";
+    return motion === "turn" || motion === "walk" ? { motion, photos: this.all } : null;
+  }
+
+  /** Offer queries with several photographs, which venues do not have. */
+  offerGroups(offered: boolean): void {
+    this.offersGroups = offered;
+    this.drawStrip();
   }
 
   /** Add pictures and choose the first of them. */
-  add(files: File[], headings: (number | null)[] = []): void {
-    const rejected = files.filter((file) => !PICTURES.test(file.type));
+  add(files: File[]): void {
+    const rejected = files.filter((file) => !isPicture(file));
     clearError(this.error);
     if (rejected.length > 0) {
       const names = rejected.map((file) => `“${file.name}”`).join(", ");
-      showError(this.error, new Error(`${names}: photographs must be JPEG, PNG or WebP files, full 360° and twice as wide as high.`));
+      showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
     }
-    const added = files.filter((file) => PICTURES.test(file.type)).map((file, index): Photo => ({
-      file, url: URL.createObjectURL(file), heading: headings[index] ?? null, tolerance: 0, cameraHeight: null, hints: NO_HINTS,
-      answer: null, fields: {},
+    const added = files.filter(isPicture).map((file): Photo => ({
+      file, url: URL.createObjectURL(file), settings: { ...this.shared }, hints: NO_HINTS, answer: null, asked: { fields: {}, files: [file] },
     }));
+    if (added.length > 0) this.forgetGroup();
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
   }
@@ -78,10 +108,8 @@ export class Photos {
   /** Choose a photograph, or none. */
   choose(photo: Photo | null): void {
     this.chosen = photo;
-    this.heading.value = photo?.heading === null || photo === null ? "" : String(photo.heading);
-    this.tolerance.value = photo === null || photo.tolerance === 0 ? "" : String(photo.tolerance);
-    this.height.value = photo?.cameraHeight === null || photo === null ? "" : String(photo.cameraHeight);
-    this.compass.set(photo?.heading ?? null);
+    for (const name of NAMES) this.inputs[name].value = photo?.settings[name] ?? "";
+    this.showHeading();
     byId("photo-settings").toggleAttribute("disabled", photo === null);
     this.drawStrip();
     this.changed(photo, true);
@@ -102,29 +130,76 @@ export class Photos {
   setHints(hints: Hints): void {
     if (this.chosen === null) return;
     this.chosen.hints = hints;
-    this.changed(this.chosen, false);
+    this.onChanged(this.chosen);
   }
 
   private remove(photo: Photo): void {
     const index = this.all.indexOf(photo);
     this.all.splice(index, 1);
     URL.revokeObjectURL(photo.url);
+    this.forgetGroup();
     if (photo === this.chosen) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
-    else this.drawStrip();
+    else {
+      this.drawStrip();
+      this.changed(this.chosen, false);
+    }
+  }
+
+  /** Show the heading in the form on the compass. */
+  private showHeading(): void {
+    const heading = this.chosen?.settings.heading_deg;
+    this.compass.set(heading === undefined ? null : Number(heading));
+  }
+
+  /** Settings that all photographs of a group share: those of the camera. */
+  private get shared(): Photo["settings"] {
+    if (this.group === null || this.chosen === null) return {};
+    const { heading_deg: _, ...shared } = this.chosen.settings;
+    return shared;
   }
 
   private read(): void {
     if (this.chosen === null) return;
-    const number = (field: HTMLInputElement): number | null => (field.value.trim() === "" ? null : field.valueAsNumber);
-    this.chosen.heading = number(this.heading);
-    this.chosen.tolerance = number(this.tolerance) ?? 0;
-    this.chosen.cameraHeight = number(this.height);
-    this.compass.set(this.chosen.heading);
-    this.changed(this.chosen, false);
+    const given = NAMES.map((name) => [name, this.inputs[name].value.trim()] as const).filter(([, value]) => value !== "");
+    this.chosen.settings = Object.fromEntries(given);
+    this.share();
+    this.showHeading();
+    this.onChanged(this.chosen);
+  }
+
+  private share(): void {
+    if (this.group === null) return;
+    const shared = this.shared;
+    for (const photo of this.all) {
+      const { heading_deg } = photo.settings;
+      photo.settings = heading_deg === undefined ? shared : { ...shared, heading_deg };
+    }
+  }
+
+  private onMotion(): void {
+    this.share();
+    this.forgetGroup();
+    this.drawStrip();
+    if (this.chosen !== null) this.onChanged(this.chosen);
+  }
+
+  private onChanged(photo: Photo): void {
+    this.forgetGroup();
+    photo.answer = null;
+    this.drawStrip();
+    this.changed(photo, false);
+  }
+
+  /** Remove the answers of photographs that were localised together. */
+  private forgetGroup(): void {
+    for (const photo of this.all) if (photo.answer?.together !== undefined) photo.answer = null;
   }
 
   drawStrip(): void {
-    byId("find-all").hidden = this.all.length < 2;
+    this.choice.hidden = this.all.length < 2 || !this.offersGroups;
+    const group = this.group;
+    byId("find-all").hidden = this.all.length < 2 || group !== null;
+    byId("find").textContent = group?.motion === "walk" ? "Find the places" : "Find the place";
     show(this.strip, ...this.all.map((photo) => {
       const name = photo.file.name.replace(/^example-/, "");
       const choose = h("button", {

@@ -2,6 +2,7 @@
 
 import { ARROWS, followPointer, h, s, show } from "./dom";
 import { unitOf } from "./plan_drawing";
+import { clearError, InputError, showFieldError } from "./notices";
 import { placeOf } from "./pose_marker";
 import type { Point } from "./types";
 import { Viewport } from "./viewport";
@@ -11,6 +12,7 @@ const FAR_STEPS = 20;
 export class PictureScale {
   readonly element: HTMLElement;
   readonly metres = h("input", { type: "number", min: 0.01, step: "any", id: "picture-metres", placeholder: "4.2", inputmode: "decimal" });
+  private readonly error = h("p", { class: "field-error", id: "picture-metres-error", role: "alert", hidden: true });
   private readonly svg = s("svg", { class: "picture", role: "group", "aria-label": "The picture with the two ends of a known distance" });
   private readonly picture = s("g");
   private readonly overlay = s("g", { class: "measured" });
@@ -23,7 +25,8 @@ export class PictureScale {
     const drawing = h("div", { class: "drawing" }, this.svg);
     this.element = h("div", { class: "picture-scale" },
       h("p", { class: "hint" }, "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall."), drawing,
-      h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres));
+      h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres, this.error));
+    this.metres.addEventListener("input", () => clearError(this.error, { metres: this.metres }));
     this.svg.append(this.picture, this.overlay);
     // Capture runs before the viewport's listener, which would move the drawing.
     this.svg.addEventListener("pointerdown", (event) => this.onDown(event));
@@ -40,7 +43,7 @@ export class PictureScale {
       await picture.decode();
     } catch {
       URL.revokeObjectURL(url);
-      throw new Error(`The browser cannot show “${file.name}” as a picture.`);
+      throw new InputError(`The browser cannot show “${file.name}” as a picture.`);
     }
     this.url = url;
     const width = picture.naturalWidth, height = picture.naturalHeight;
@@ -53,6 +56,7 @@ export class PictureScale {
     if (this.url !== null) URL.revokeObjectURL(this.url);
     this.url = null;
     this.metres.value = "";
+    clearError(this.error, { metres: this.metres });
     show(this.picture);
     show(this.overlay);
   }
@@ -61,6 +65,11 @@ export class PictureScale {
   get knownDistance(): string | null {
     if (this.url === null || this.metres.value.trim() === "") return null;
     return [...this.ends.flatMap(([x, y]) => [x.toFixed(1), (-y).toFixed(1)]), this.metres.value.trim()].join(",");
+  }
+
+  /** Ask for the distance that is missing. */
+  askForDistance(): void {
+    showFieldError(this.error, this.metres, "Put the ends of the line on two points and enter their distance in metres.");
   }
 
   private draw(): void {

@@ -1,12 +1,13 @@
 /** Stored plans: list, search, upload, progress, deletion. */
 
-import { api } from "./api";
+import { api, ServiceError } from "./api";
 import { button, byId, h, show } from "./dom";
 import { followPlan } from "./events";
+import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
 import { acceptDrops } from "./photos";
-import type { Plan, PlanSummary } from "./types";
+import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */
 const isCertain = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
@@ -23,6 +24,10 @@ export interface PlanActions {
   started: () => void;
   /** The user picked a plan from the list or uploaded one. */
   picked: () => void;
+  /** All levels of a file were stored as a venue. */
+  imported: (venue: { id: string }) => void;
+  /** The user picked an example; the plan is null if it is stored already. */
+  example: (plan: PlanDocument | null, photos: File[]) => void;
   /** The user searches for a name. */
   searched: (name: string) => void;
 }
@@ -31,7 +36,9 @@ export class Plans {
   private readonly list = byId("plan-list");
   private readonly search = byId<HTMLInputElement>("plan-search");
   private readonly error = byId("plan-error");
-  private readonly importing = new ImportForm((file, fields) => void this.upload(file, fields));
+  private readonly menu = byId<HTMLDetailsElement>("plan-menu");
+  private readonly importing = new ImportForm((file, fields) => void this.upload(file, fields),
+    (file, fields) => void this.uploadLevels(file, fields), () => this.cancelImport());
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
   private found: PlanSummary[] = [];
   private cursor: string | null = null;
@@ -49,6 +56,9 @@ export class Plans {
         actions.searched(this.search.value.trim());
       }, SEARCH_AFTER_MS);
     });
+    this.connectMenu();
+    byId("example-flat").addEventListener("click", () => void this.pickExample(FLAT));
+    byId("example-rooms").addEventListener("click", () => void this.pickExample(ROOMS));
     const input = byId<HTMLInputElement>("plan-file");
     input.addEventListener("change", () => {
       const file = input.files?.[0];
@@ -56,6 +66,19 @@ export class Plans {
       if (file !== undefined) this.begin(file);
     });
     acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) this.begin(files[0]); });
+  }
+
+  /** Close the menu after a choice, with Escape, and with a click outside. */
+  private connectMenu(): void {
+    addEventListener("keydown", (event) => {
+      if (event.key !== "Escape" || !this.menu.open) return;
+      this.menu.open = false;
+      this.menu.querySelector("summary")?.focus();
+    });
+    addEventListener("pointerdown", ({ target }) => {
+      const isInside = target instanceof Node && (this.menu.contains(target) || byId("delete-dialog").contains(target));
+      if (!isInside) this.menu.open = false;
+    });
   }
 
   /** Load the list, or with a cursor its next page; return the listed plans. */
@@ -87,6 +110,19 @@ export class Plans {
     }
   }
 
+  private async pickExample(example: Example): Promise<void> {
+    this.actions.started();
+    this.actions.picked();
+    this.menu.open = false;
+    const request = this.discardPending();
+    const [plan, photos, stored] = await Promise.all([examplePlan(example), exampleFiles(example), this.load()]);
+    if (request !== this.requests) return;
+    const known = stored.find(({ name }) => name === plan.name);
+    if (known === undefined) this.take(null);
+    else await this.choose(known.id);
+    this.actions.example(known === undefined ? plan : null, photos);
+  }
+
   /** Ignore the results of earlier requests to show a plan. */
   discardPending(): number {
     return ++this.requests;
@@ -110,6 +146,11 @@ export class Plans {
     else void this.upload(file);
   }
 
+  private cancelImport(): void {
+    clearError(this.error, this.importing.fields);
+    this.importing.close();
+  }
+
   /** Upload a file as a new plan. */
   async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
     clearError(this.error, this.importing.fields);
@@ -129,12 +170,31 @@ export class Plans {
       await this.load();
       say(`“${plan.name}” is stored.`);
     } catch (error) {
-      // A plan left on the screen would look like the rejected one.
-      if (request === this.requests) this.take(null);
-      this.importing.ask(file, true);
-      showError(this.error, error, this.importing.fields);
+      const levels = error instanceof ServiceError ? error.levels : [];
+      this.importing.ask(file, true, levels);
+      if (levels.length === 0) showError(this.error, error, this.importing.fields);
     } finally {
       if (state.textContent.startsWith("Importing")) state.textContent = "";
+    }
+  }
+
+  /** Upload all levels of a file as plans and their venue. */
+  private async uploadLevels(file: File, fields: Record<string, string>): Promise<void> {
+    clearError(this.error, this.importing.fields);
+    const request = this.discardPending(), state = byId("plan-state");
+    state.textContent = `Importing all levels of “${file.name}” …`;
+    try {
+      const venue = await api.uploadLevels(file, fields);
+      await this.load();
+      if (request === this.requests) {
+        this.importing.close();
+        this.actions.imported(venue);
+      }
+      say(`“${venue.name}” is stored.`);
+    } catch (error) {
+      showError(this.error, error, this.importing.fields);
+    } finally {
+      state.textContent = "";
     }
   }
 
@@ -165,6 +225,7 @@ export class Plans {
   }
 
   private pick(id: string): void {
+    this.menu.open = false;
     this.actions.started();
     this.actions.picked();
     void this.choose(id);

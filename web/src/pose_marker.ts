@@ -1,6 +1,6 @@
 /** Camera marker on the plan, moved with pointer or keyboard. */
 
-import { followPointer, s } from "./dom";
+import { byId, followPointer, s } from "./dom";
 import { degrees, radians } from "./layout";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Point, Pose } from "./types";
@@ -15,6 +15,16 @@ export function placeOf(svg: SVGSVGElement, event: PointerEvent | MouseEvent): P
   if (matrix === null) return [0, 0];
   const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(matrix.inverse());
   return [x, -y];
+}
+
+/** Show the coordinates under the pointer beside the name of the plan. */
+export function showCursor(svg: SVGSVGElement): void {
+  const text = byId("cursor");
+  svg.addEventListener("pointermove", (event) => {
+    const [x, y] = placeOf(svg, event);
+    text.textContent = `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m`;
+  });
+  svg.addEventListener("pointerleave", () => { text.textContent = ""; });
 }
 
 export class PoseMarker {

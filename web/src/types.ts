@@ -20,7 +20,10 @@ export type RoomLayout = Schemas["RoomLayoutAnswer"];
 export type Layout = Schemas["LayoutAnswer"];
 export type Candidate = Schemas["CandidateAnswer"];
 export type Posterior = Schemas["PosteriorAnswer"];
-export type Answer = Schemas["LocaliseAnswer"];
+export type SequenceAnswer = Schemas["SequenceAnswer"];
+/** Answer to a photograph; `together` states that it was asked for with others. */
+export type Answer = Schemas["LocaliseAnswer"] & { together?: Together };
+export type ViewAnswer = Schemas["ViewAnswer"];
 export type Problem = Schemas["Problem"];
 export type Fault = Schemas["Fault"];
 
@@ -31,6 +34,13 @@ export interface Pose {
   x_m: number;
   y_m: number;
   heading_deg: number;
+}
+
+/** Photographs that were localised together, and the probability that all of their places are right. */
+export interface Together {
+  motion: "turn" | "walk";
+  photographs: number;
+  confidence: number | null;
 }
 
 /** Hints of the place of a photograph: a circle on the plan, and rooms. */

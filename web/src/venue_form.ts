@@ -2,7 +2,7 @@
 
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
-import { clearError, say, showError } from "./notices";
+import { clearError, InputError, say, showError } from "./notices";
 import type { PlanSummary, Venue } from "./types";
 
 interface Row {
@@ -50,9 +50,9 @@ export class VenueForm {
     clearError(this.error, fields);
     try {
       const missing = this.chosen.find(({ level }) => Number.isNaN(level.valueAsNumber));
-      if (this.name.value.trim() === "") throw new Error("Enter a name for the venue.");
-      if (this.chosen.length === 0) throw new Error("Add at least one plan.");
-      if (missing !== undefined) throw new Error(`Enter the level of ${missing.plan.name} as a number: 0 is the ground floor.`);
+      if (this.name.value.trim() === "") throw new InputError("Enter a name for the venue.");
+      if (this.chosen.length === 0) throw new InputError("Add at least one plan.");
+      if (missing !== undefined) throw new InputError(`Enter the level of ${missing.plan.name} as a number: 0 is the ground floor.`);
       const plans = this.chosen.map(({ plan, level }) => ({ floorplan_id: plan.id, level: level.valueAsNumber }));
       const venue = await api.createVenue(this.name.value.trim(), plans);
       this.name.value = "";

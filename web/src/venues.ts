@@ -21,7 +21,7 @@ export class Venues {
   private readonly bar = byId("venue-bar");
   private readonly choice = byId<HTMLSelectElement>("venue-plan");
   private readonly error = byId("plan-error");
-  private readonly form = new VenueForm((venue) => void this.onMade(venue));
+  private readonly form = new VenueForm((venue) => void this.take(venue));
   private found: Venue[] = [];
   private venue: Venue | null = null;
 
@@ -40,9 +40,15 @@ export class Venues {
     this.form.offer(plans);
   }
 
-  private async onMade(venue: Venue): Promise<void> {
-    byId<HTMLDetailsElement>("venue-make").open = false;
+  /** List and choose a new venue. */
+  async take(venue: { id: string }): Promise<void> {
+    for (const fold of ["venue-make", "plan-menu"]) byId<HTMLDetailsElement>(fold).open = false;
     await Promise.all([this.load(""), this.choose(venue.id)]);
+  }
+
+  private pick(id: string): void {
+    byId<HTMLDetailsElement>("plan-menu").open = false;
+    void this.choose(id);
   }
 
   /** Load the list of venues with a name. */
@@ -91,7 +97,7 @@ export class Venues {
 
   private draw(): void {
     show(this.list, ...this.found.map((venue) => h("li", {}, h("button", {
-      type: "button", class: "plan", "aria-pressed": String(venue.id === this.venue?.id), onclick: () => void this.choose(venue.id),
+      type: "button", class: "plan", "aria-pressed": String(venue.id === this.venue?.id), onclick: () => this.pick(venue.id),
     }, h("span", { class: "name" }, venue.name), h("span", { class: "facts" }, `venue, ${venue.plans} plans`)))));
     byId("venues").hidden = this.found.length === 0;
   }

@@ -2,7 +2,7 @@
 
 import { api, ServiceError } from "../api";
 import { button, byId, h, show } from "../dom";
-import { clearError, say, showError } from "../notices";
+import { clearError, InputError, say, showError } from "../notices";
 import { type Box, boxOf, unitOf } from "../plan_drawing";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
@@ -29,7 +29,7 @@ const NEW_ROOM_M: Point = [4, 3];
 const TOOLS: [Tool, string][] = [["select", "Select"], ["room", "Draw a room"], ["door", "Door"], ["window", "Window"], ["passage", "Passage"], ["scale", "Scale"]];
 
 export class Editor {
-  readonly underlay = new Underlay();
+  readonly underlay: Underlay;
   private readonly handles: Handles;
   private readonly tools: Tools;
   private readonly bar = byId("plan-tools");
@@ -44,6 +44,7 @@ export class Editor {
   private measured = 0;
 
   constructor(svg: SVGSVGElement, private readonly host: EditorHost) {
+    this.underlay = new Underlay(svg);
     this.handles = new Handles(svg, { edit: (plan, goesOn) => this.edit(plan, goesOn), select: (selection) => this.select(selection) });
     this.tools = new Tools(svg, {
       edit: (plan) => {
@@ -93,7 +94,9 @@ export class Editor {
     if (report?.format !== "picture" || report.metres_per_unit == null || report.notes.some((note) => TURNED.test(note))) return;
     try {
       const original = await api.original(plan.id);
-      if (this.base?.revision === plan.revision) await this.underlay.lay(original, plan.name, report.metres_per_unit);
+      if (this.base?.revision !== plan.revision) return;
+      await this.underlay.lay(original, plan.name, report.metres_per_unit);
+      this.drawBar();
     } catch {
       // The picture is optional.
     }
@@ -144,6 +147,7 @@ export class Editor {
         button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
         h("label", { class: "file" }, picture, h("span", {}, "Picture to trace")),
         button("Undo", () => this.step("undo"), { id: "undo" }), button("Redo", () => this.step("redo"), { id: "redo" })),
+      this.underlay.box !== null && h("label", { class: "inline", for: this.underlay.slider.id }, "Picture through the rooms", this.underlay.slider),
       this.measure, this.hint,
       h("div", { class: "ask" },
         button(this.base === null ? "Store the plan" : "Save as a new revision", () => void this.save(), { class: "primary", id: "save" }),
@@ -203,7 +207,7 @@ export class Editor {
 
   private applyScale(distance: number): void {
     if (this.history === null || !(distance > 0) || !(this.measured > 0)) {
-      showError(this.error, new Error("The distance must be more than 0 m, between two different points."));
+      showError(this.error, new InputError("The distance must be more than 0 m, between two different points."));
       return;
     }
     clearError(this.error);

@@ -1,14 +1,22 @@
-/** Picture under the rooms to draw over, from the plan's origin to the right and up. */
+/** Picture that shows through the rooms, to draw over and to check them, from the plan's origin to the right and up. */
 
-import { s, show } from "../dom";
+import { h, s, show } from "../dom";
+import { InputError } from "../notices";
 
 const FIRST_WIDTH_M = 12;
+const FIRST_SHARE = 0.6;
 
 export class Underlay {
   readonly element = s("g", { class: "underlay" });
   private url: string | null = null;
   private size = { width: 0, height: 0 };
   private metresPerPixel = 0;
+  /** Form for the share of the picture that shows through the rooms. */
+  readonly slider = h("input", { type: "range", min: 0, max: 1, step: 0.05, value: FIRST_SHARE, id: "see-through" });
+
+  constructor(private readonly svg: SVGSVGElement) {
+    this.slider.addEventListener("input", () => this.mix());
+  }
 
   get box(): { width: number; height: number } | null {
     return this.url === null ? null : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
@@ -23,7 +31,7 @@ export class Underlay {
       await picture.decode();
     } catch {
       URL.revokeObjectURL(url);
-      throw new Error(`The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
+      throw new InputError(`The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
     }
     this.remove();
     this.url = url;
@@ -41,11 +49,19 @@ export class Underlay {
     if (this.url !== null) URL.revokeObjectURL(this.url);
     this.url = null;
     show(this.element);
+    this.mix();
+  }
+
+  /** Make the rooms as transparent as the slider says, if there is a picture. */
+  private mix(): void {
+    this.svg.classList.toggle("traced", this.url !== null);
+    this.svg.style.setProperty("--cover", String(1 - this.slider.valueAsNumber));
   }
 
   private draw(): void {
     const box = this.box;
     if (box === null || this.url === null) return;
-    show(this.element, s("image", { href: this.url, x: 0, y: -box.height, width: box.width, height: box.height, opacity: 0.55, preserveAspectRatio: "none" }));
+    show(this.element, s("image", { href: this.url, x: 0, y: -box.height, width: box.width, height: box.height, preserveAspectRatio: "none" }));
+    this.mix();
   }
 }

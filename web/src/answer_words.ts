@@ -1,0 +1,96 @@
+/** Words for the parts of an answer. */
+
+import { normal95, within95 } from "./answer_overlay";
+import type { Answer, ViewAnswer } from "./types";
+
+/** Describe a confidence. */
+export function confidenceWords(confidence: number | null): string {
+  if (confidence === null) return "Unknown confidence: the model is not calibrated";
+  if (confidence >= 0.95) return "Almost certainly here";
+  if (confidence >= 0.8) return "Very likely here";
+  if (confidence >= 0.5) return "Probably here";
+  if (confidence >= 0.2) return "Possibly here";
+  return "Uncertain: possibly another place, or not in this plan";
+}
+
+export const percent = (share: number): string =>
+  share > 0 && share < 0.01 ? "under 1 %" : share > 0.99 && share < 1 ? "over 99 %" : `${Math.round(100 * share)} %`;
+
+export const milliseconds = (duration: number): string =>
+  duration >= 1000 ? `${(duration / 1000).toFixed(1)} s` : `${Math.round(duration)} ms`;
+
+/** Return the 95 % radius of the position along the longer axis of the ellipse on the plan. */
+export function accuracyWords(answer: Answer): string | null {
+  if (answer.covariance_m2 === null) return null;
+  const [radius] = within95(answer.covariance_m2);
+  return radius < 1 ? `± ${Math.max(1, Math.round(100 * radius))} cm` : `± ${radius.toFixed(1)} m`;
+}
+
+/** Return a heading with its 95 % interval. */
+export function headingWords(headingDeg: number, deviationDeg: number | null): string {
+  const spread = deviationDeg === null ? 0 : normal95(deviationDeg);
+  return `${(Math.round(headingDeg) % 360).toFixed(0)}°${spread < 0.5 ? "" : ` ± ${spread.toFixed(0)}°`}`;
+}
+
+/** Describe what was assumed about a photograph, with the origin of each value. */
+export function viewWords(view: ViewAnswer): string {
+  const { projection, hfov, pitch, roll, camera } = view;
+  const kind = `Read as ${PROJECTIONS[projection]}`;
+  if (camera === null && projection === "equirectangular" && hfov.value_deg >= 360) return `${kind}.`;
+  const width = `, ${angleWords(hfov.value_deg, hfov.std_deg)} wide (${VALUE_SOURCES[hfov.source]})`;
+  if (camera === null) return `${kind}${width}.`;
+  const tilt = `tilted ${directed(pitch, "up", "down")} and leaning ${directed(roll, "right", "left")}`;
+  const sources = pitch.source === roll.source ? VALUE_SOURCES[pitch.source] :
+    `${VALUE_SOURCES[pitch.source]}; ${VALUE_SOURCES[roll.source]}`;
+  return `${kind}${width}, ${tilt} (${sources}).`;
+}
+
+/** Describe how much of the surroundings an answer's photographs show, and what that rules out. */
+export function seenWords(view: ViewAnswer): string {
+  return `${seenDeg(view).toFixed(0)}° of 360° of the surroundings are seen; that rules out ${percent(view.ruled_out)} of the area.`;
+}
+
+/** Return advice how to photograph the place for a sure answer; null if there is none. */
+export function adviceWords(answer: Answer): string | null {
+  const { view, together } = answer;
+  if (view === null || view === undefined || view.advice === null) return null;
+  const seen = `${seenDeg(view).toFixed(0)}° of the surroundings are too little to tell the place`;
+  return together?.motion === "turn" ? `Turn further: ${seen}. Add more photographs from the same spot.` :
+    `Turn around: ${seen}. Add photographs from the same spot, and choose “Taken from one spot, turning”.`;
+}
+
+function seenDeg({ seen }: ViewAnswer): number {
+  return seen.reduce((sum, { from_deg, to_deg }) => sum + to_deg - from_deg, 0);
+}
+
+function angleWords(value: number, deviation: number): string {
+  const spread = normal95(deviation);
+  return `${value.toFixed(0)}°${spread < 0.5 ? "" : ` ± ${spread.toFixed(0)}°`}`;
+}
+
+function directed({ value_deg, std_deg }: ViewAnswer["pitch"], positive: string, negative: string): string {
+  return `${value_deg < -0.5 ? negative : positive} by ${angleWords(Math.abs(value_deg), std_deg)}`;
+}
+
+const PROJECTIONS: Record<ViewAnswer["projection"], string> = {
+  equirectangular: "a 360° photograph", perspective: "an ordinary photograph", cylindrical: "a panorama strip", fisheye: "a fisheye photograph",
+};
+
+/** Origin of a value of the camera. */
+const VALUE_SOURCES: Record<ViewAnswer["pitch"]["source"], string> = {
+  given: "as entered", gpano: "from the file", exif: "from the file", estimated: "estimated from lines in the picture", assumed: "a usual value",
+};
+
+/** Origin of a heading. */
+export const HEADING_SOURCES: Record<Answer["heading_source"], string> = {
+  given: "as given",
+  panorama: "from the photograph’s metadata",
+  searched: "estimated from the picture",
+};
+
+/** Last stage of an answer; without LPO it is coarser. */
+export const STAGES: Record<Answer["stage"], string> = {
+  lpo: "refined pose (LPO)",
+  vdr: "dense sampling (VDR), not refined",
+  retrieval: "nearest pose of the pose grid, not refined",
+};
