@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from pathlib import Path
 
 import pytest
@@ -21,18 +22,50 @@ settings.load_profile("tests")
 
 
 @pytest.fixture(scope="session")
-def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Train both stages of the `tiny` preset for seconds and export the bundle."""
+def tiny_bundle(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """Train both stages of the `tiny` preset for seconds and export the bundle, once for all processes of a run."""
+    folder = tmp_path_factory.mktemp("tiny")
+    if worker_id == "master":
+        return _tiny_bundle(folder)
+    shared = tmp_path_factory.getbasetemp().parent / "tiny"
+    with shared.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not shared.exists():
+            _tiny_bundle(folder)
+            folder.rename(shared)
+    return shared / "bundle"
+
+
+def _tiny_bundle(folder: Path) -> Path:
     from lalaloc_core.learn.export.run import export_run
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
     from lalaloc_core.learn.training.run import train_image, train_layout
 
     torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("tiny")
     device = torch.device("cpu")
     # Rendering the usual number of validation panoramas would take longer than the training.
     data = TrainingData(validation_scenes=2)
     train_layout(PRESETS["tiny"], folder, device=device, data=data, workers=0)
     train_image(PRESETS["tiny"], folder, device=device, data=data, workers=0)
     return export_run(folder, folder / "bundle", name="tiny", version="test").folder
+
+
+@pytest.fixture(scope="session")
+def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the tiny bundle with an encoder of views, whose weights are random."""
+    import dataclasses
+
+    from lalaloc_core.learn.export.bundle_export import add_view_encoder
+    from lalaloc_core.learn.training.presets import PRESETS
+    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.nets.view_encoder import ViewEncoder
+
+    origin = Bundle.open(tiny_bundle)
+    folder = tmp_path_factory.mktemp("tiny-views")
+    for name in origin.manifest.files:
+        (folder / name).write_bytes(origin.read(name))
+    config = PRESETS["tiny"]
+    torch.manual_seed(0)
+    encoder = ViewEncoder(config.view, config.ring)
+    return add_view_encoder(dataclasses.replace(origin, folder=folder), config, encoder, {}).folder

@@ -11,7 +11,7 @@ from collections.abc import Callable
 _MAX_RATIO = 3.0
 # Shorter work is repeated, since clocks are coarse.
 _MIN_S = 0.02
-_TRIES = 12
+_TRIES = 30
 
 
 def assert_no_worse_than_linear(prepare: Callable[[int], Callable[[], object]], size: int) -> None:

@@ -28,6 +28,7 @@ LAYERS = {
     # The query side.
     "lalaloc_core.floorplan.earth": 0,
     "lalaloc_core.floorplan": 1,
+    "lalaloc_core.localise.prediction_errors": 1,
     "lalaloc_core.localise.bundle": 2,
     "lalaloc_core.panorama": 2,
     "lalaloc_core.photograph": 3,
@@ -36,6 +37,7 @@ LAYERS = {
     "lalaloc_core.localise": 4,
     "lalaloc_core.localise.optimise": 5,
     "lalaloc_core.localise.sequence": 5,
+    "lalaloc_core.localise.tracking": 5,
     "lalaloc_core.localise.venue": 5,
     "lalaloc_core.draw": 5,
     "lalaloc_core.importers.common": 2,
@@ -87,8 +89,8 @@ FORBIDDEN = {
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
     "tenancy uploaded_file",
-    "cores settings setting_groups setting_types errors problem_kinds schemas stored_plan threads bounded_cache "
-    "telemetry",
+    "cores settings setting_groups setting_types errors problem_kinds schemas stored_plan threads single_flight "
+    "bounded_cache telemetry",
     "renditions",
     # `workers` runs in worker processes and does not import their supervisors.
     "workers",

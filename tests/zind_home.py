@@ -101,10 +101,15 @@ def _panorama_data(
     # In the mirrored frame, clockwise becomes counter-clockwise.
     angle = panorama.heading
     cosine, sine = math.cos(angle), math.sin(angle)
-    offset = room.polygon_m * mirror / scale_m - translation
-    vertices = np.stack([cosine * offset[:, 0] + sine * offset[:, 1], -sine * offset[:, 0] + cosine * offset[:, 1]], 1)
-    vertices /= scale
-    layout = {"vertices": vertices.tolist(), "doors": [], "windows": [], "openings": [], "internal": []}
+
+    def own(points: np.ndarray) -> np.ndarray:
+        x, y = (points * mirror / scale_m - translation).T
+        return np.stack([cosine * x + sine * y, -sine * x + cosine * y], 1) / scale
+
+    vertices = own(room.polygon_m)
+    # Rings are closed, as in the data set.
+    internal = [own(hole[[*range(len(hole)), 0]]).tolist() for hole in room.holes_m]
+    layout = {"vertices": vertices.tolist(), "doors": [], "windows": [], "openings": [], "internal": internal}
     data = {
         "label": f"label {panorama.room_index + 1}",
         "is_primary": panorama.primary,

@@ -108,7 +108,12 @@ def test_retry_after_is_observed(failing: FailingServer, make_client: MakeClient
     assert second.received_s - first.received_s >= 1.0
 
 
-@pytest.mark.parametrize("retry_after", ["3600", format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)])
+@pytest.mark.parametrize(
+    "retry_after",
+    ["3600", format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)],
+    # The date of one process is not that of another.
+    ids=["seconds", "date"],
+)
 def test_wait_beyond_the_total_is_not_started(
     failing: FailingServer, make_client: MakeClient, retry_after: str
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -10,6 +11,7 @@ import pytest
 
 from lalaloc_client import ConflictError, InvalidError, NotFoundError, VenueAnchor, VenuePlan
 from tests.client.conftest import MakeClient
+from tests.importers.test_roomplan import two_stories
 from tests.service.conftest import FLAT, StartApp
 
 ANCHOR = VenueAnchor(51.7546, -1.2545, altitude_m=61.0, north_deg=12.5)
@@ -55,6 +57,23 @@ def test_venue_is_stored_changed_and_deleted(service: Any) -> None:
     with pytest.raises(NotFoundError):
         service.venue(made.id)
     assert service.floorplan(plans[0]).status == "ready"
+
+
+def test_file_of_several_levels_becomes_a_venue(service: Any, tmp_path: Path) -> None:
+    file = tmp_path / "12 Mill Lane.json"
+    file.write_bytes(two_stories())
+    venue = service.upload_venue(file)
+    assert [(plan.name, plan.level) for plan in service.venue_plans(venue.id)] == [
+        ("12 Mill Lane – story 0", 0.0),
+        ("12 Mill Lane – story 1", 1.0),
+    ]
+    named = service.upload_venue(two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a")
+    assert named == service.upload_venue(
+        two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a"
+    )
+    assert (named.name, service.upload_venue(FLAT).name) == ("Home", "venue")
+    with pytest.raises(InvalidError, match="unknown part"):
+        service.upload_venue(file, options={"level": "1"})
 
 
 def test_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:

@@ -23,6 +23,7 @@ from lalaloc_core.evaluate.report.photographs import (
     evaluate_photographs,
 )
 from lalaloc_core.evaluate.report.tables import percent
+from lalaloc_core.evaluate.runs.foreign import foreign_plans
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, score_galleries
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
 from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
@@ -396,7 +397,13 @@ class TestEvaluating:
         profile_m = hall.profile_m(0, 128)
         measures = measure_azimuths([profile_m], np.log(profile_m), np.full(128, -3.0), truth, scores)
         read = ReadPhotograph(photograph=hall, profile_m=profile_m, class_scores=scores, measures=measures)
-        markdown = PhotographResults(read=[read], answers={}).markdown()
+        results = PhotographResults(read=[read], answers={}, foreign={"known": [0.9, 0.2, 0.4, 0.1]})
+        markdown, figures = results.markdown(), results.figures()
+        none, every = percent(0.0), percent(1.0)
+        assert f"| door | {none} | {none} | {every} | {none} |" in markdown
+        assert figures["read_as"][OPENING_CLASSES.index("door")] == [0.0, 0.0, 1.0, 0.0]
+        assert f"heading known: confidence above 0.5 | {percent(0.25)} of 4 |" in markdown
+        assert figures["foreign_plans"] == {"known": {"n": 4, "accepted": 0.25}}
         assert (
             f"{percent(2 / 3)} (walls {percent(1.0)} found, {percent(1.0)} right; doors {percent(0.0)} found, –"
             in markdown
@@ -431,6 +438,12 @@ class TestEvaluating:
         # A second run reuses the stored answers.
         assert main([*command, "--workers", "0", "--out", str(out)]) == 0
         assert json.loads((out / FIGURES_FILE).read_text()) == figures
+
+    def test_foreign_plans_are_twenty_with_and_without_openings(self) -> None:
+        plans = foreign_plans()
+        assert [bool(plan.openings) for plan in plans] == [True, False] * 10
+        assert sum(plan.name == "office" for plan in plans) == 10
+        assert [plan.to_dict() for plan in foreign_plans()] == [plan.to_dict() for plan in plans]
 
     def test_poor_photographs_alone_are_refused(self, tmp_path: Path, tiny_bundle: Path) -> None:
         write(tmp_path, "den", quality="poor")

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import BundleError, InvalidInputError
+from lalaloc_core.evaluate.appearance import fit_appearance, mixtures, redrawn
 from lalaloc_core.evaluate.calibrate import (
     Answers,
     calibrate,
@@ -21,12 +22,21 @@ from lalaloc_core.evaluate.calibrate import (
     fit_confidence,
     fit_matching_weights,
     store_cohort,
+    with_heading_doubt,
 )
 from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.synthetic import training_plans
-from lalaloc_core.localise.bundle import COHORT, Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
+from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans
+from lalaloc_core.localise.bundle import (
+    COHORT,
+    Bundle,
+    ConfidenceModel,
+    LogisticModel,
+    MatchingWeights,
+    default_bundle,
+    write_manifest,
+)
 from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
@@ -98,8 +108,6 @@ def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> 
 class TestConfidence:
     def test_fit_recovers_the_generating_model(self) -> None:
         model = fitted(believable(8000, 0))
-        # Replaced by a later signal.
-        assert model.cost_to_chance == 0.0
         assert model.log_odds == 0.0
         assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.3)
         assert model.cost == pytest.approx(MAKER.cost, abs=0.8)
@@ -263,6 +271,68 @@ class TestConfidence:
             assert again.manifest.metrics["validation_queries"] == "made-up queries"
         finally:
             write_manifest(tiny_bundle, opened_bundle.manifest)
+
+
+class TestHeadingDoubt:
+    def test_usual_cost_and_gain_are_quantiles_of_paired_answers(self) -> None:
+        def answer(name: str, cost: float) -> Prediction:
+            prediction = dataclasses.replace(result(0.2), scene=name)
+            return dataclasses.replace(prediction, signals={"retrieval": {"cost": cost}})
+
+        given = np.linspace(0.1, 0.5, 201)
+        known = [answer(f"home-{k}", cost) for k, cost in enumerate(given)]
+        # The search fits better by 0 to 40 %; some photographs were answered in one way only.
+        gain = np.linspace(0.0, 0.4, 201)
+        searched = [answer(f"home-{k}", cost) for k, cost in enumerate(given * (1.0 - gain))]
+        known.append(answer("once", 9.0))
+        unanswered = dataclasses.replace(result(math.nan), scene="home-7")
+        weights = with_heading_doubt(
+            MatchingWeights(openings=0.3),
+            Answers(own=known[:100], disturbed=known[100:]),
+            Answers(own=searched[:100], disturbed=[*searched[100:], unanswered]),
+        )
+        assert weights.usual_cost == pytest.approx(np.quantile(given, 0.95))
+        assert weights.usual_gain == pytest.approx(np.quantile(gain, 0.995))
+        assert weights.openings == 0.3
+        assert with_heading_doubt(weights, Answers(own=[]), Answers(own=[])) == weights
+
+
+class TestAppearance:
+    def test_mixtures_are_recovered(self) -> None:
+        rng = np.random.default_rng(0)
+        true = rng.dirichlet(np.ones(4), 4)
+        drawn = np.repeat(np.arange(4), 2000)
+        # What is seen is recognised in nine of ten cases.
+        recognised = 0.9 * np.eye(4) + 0.025
+        seen = [rng.choice(4, p=true[code] @ recognised) for code in drawn]
+        likelihood = recognised[:, seen].T
+        np.testing.assert_allclose(mixtures(likelihood, drawn), true, atol=0.05)
+        np.testing.assert_array_equal(mixtures(likelihood[:2000], drawn[:2000])[1:], np.eye(4)[1:])
+
+    def test_plans_are_redrawn_by_conventions(self) -> None:
+        document = plan_of(rectangle(6.0, 4.0)).to_dict()
+        document["openings"] = [
+            {"kind": "window", "line": [[0.5, 0.0], [1.5, 0.0]], "sill_m": 0.0, "head_m": 2.1},
+            {"kind": "window", "line": [[2.0, 0.0], [3.0, 0.0]], "sill_m": 0.9, "head_m": 2.1},
+            {"kind": "passage", "line": [[3.5, 0.0], [4.5, 0.0]]},
+            {"kind": "passage", "line": [[1.0, 4.0], [4.0, 4.0]]},
+            {"kind": "door", "line": [[5.0, 0.0], [5.9, 0.0]]},
+        ]
+        plan = FloorPlan.from_dict(document)
+        kinds = [[opening.kind for opening in redrawn(plan, seed).openings] for seed in range(40)]
+        by_opening = [set(drawn) for drawn in zip(*kinds, strict=True)]
+        # Windows above a sill and wide passages have one convention.
+        assert by_opening == [{"window", "door"}, {"window"}, {"passage", "door"}, {"passage"}, {"door", "passage"}]
+        assert redrawn(plan, 3).to_dict() == redrawn(plan, 3).to_dict()
+
+    def test_fit_needs_predicted_openings_and_gives_probabilities(self, encoders: Encoders) -> None:
+        scenes = [GeneratedScenes(homes=1, shots_per_home=1).load("validation-00000")]
+        with pytest.raises(BundleError, match="predicts no openings"):
+            fit_appearance(encoders, scenes)
+        rows = np.array(fit_appearance(Encoders(Bundle.open(default_bundle()), threads=1), scenes))
+        assert MatchingWeights(appearance=tuple(map(tuple, rows.tolist()))).appearance is not None
+        # Half of the result is the prior, in which walls look like walls.
+        assert rows[0, 0] > 0.49
 
 
 class TestMatchingWeights:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import io
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -11,12 +14,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lalaloc_core import __version__
 from lalaloc_core.cli import main
 from lalaloc_core.localise import bundle
 from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.taken import jpeg, sphere, take
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -29,6 +34,17 @@ def run_in(folder: Path, *arguments: str, **changes: str) -> subprocess.Complete
     return subprocess.run(
         [*LALALOC, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
     )
+
+
+def test_real_photographs_are_found(capsys: pytest.CaptureFixture[str]) -> None:
+    real = EXAMPLES / "real"
+    # Positions from the annotations of the photographs.
+    truth = {"cayley_interior": (15.30, 2.71), "hotel_room": (1.58, 1.58), "lythwood_room": (7.97, 3.44)}
+    photographs = [str(real / f"{name}.jpg") for name in truth]
+    assert main(["localise", str(real / "rooms.json"), *photographs, "--json"]) == 0
+    for answer, (x_m, y_m) in zip(json.loads(capsys.readouterr().out), truth.values(), strict=True):
+        assert math.hypot(answer["position"]["x_m"] - x_m, answer["position"]["y_m"] - y_m) < 0.5
+        assert answer["confidence"] > 0.5
 
 
 def test_localise_works_from_any_folder(tmp_path: Path) -> None:
@@ -44,6 +60,26 @@ def test_localise_works_from_any_folder(tmp_path: Path) -> None:
     assert answer["stage"] == "lpo"
     with Image.open(tmp_path / "answer.png") as picture:
         assert (picture.format, picture.width) == ("PNG", 1600)
+
+
+def test_track_follows_spheres_and_phone_photographs(tmp_path: Path) -> None:
+    walk = tmp_path / "walk"
+    walk.mkdir()
+    shutil.copy(KITCHEN, walk / "0.00.jpg")
+    phone = take(sphere("kitchen"), Perspective.of_hfov(640, 480, math.radians(81.2)))
+    lens = {ExifTags.Base.FocalLengthIn35mmFilm: 21, ExifTags.Base.ExifImageWidth: 640}
+    (walk / "1.50.jpg").write_bytes(jpeg(phone, lens | {ExifTags.Base.ExifImageHeight: 480}))
+    odometry = tmp_path / "odometry.csv"
+    odometry.write_text("time_s,x_m,y_m,yaw_deg\n0,2,1,30\n2,2,1,30\n")
+    options = ["--odometry", str(odometry), "--pitch", "0", "--roll", "0", "--json"]
+    done = run_in(tmp_path, "track", PLAN, str(walk), *options, "--trajectory", "path.tum")
+    assert done.returncode == 0, done.stderr
+    first, second = json.loads(done.stdout)
+    assert [first["view"]["projection"], second["view"]["projection"]] == ["equirectangular", "perspective"]
+    assert second["view"]["roll"]["source"] == "given"
+    for answer in (first, second):
+        assert (answer["room"], answer["motion_contradicted"]) == ("kitchen", [])
+    assert len((tmp_path / "path.tum").read_text().splitlines()) == 2
 
 
 def test_several_photographs_give_rows_and_pictures(
@@ -62,9 +98,49 @@ def test_several_photographs_give_rows_and_pictures(
     assert not out.exists()
 
 
+def test_many_photographs_give_a_table_places_on_earth_and_a_map(
+    tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan, formula = tmp_path / "plan.json", tmp_path / "=1+1.jpg"
+    plan.write_text(
+        json.dumps(
+            json.loads(Path(PLAN).read_text()) | {"north_deg": 0.0, "anchor": {"longitude": 13.4, "latitude": 52.5}}
+        )
+    )
+    shutil.copy(BEDROOM, formula)
+    files = [str(tmp_path / name) for name in ("out.csv", "out.geojson", "map.svg")]
+    options = [
+        text for option, file in zip(("--csv", "--geojson", "--map"), files, strict=True) for text in (option, file)
+    ]
+    photographs = [KITCHEN, str(plan), os.path.relpath(formula, tmp_path)]
+    command = ["localise", str(plan), *photographs, "--bundle", str(tiny_bundle), "--json", *options]
+    with contextlib.chdir(tmp_path):
+        assert main(command) == 2
+    out, errors = capsys.readouterr()
+    kitchen, failed, bedroom = json.loads(out)
+    assert list(failed) == ["photograph", "error"]
+    assert failed["error"] in errors
+    assert "1 of 3 photographs were not localised" in errors
+    with Path(files[0]).open(encoding="utf-8", newline="") as table:
+        rows = list(csv.DictReader(table))
+    assert [row["photograph"] for row in rows] == [KITCHEN, str(plan), "'=1+1.jpg"]
+    assert [bool(row["error"]) for row in rows] == [False, True, False]
+    assert float(rows[0]["x_m"]) == pytest.approx(kitchen["position"]["x_m"], abs=1e-3)
+    assert (rows[1]["room"], rows[2]["room"]) == ("", bedroom["room"])
+    features = json.loads(Path(files[1]).read_text())["features"]
+    assert [feature["properties"]["photograph"] for feature in features] == [KITCHEN, "=1+1.jpg"]
+    for feature in features:
+        assert feature["geometry"]["coordinates"] == pytest.approx([13.4, 52.5], abs=1e-3)
+    drawn = Path(files[2]).read_text()
+    assert (drawn.count('class="camera"'), "kitchen" in drawn, "=1+1" in drawn) == (2, True, True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
+        ([PLAN, KITCHEN, "--geojson", "out.geojson"], "give it an anchor"),
+        ([PLAN, KITCHEN, "--map", "map.gif"], "it must end in .png or .svg (--map)"),
+        ([PLAN, KITCHEN, "--csv", "/gone/out.csv"], "cannot be written"),
         (["gone.json", KITCHEN], "'gone.json' cannot be read"),
         ([PLAN, "gone.jpg"], "'gone.jpg' cannot be read"),
         ([PLAN, PLAN], "flat.json': the photograph is"),
@@ -167,7 +243,7 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"lalaloc {__version__}\n"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_script_is_valid(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out

@@ -229,6 +229,16 @@ def test_picture_without_confidence() -> None:
     assert "kitchen" in words
 
 
+def test_near_candidates_are_drawn_as_one_place() -> None:
+    rivals = [(2.5, 3.5, 0.1), (5.0, 4.0, 0.2), (5.0, 4.9, 0.05), (7.0, 1.0, 0.04)]
+    places = answer(rivals=tuple(DrawnCandidate(x_m, y_m, 0.0, "kitchen", share) for x_m, y_m, share in rivals))
+    root = ElementTree.fromstring(draw_answer(places, picture="plan"))
+    assert [element.get("class") for element in root.iter()].count("rival") == 2
+    texts = {text.strip() for text in root.itertext()}
+    assert {"25.0 %", "4.0 %"} <= texts
+    assert not {"10.0 %", "5.0 %"} & texts
+
+
 def test_ellipse_axes_match_the_covariance() -> None:
     assert ellipse_m((0.01, 0.0, 0.04)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
     turned = ellipse_m((0.025, 0.015, 0.025))

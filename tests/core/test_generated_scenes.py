@@ -14,6 +14,7 @@ from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic import disturbed
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
 from lalaloc_core.learn.data.synthetic.disturbed import DisturbedPhotograph, DisturbedScenes
+from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.synthetic.mismatched import Cropped, MismatchedScenes, OutdoorPhotograph, UpsideDown
 from lalaloc_core.render.layout import layout_view
@@ -179,3 +180,29 @@ def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_disturbed_photograph_has_no_depth() -> None:
     with pytest.raises(DatasetError, match="no depth"):
         DisturbedPhotograph(_Shaded(), 0).depth_m()
+
+
+def test_photographs_are_asked_for_in_other_buildings() -> None:
+    homes = GeneratedScenes(homes=6, shots_per_home=2)
+    own = homes.load("validation-00000")
+    scenes = [ForeignScenes(homes).load(f"validation-{number:05d}") for number in range(6)]
+    # The next home, its walls alone, and offices, of which one shows its openings.
+    assert [bool(scene.plan.openings) for scene in scenes] == [True, False, False, True, False, True]
+    assert [scene.plan.name == "office" for scene in scenes] == [False, False, True] * 2
+    assert all(len(scene.plan.rooms) > 10 for scene in scenes[2::3])
+    for scene in scenes:
+        places = np.stack([camera.position_m for camera in scene.cameras])
+        assert (scene.plan.room_index_at(places) == [camera.room_index for camera in scene.cameras]).all()
+    assert not np.array_equal(scenes[0].cameras[0].position_m, own.cameras[0].position_m)
+    look = homes.appearances[0]
+    shown, true = (scene.cameras[0].photographs[look].image(8, 16) for scene in (scenes[0], own))
+    np.testing.assert_array_equal(shown, true)
+
+
+def test_unopened_plans_show_walls_alone() -> None:
+    homes = GeneratedScenes(homes=1)
+    own, bare = (dataset.load("validation-00000") for dataset in (homes, UnopenedScenes(homes)))
+    assert own.plan.openings
+    assert not bare.plan.openings
+    assert not bare.plan.opening_kinds
+    assert [room.id for room in bare.plan.rooms] == [room.id for room in own.plan.rooms]

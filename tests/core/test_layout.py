@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from hypothesis import given, settings
 
@@ -14,7 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
-from lalaloc_core.render.gradient import log_distance_gradient, log_profile_gradient
+from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient
 from lalaloc_core.render.layout import LayoutView, layout_view
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_view
@@ -272,6 +273,17 @@ class TestProfiles:
         found = log_distance_gradient(np.array([[2.0, 0.5]]), np.zeros((1, 1)), walls)
         assert np.exp(found.log_m) == 2.5
         assert found.by_pose[0, :, 0].tolist() == [0.0, -1.0 / 2.5, 0.0]
+
+    @given(seeds())
+    @settings(max_examples=20)
+    def test_slanted_steps_keep_the_margin_to_walls(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        # A corridor so long that its ends are never ahead.
+        plan, position = plan_of(rectangle(1000.0, 3.0)), np.array([[500.0, 1.5]])
+        for azimuth in rng.choice([0.0, np.pi], 50) + rng.uniform(-1.4, 1.4, 50):
+            direction = np.array([[np.sin(azimuth), np.cos(azimuth)]])
+            position = position + direction * free_travel_m(position, direction, plan.walls_m[:1], 0.03)[:, None]
+        assert plan.rooms[0].shape.exterior.distance(shapely.Point(position[0])) > 0.03 - 1e-9
 
 
 @given(rows_of_rooms(), seeds())

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, WALL_CODE, WINDOW_CODE
+from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.cost_terms import precisions
+from lalaloc_core.localise.cost_terms import class_losses, precisions
 from lalaloc_core.localise.layouts import Layouts, SeenThrough
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType, Query
@@ -148,6 +149,47 @@ class TestOpenings:
         kinds = np.array([[WALL_CODE] * 8, [WINDOW_CODE] * 8, [DOOR_CODE] * 8], np.uint8)
         found = costs(query, hall_layouts(np.zeros((3, 8)), kinds))[0]
         assert np.ptp(found) < 1e-3
+
+    def test_openings_are_blurred_by_the_distance_of_walls_that_are_seen(self) -> None:
+        seen = np.arange(64) < 20
+        probability = np.tile(PRIOR, (1, 64, 1))
+        probability[:, 5] = [0.1, 0.1, 0.1, 0.7]
+        view, sphere = (
+            make_query(log_m, log_scale, openings=openings(probability))
+            for log_m, log_scale in [
+                (np.where(seen, np.log(8.0), 0.0)[None], np.where(seen, -1.0, np.inf)[None]),
+                (np.full((1, 64), np.log(8.0)), np.full((1, 64), -1.0)),
+            ]
+        )
+        layouts = hall_layouts(np.zeros((2, 64)), np.array([[WALL_CODE] * 64, [DOOR_CODE] * 64], np.uint8))
+        by_view, by_sphere = (
+            MatchingCost(PLAN, query, 1.0, WEIGHTS, CONFIG).terms(layouts, np.zeros(2, np.intp), np.zeros(2)).openings
+            for query in (view, sphere)
+        )
+        np.testing.assert_allclose(by_view, by_sphere, rtol=1e-6)
+
+    @given(seeds(), st.sets(st.sampled_from([DOOR_CODE, WINDOW_CODE, PASSAGE_CODE])))
+    def test_appearance_is_a_mixture_over_what_is_seen(self, seed: int, claimed: set[int]) -> None:
+        rng = np.random.default_rng(seed)
+        probability, prior = rng.dirichlet(np.ones(4), 5), rng.dirichlet(np.full(4, 5.0))
+        appearance, floor = rng.dirichlet(np.ones(4), 4), 0.03
+        found = class_losses(probability, prior, claimed, floor, appearance.tolist())
+        for azimuth, drawn in np.ndindex(found.shape):
+            # Classes that the plan does not claim are drawn as wall.
+            kinds = [drawn] if drawn in claimed else [kind for kind in range(4) if kind not in claimed]
+            share = sum(
+                prior[kind] / prior[kinds].sum() * appearance[kind, seen] * probability[azimuth, seen] / prior[seen]
+                for kind in kinds
+                for seen in range(4)
+            )
+            assert found[azimuth, drawn] == pytest.approx(-math.log(floor + (1.0 - floor) * share), abs=1e-9)
+        itself = class_losses(probability, prior, claimed, floor, np.eye(4).tolist())
+        np.testing.assert_allclose(class_losses(probability, prior, claimed, floor), itself, atol=1e-12)
+
+    @pytest.mark.parametrize("rows", [((1.0, 0.0),) * 4, ((0.5, 0.3, 0.1, 0.0),) * 4, ((1.5, -0.5, 0.0, 0.0),) * 4])
+    def test_invalid_appearance_is_refused(self, rows: tuple[tuple[float, ...], ...]) -> None:
+        with pytest.raises(ConfigError, match="4 rows of 4 probabilities that sum to 1"):
+            MatchingWeights(appearance=rows)
 
     def test_reach_blurs_openings(self) -> None:
         door = np.full((1, 128, 4), 0.01)

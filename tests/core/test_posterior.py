@@ -187,9 +187,11 @@ class TestSignals:
         )
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
 
-    def test_signals_without_profile_or_cohort_are_zero(self) -> None:
+    @pytest.mark.parametrize("profile", [None, PredictedProfile(np.zeros((1, 4)), np.full((1, 4), np.inf))])
+    def test_signals_without_walls_or_cohort_are_zero(self, profile: PredictedProfile | None) -> None:
         posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0, NOWHERE)
-        found = signals_of(PLAIN, candidate(5.0, 0.4), posterior, 0.6, None)
+        query = dataclasses.replace(PLAIN, profile=profile)
+        found = signals_of(query, candidate(5.0, 0.4), posterior, 0.6, None)
         assert (found.uncertainty, found.cost_to_chance, found.answer_to_chance) == (0.0, 0.0, 0.0)
 
     @pytest.mark.parametrize(("mass", "log_odds"), [(0.0, -6.0), (1.0, 6.0), (1.0 + 1e-12, 6.0)])

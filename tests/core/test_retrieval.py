@@ -15,7 +15,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
-from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.bundle import Manifest, MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, coarse_costs, likeliest
 from lalaloc_core.localise.cost_terms import latent_distances, precisions
@@ -59,7 +59,19 @@ class PlaceEncoders(Encoders):
     """Fake encoders: the latent of a pose is a direction that depends smoothly on its position."""
 
     def __init__(self) -> None:
-        pass
+        self.manifest = Manifest(
+            name="places",
+            version="1",
+            architecture="paper",
+            layout_config={},
+            profile_columns=1,
+            image_height=1,
+            image_width=2,
+            image_mean=[],
+            image_std=[],
+            latent_size=4,
+            ring_sectors=0,
+        )
 
     def poses(
         self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float
@@ -206,6 +218,21 @@ class TestContradictedHeading:
         wrong = self.query(grid, 3)
         assert not contradicted(PLAN, grid, wrong, MatchingWeights(), MatchingConfig(heading_doubt=0.0))
         assert not contradicted(PLAN, grid, wrong, MatchingWeights(temperature=0.5), MatchingConfig())
+
+    def test_heading_is_kept_if_it_fits_as_usual(self, grid: PoseGrid) -> None:
+        wrong, config = self.query(grid, 3), MatchingConfig()
+        given, searched = (
+            float(grid_costs(PLAN, grid, query, MatchingWeights(), config).cost.min())
+            for query in (wrong, present(wrong.searched))
+        )
+        gain = 1.0 - searched / given
+        for weights, is_contradicted in (
+            (MatchingWeights(usual_cost=0.9 * given), True),
+            (MatchingWeights(usual_cost=1.1 * given), False),
+            (MatchingWeights(usual_gain=0.9 * gain), True),
+            (MatchingWeights(usual_gain=1.1 * gain), False),
+        ):
+            assert contradicted(PLAN, grid, wrong, weights, config) == is_contradicted
 
 
 class TestVogelDisc:

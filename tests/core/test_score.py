@@ -122,11 +122,15 @@ class TestScores:
             final.median_cm,
         )
 
-    def test_slice_of_one_scene_has_a_point_interval(self) -> None:
+    def test_interval_of_few_queries_is_wide(self) -> None:
         rare = prediction(2.0, scene="b", facts=("closet",))
         found = score([rare, *(prediction(0.1, scene=str(k)) for k in range(9))]).slices["closet"]
         assert (found.median_cm.low, found.median_cm.high) == pytest.approx((200.0, 200.0))
-        assert (found.within_1m.low, found.within_1m.high) == (0.0, 0.0)
+        # Wilson's interval of one miss.
+        assert (found.within_1m.low, found.within_1m.high) == pytest.approx((0.0, 0.793), abs=1e-3)
+        both = score([prediction(0.1, scene="a"), prediction(0.2, scene="b")]).final.within_1m
+        assert (both.value, both.high) == (1.0, 1.0)
+        assert both.low == pytest.approx(0.342, abs=1e-3)
 
     def test_no_predictions_are_refused(self) -> None:
         with pytest.raises(InvalidInputError, match="no predictions"):

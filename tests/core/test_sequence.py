@@ -25,6 +25,7 @@ from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
 from lalaloc_core.localise.sequence.search import SequenceLocalisation, SequenceRefiner, localise_sequence
+from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, present, rectangle
 
@@ -286,6 +287,25 @@ class TestSearch:
             alone = localise(plan, grid, encoders, query, refine="none")
             np.testing.assert_allclose(picture.posterior.pose, alone.posterior.pose, atol=2e-3)
             assert picture.candidates[0].cost == pytest.approx(alone.candidates[0].cost, abs=1e-5)
+
+    def test_turn_is_judged_by_all_its_photographs_together(
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, search: Search
+    ) -> None:
+        spot: Walk = [((1.6, 7.0), 2, 0.3), ((1.6, 7.0), 2, 1.5)]
+        queries = queries_along(encoders, plan, spot, CameraHeight(CAMERA_M, 0.0))
+        found = search(queries, [Motion(distance_m=0.0, distance_std_m=0.1)], refiner=refine_sequence)
+        assert found_turns(found) == pytest.approx([0.0, 1.2], abs=0.01)
+        joint = localise(plan, grid, encoders, queries[0], refine="none")
+        judged = judged_turn(found, joint)
+        for picture, before in zip(judged.pictures, found.pictures, strict=True):
+            assert picture.candidates == before.candidates
+            assert picture.signals == {before.stage: joint.signals[joint.stage]}
+            assert picture.posterior.position == pytest.approx(joint.posterior.position, abs=0.05)
+        support = joint.posterior.support
+        away = replace(joint.posterior, support=replace(support, position_m=support.position_m + 3.0))
+        elsewhere = judged_turn(found, replace(joint, posterior=away))
+        assert elsewhere.path_probability < 0.05
+        assert elsewhere.pictures[0].candidates == found.pictures[0].candidates
 
     def test_contradicted_motion_is_reported_and_ignored(self, search: Search, walk_queries: list[Query]) -> None:
         first, second = motions_along(WALK)

@@ -146,14 +146,15 @@ class TestPlan:
         annotation = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0)))
         assert same_ring(annotation.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-3)
 
-    def test_second_ring_in_a_floor_is_a_warning(self, tmp_path: Path) -> None:
+    def test_second_ring_in_a_floor_is_a_hole(self, tmp_path: Path) -> None:
         drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
         pillar = [drawing.junction(x, y, 0.0) for x, y in ((900, 900), (1200, 900), (1200, 1200))]
         drawing.planes[0][1].extend(drawing.ring(pillar))
         plan = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0))).plan
         assert same_ring(plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-3)
-        assert "living room 1007" in plan.warnings[0]
-        assert "2 rings" in plan.warnings[0]
+        (hole,) = plan.rooms[0].holes_m
+        assert same_ring(hole, np.array([[0.9, 0.9], [1.2, 1.2], [1.2, 0.9]]), 1e-3)
+        assert plan.warnings == ()
 
     def test_room_with_two_floors_becomes_two_rooms(self, tmp_path: Path) -> None:
         drawing = Drawing()

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.export.run import export_views
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
@@ -30,25 +31,15 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PredictedProfile, Query, RivalWall
-from lalaloc_core.localise.view_encoder import OnnxViewEncoder
+from lalaloc_core.localise.view_encoder import LevelPatch, OnnxViewEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.view_encoder import ViewEncoder, ViewEncoderConfig
+from lalaloc_core.nets.view_encoder import ViewEncoder
+from lalaloc_core.photograph.patches import PatchSize
+from lalaloc_core.photograph.view import View
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.test_bundle import exported_bundle
 
-TINY = dataclasses.replace(
-    PRESETS["tiny-trunk"],
-    view=ViewEncoderConfig(
-        image_height=64,
-        image_width=64,
-        sectors=4,
-        trunk=PRESETS["tiny-trunk"].trunk.trunk,
-        squeezed=(8, 8, 8, 8),
-        mixer_width=16,
-        mixer_blocks=1,
-        mixer_heads=2,
-    ),
-)
+TINY = PRESETS["tiny-trunk"]
 SHORT = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, steps=2, batch=4))
 CPU = torch.device("cpu")
 COLUMNS = 64
@@ -91,6 +82,46 @@ class TestRendering:
         assert 0.1 < opaque.float().mean() < 0.9
         # The error of levelling moves pixels by a few degrees at most.
         assert ((shown[..., 0] - images[..., 0]).abs()[opaque] < 15.0).all()
+
+
+class TestViewScenes:
+    def test_views_state_what_is_known(self) -> None:
+        spheres = GeneratedScenes(homes=1, seed=0, shots_per_home=1)
+        name = spheres.scenes("validation")[0]
+
+        def opened(stated: Stated) -> View:
+            (camera,) = ViewScenes(spheres, field_deg=80.0, stated=stated).load(name).cameras
+            (photograph,) = camera.photographs.values()
+            assert isinstance(photograph, ViewPhotograph)
+            return photograph.open(PatchSize())
+
+        nothing, field, tilt = opened("nothing"), opened("field"), opened("tilt")
+        assert [view.hfov.source for view in (nothing, field, tilt)] == ["estimated", "given", "given"]
+        assert [view.pitch.source == "given" for view in (nothing, field, tilt)] == [False, False, True]
+        assert nothing.hfov.sd > field.hfov.sd
+
+    def test_views_show_the_parts_of_the_sphere_that_they_look_at(self) -> None:
+        spheres = GeneratedScenes(homes=1, seed=0, shots_per_home=1)
+        name = spheres.scenes("validation")[0]
+        (camera,) = spheres.load(name).cameras
+        ahead, behind = ViewScenes(spheres, field_deg=80.0, per_camera=2).load(name).cameras
+        assert (ahead.name, behind.name) == ("0@0", "0@-180")
+        assert abs(wrap_angle(behind.heading - camera.heading)) == pytest.approx(math.pi)
+        size = PatchSize()
+        for view in (ahead, behind):
+            (photograph,) = view.photographs.values()
+            assert isinstance(photograph, ViewPhotograph)
+            opened = photograph.open(size)
+            (patch,) = opened.patches
+            # The tilt is unknown to the reader, and its error moves pixels.
+            assert abs(opened.pitch.value - photograph.pitch) < math.radians(4.0)
+            height, width = 2 * round(90.0 / size.hfov_deg * size.width), round(360.0 / size.hfov_deg * size.width)
+            top = round((90.0 - size.top_deg) / 180.0 * height)
+            left = (width - size.width) // 2
+            sphere = photograph.image(height, width)[top : top + size.height, left : left + size.width]
+            difference = np.abs(patch.pixels.astype(float) - sphere)[patch.seen]
+            wrong = np.abs(patch.pixels.astype(float) - sphere[:, ::-1])[patch.seen]
+            assert difference.mean() < min(20.0, 0.6 * wrong.mean())
 
 
 class TestEncoder:
@@ -139,7 +170,7 @@ class TestTraining:
         assert (stored.sectors, stored.image_width) == (4, 64)
         image = np.random.default_rng(0).integers(0, 256, (64, 64, 4), dtype=np.uint8)
         image[..., 3] = 255
-        query = OnnxViewEncoder(bundle).query([(image, 0.0)], None, EXACT)
+        query = OnnxViewEncoder(bundle).query([LevelPatch(image, 0.0)], None, EXACT)
         assert query.profile is not None
         columns = TINY.profile_columns
         assert len(query.roll) == columns
@@ -147,6 +178,15 @@ class TestTraining:
         expected[middle(TINY)] = True
         assert np.array_equal(query.profile.seen[0], expected)
         assert np.array_equal(query.profile.seen[3], np.roll(expected, 3))
+        # An uncertain tilt widens the predictions: numerically, by the distance of an edge seen at another elevation.
+        tilt, error = math.radians(3.0), math.sqrt(math.radians(3.0) ** 2 - math.radians(0.7) ** 2)
+        tilted = OnnxViewEncoder(bundle).query([LevelPatch(image, 0.0, tilt)], None, EXACT).profile
+        assert tilted is not None
+        log_m, seen = query.profile.log_m[0, expected], np.exp(query.profile.log_scale[0, expected])
+        elevation = np.arctan(EXACT.height_m / np.exp(log_m))
+        moved = np.log(np.tan(elevation + 1e-4) / np.tan(elevation)) / 1e-4 * error
+        wider = np.hypot(seen, moved / math.sqrt(2.0))
+        np.testing.assert_allclose(np.exp(tilted.log_scale[0, expected]), wider, rtol=1e-2)
 
     def test_a_data_set_is_refused(self, tmp_path: Path) -> None:
         data = TrainingData(dataset=GeneratedScenes(homes=1))

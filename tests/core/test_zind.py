@@ -24,7 +24,7 @@ from lalaloc_core.learn.data.structured3d_writer import build_annotation
 from lalaloc_core.learn.data.zind import Zind
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import random_poses
-from tests.strategies import crooked_flat, plans, same_ring, seeds
+from tests.strategies import crooked_flat, plan_document, plan_of, plans, rectangle, same_ring, seeds
 from tests.zind_home import (
     CEILING_GREY,
     FLOOR,
@@ -226,6 +226,64 @@ class TestRooms:
         scene = Zind(root).load(NAME)
         assert same_ring(scene.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-6)
         assert len(scene.cameras) == len(PANORAMAS)
+
+    def test_inner_walls_are_holes(self, tmp_path: Path) -> None:
+        document = plan_document(rectangle(5.0, 4.0))
+        document["rooms"][0]["holes"] = [rectangle(0.1, 2.0, corner=(2.4, 1.0)), rectangle(0.5, 0.5, corner=(4.0, 0.5))]
+        plan = FloorPlan.from_dict(document)
+        write_home(
+            tmp_path / "0002",
+            plan,
+            [TruePanorama(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)],
+            np.random.default_rng(3),
+            (4, 8),
+        )
+        (room,) = Zind(tmp_path).load(NAME).plan.rooms
+        assert all(
+            same_ring(found, hole, 1e-6) for found, hole in zip(room.holes_m, plan.rooms[0].holes_m, strict=True)
+        )
+        assert room.area_m2 == pytest.approx(5.0 * 4.0 - 0.2 - 0.25)
+
+    @pytest.mark.parametrize(
+        ("internal", "area_m2", "warning"),
+        [
+            ([[[1.0, -1.0], [1.0, 2.0], [1.5, 2.0], [1.5, -1.0]]], 19.0, None),
+            ([[[2.4, -1.0], [2.4, 5.0], [2.5, 5.0], [2.5, -1.0]]], 20.0, "1 of 1 rings of inner walls are left out"),
+            ([[[7.0, 0.0], [8.0, 0.0], [8.0, 1.0]]], 20.0, "1 of 1 rings of inner walls are left out"),
+            ([[[1.0, 1.0], [2.0, 1.0]]], 20.0, "ring 0 of 'internal' is left out; it has no three points"),
+            ([[[1.0, 1.0], [2.0, "x"], [3.0, 3.0]]], 20.0, "ring 0 of 'internal' is left out; ring 0 of 'internal'"),
+            ({}, 20.0, "'internal' is left out; it is not a list of rings"),
+        ],
+        ids=["through the outline", "divides the room", "outside", "line", "no number", "no list"],
+    )
+    def test_unusual_inner_walls_are_cut_or_left_out(
+        self, tmp_path: Path, internal: Any, area_m2: float, warning: str | None
+    ) -> None:
+        write_home(
+            tmp_path / "0002",
+            plan_of(rectangle(5.0, 4.0)),
+            [TruePanorama(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)],
+            np.random.default_rng(3),
+            (4, 8),
+        )
+
+        def change(document: dict[str, Any]) -> None:
+            layout = panorama(document)["layout_complete"]
+            shift = np.array(layout["vertices"][0])
+            # The panorama's frame is mirrored, has the camera height of 1.5 m as its unit, and the same directions.
+            layout["internal"] = (
+                internal
+                if not isinstance(internal, list)
+                else [
+                    [[shift[0] - x / 1.5, shift[1] + y / 1.5] if not isinstance(y, str) else [x, y] for x, y in ring]
+                    for ring in internal
+                ]
+            )
+
+        change_home(tmp_path, change)
+        plan = Zind(tmp_path).load(NAME).plan
+        assert plan.area_m2 == pytest.approx(area_m2)
+        assert [warning in told for told in plan.warnings] == [True] if warning else plan.warnings == ()
 
     def test_room_without_layout_is_a_problem(self, root: Path) -> None:
         change_home(root, lambda document: panorama(document, 2, 2).pop("layout_complete"))

@@ -22,8 +22,11 @@ from fastapi import FastAPI
 from PIL import Image
 
 from service.app import create_app
+from service.http.server import BoundedSocket
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
+from service.storage.statements import CHUNK_BYTES
+from service.storage.store import Store
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 from tests.service.ray_cluster import ray_cluster, serving
 
@@ -113,7 +116,7 @@ def start_app(request: pytest.FixtureRequest, tiny_bundle: Path, database_of: Da
                 return
             urls = [stack.enter_context(serve(create_app(settings))) for _ in range(_REPLICAS)]
             turns = InTurn(urls) if _REPLICAS > 1 else None
-            yield stack.enter_context(httpx.Client(base_url=urls[0], timeout=30.0, transport=turns))
+            yield stack.enter_context(httpx.Client(base_url=urls[0], timeout=120.0, transport=turns))
 
     return start
 
@@ -149,7 +152,7 @@ def serve(app: FastAPI) -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         # Connections inherit it; without, answers wait 40 ms for their heads to be acknowledged.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        server = uvicorn.Server(uvicorn.Config(app, http="h11", loop="asyncio", ws="none", log_level="critical"))
+        server = uvicorn.Server(uvicorn.Config(app, http="h11", loop="asyncio", ws=BoundedSocket, log_level="critical"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
@@ -188,6 +191,19 @@ def upload(client: httpx.Client, plan: dict[str, Any] | None = None, *, wait: bo
     if wait:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
     return plan_id
+
+
+def original_of(store: Store, plan_id: str) -> bytes:
+    """Return the uploaded file of a plan's current revision, regardless of tenant."""
+    (summary,) = store.plans.summaries([plan_id])
+    file = store.originals.checked(summary.revision_id)
+    assert file is not None
+    content = b""
+    while len(content) < file.size_bytes:
+        chunk = store.originals.chunk(summary.revision_id, len(content) // CHUNK_BYTES)
+        assert chunk
+        content += chunk
+    return content
 
 
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:

@@ -135,7 +135,8 @@ def test_photograph_of_the_home_is_trusted(right: list[dict[str, Any]]) -> None:
 def test_picture_of_no_room_is_not_trusted(
     shipped: httpx.Client, homes: list[str], given: bool, picture: bytes
 ) -> None:
-    answers = [ask(shipped, home, picture, 0.0 if given else None) for home in homes[:4]]
+    heading_deg = 0.0 if given else None
+    answers = [ask(shipped, home, picture, heading_deg, projection="equirectangular") for home in homes[:4]]
     assert confidences(answers).max() < 0.1
 
 
@@ -156,7 +157,9 @@ def test_changed_panorama_is_not_trusted(
     answers = []
     for shot, home in zip(shots, homes, strict=True):
         changed = change(np.array(Image.open(io.BytesIO(shot.picture))))
-        answers.append(ask(shipped, home, png(changed), shot.heading_deg if given else None))
+        answers.append(
+            ask(shipped, home, png(changed), shot.heading_deg if given else None, projection="equirectangular")
+        )
     # Some rooms look similar upside down, and some parts of a room look like a room.
     assert np.mean(confidences(answers) < 0.1) > 0.6
     assert confidences(answers).mean() < 0.25

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,7 @@ from service.storage.store import Store
 from service.telemetry import Telemetry
 from service.tenancy.cpu_accounts import CpuAccounts
 from service.tenancy.fair_share import FairSemaphore
+from service.threads import BoundedReads
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -195,6 +198,39 @@ def test_bounded_cache_drops_the_least_recently_used(puts: list[tuple[int, int]]
         if expected:
             assert cache.get(expected[0][0]) == expected[0][1]
             expected.append(expected.pop(0))
+
+
+def test_value_is_made_once_for_all_threads() -> None:
+    cache: BoundedCache[str, int] = BoundedCache(100, lambda size: size)
+    made: list[str] = []
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def make() -> int:
+        made.append("a")
+        begun.set()
+        assert goes_on.wait(20.0)
+        return 7
+
+    with ThreadPoolExecutor(4) as threads:
+        first = threads.submit(cache.get_or_make, "a", make)
+        assert begun.wait(20.0)
+        others = [threads.submit(cache.get_or_make, "a", make) for _ in range(3)]
+        assert cache.get_or_make("b", lambda: None) is None
+        goes_on.set()
+        assert [future.result(20.0) for future in (first, *others)] == [7] * 4
+    assert made == ["a"]
+    assert cache.get("a") == 7
+
+
+def test_failed_call_fails_for_all_who_wait_and_is_made_again() -> None:
+    cache: BoundedCache[str, int] = BoundedCache(100, lambda size: size)
+
+    def fail() -> int:
+        raise StoreUnavailableError
+
+    with pytest.raises(StoreUnavailableError):
+        cache.get_or_make("a", fail)
+    assert cache.get_or_make("a", lambda: 3) == 3
 
 
 def test_cache_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
@@ -508,6 +544,17 @@ def test_grid_of_replaced_revision_is_cancelled(
 # Outages of the database
 
 
+def _looked_up(lookup: PlanLookup, tenant: str, plan_id: str) -> PlanRecord | None:
+    async def find() -> PlanRecord | None:
+        reads = BoundedReads(threads=1, max_pending=1, wait_s=30.0)
+        try:
+            return await lookup.find(tenant, plan_id, reads)
+        finally:
+            reads.close()
+
+    return asyncio.run(find())
+
+
 def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make_grids: MakeGrids) -> None:
     url = postgres.new_database()
     store, elsewhere, without_memory = Store(url), Store(url), Store(url, plan_cache_bytes=0)
@@ -515,13 +562,13 @@ def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make
     known = PlanLookup(store, max_age_s=600.0)
     forgetful = PlanLookup(store, max_age_s=0.0)
     without = PlanLookup(without_memory, max_age_s=600.0)
-    assert known.get("default", "p") == forgetful.get("default", "p") == record
-    assert without.get("default", "p") is not None
+    assert _looked_up(known, "default", "p") == _looked_up(forgetful, "default", "p") == record
+    assert _looked_up(without, "default", "p") is not None
     grids.compute(record, 1.5).result(30.0)
     _add(elsewhere, plan_id="q")
     postgres.stop()
     try:
-        assert known.get("default", "p") == record
+        assert _looked_up(known, "default", "p") == record
         assert grids.find(grids.key(record.revision_id, 1.5)) is not None
         unknown = (
             (known, "default", "q"),
@@ -531,17 +578,17 @@ def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make
         )
         for plans, tenant, plan_id in [*unknown, (without, "default", "p")]:
             with pytest.raises(StoreUnavailableError):
-                plans.get(tenant, plan_id)
+                _looked_up(plans, tenant, plan_id)
         with pytest.raises(StoreUnavailableError):
             grids.compute(record, 1.6).result(30.0)
     finally:
         postgres.start()
-    wait_for(lambda: known.get("default", "q") is not None)
+    wait_for(lambda: _looked_up(known, "default", "q") is not None)
     # An outage is not a failure of the plan.
     assert grids.compute(record, 1.6).result(30.0) is not None
     store.plans.delete("default", "p")
     time.sleep(1.1)
-    assert known.get("default", "p") is None
+    assert _looked_up(known, "default", "p") is None
     for opened in (store, elsewhere, without_memory):
         opened.close()
 
@@ -550,15 +597,15 @@ def test_busy_database_does_not_serve_cached_plans(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", connections=1, wait_s=0.05)
     known = PlanLookup(store, max_age_s=600.0)
     record = _add(store)
-    assert known.get("default", "p") == record
+    assert _looked_up(known, "default", "p") == record
     with store._database.reading():
         # As if the database answered other callers meanwhile.
         store._database._answered_s = float("inf")
         for _ in range(2):
             with pytest.raises(StoreBusyError):
-                known.get("default", "p")
+                _looked_up(known, "default", "p")
         store._database._answered_s = 0.0
-        assert known.get("default", "p") == record
+        assert _looked_up(known, "default", "p") == record
     store.close()
 
 

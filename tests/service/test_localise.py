@@ -152,7 +152,7 @@ def test_all_form_faults_are_reported_at_once(client: httpx.Client, panorama: by
     fields = {"headng_deg": "1", "heading_deg": "361", "top_k": "1000", "camera_height_m": "nan", "refine": "all"}
     response = client.post("/localise", data=fields, files={"picture": ("p.jpg", panorama)})
     faults = [fault["field"] for fault in assert_problem(response, 422, "invalid-request")["errors"]]
-    expected = {"headng_deg", "picture", "panorama", "floorplan_id"} | (fields.keys() - {"headng_deg"})
+    expected = {"headng_deg", "picture", "photo", "floorplan_id"} | (fields.keys() - {"headng_deg"})
     assert sorted(faults) == sorted(expected)
 
 
@@ -179,7 +179,7 @@ def test_every_part_is_required(client: httpx.Client, flat: str, panorama: bytes
     no_plan = assert_problem(client.post("/localise", files=picture), 422, "invalid-request")
     assert no_plan["errors"] == [{"field": "floorplan_id", "message": "is missing"}]
     no_picture = client.post("/localise", files={"floorplan_id": (None, flat)})
-    assert assert_problem(no_picture, 422, "invalid-request")["errors"][0]["field"] == "panorama"
+    assert assert_problem(no_picture, 422, "invalid-request")["errors"][0]["field"] == "photo"
     not_a_file = client.post("/localise", files={"floorplan_id": (None, flat), "panorama": (None, "x")})
     assert "file" in assert_problem(not_a_file, 422, "invalid-request")["detail"]
     assert_problem(client.post("/localise", json={"floorplan_id": flat}), 415, "unsupported-media")
@@ -207,8 +207,7 @@ BAD_PICTURES = {
     "truncated": (encode_picture(512, 256, "JPEG")[:3000], "damaged"),
     "bomb": (_png_header(20_000, 10_000), "pixels"),
     "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
-    "portrait": (encode_picture(256, 512, "JPEG"), "256 x 512"),
-    "square": (encode_picture(256, 256, "PNG"), "twice as wide"),
+    "strip": (encode_picture(800, 256, "PNG"), "800 x 256 is a strip; send projection=cylindrical and hfov_deg"),
     "tiny": (encode_picture(64, 32, "PNG"), "the minimum is 64"),
 }
 
@@ -294,14 +293,19 @@ def test_confidence_does_not_depend_on_top_k(
     assert expected is not None
     assert 0.0 < expected.position < 1.0
     # Opposite places of a rectangular room tie up to rounding, and their order changes a few per cent.
-    for name, value in (("confidence", expected.position), ("heading_confidence", expected.heading)):
+    for name, value in (
+        ("confidence", expected.position),
+        ("heading_confidence", expected.heading),
+        ("probability_elsewhere", 1.0 - expected.fit),
+    ):
         assert len({answer[name] for answer in answers}) == 1
         assert answers[0][name] == pytest.approx(value, rel=0.05, abs=1e-4)
     shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]
     # Confidence is about the place, for any heading.
     assert 0.0 < shares[0] <= answers[-1]["confidence"]
-    assert sum(shares) <= 1.0
+    assert sum(shares) + answers[-1]["probability_elsewhere"] <= 1.0 + 1e-6
     assert unfitted["confidence"] is None
+    assert unfitted["probability_elsewhere"] is None
     assert unfitted["candidates"][0]["probability"] is None
 
 

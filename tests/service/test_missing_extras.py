@@ -11,7 +11,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_pictures import vector_pdf
-from tests.service.conftest import StartApp, assert_problem, encode_picture, upload
+from tests.service.conftest import StartApp, assert_problem, upload
 
 # Created before the packages are hidden.
 _PLAN = FloorPlan.from_dict(dict(PLAN))
@@ -20,9 +20,8 @@ FILES = {
     "pdf": (vector_pdf(), "plans"),
     "dxf": (export_plan(_PLAN, "dxf"), "plans"),
     "svg": (export_plan(_PLAN, "svg"), "plans"),
-    "picture": (encode_picture(400, 300, "PNG"), "plans"),
 }
-PACKAGES = ("ifcopenshell", "pypdfium2", "ezdxf", "cv2", "svgelements")
+PACKAGES = ("ifcopenshell", "pypdfium2", "ezdxf", "svgelements")
 
 
 @pytest.fixture(scope="module")

@@ -148,7 +148,12 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
     "no picture": (_request(sensorReadings={"cameraReadings": []}), "sensorReadings.cameraReadings", "1 are needed"),
     "no base64": (_camera(imageBytes="***"), "sensorReadings.cameraReadings.0.imageBytes", "is not Base64"),
     "depth": (_camera(imageFormat="DEPTH"), "sensorReadings.cameraReadings.0.imageFormat", "colours"),
-    "a pinhole": (_camera(params={"model": "PINHOLE"}), "sensorReadings.cameraReadings.0.params.model", "full 360°"),
+    "no parameters": (
+        _camera(params={"model": "PINHOLE"}),
+        "sensorReadings.cameraReadings.0.params.modelParams",
+        "has 0 items, PINHOLE needs 4: fx, fy, cx, cy",
+    ),
+    "a lidar": (_camera(params={"model": "LIDAR"}), "sensorReadings.cameraReadings.0.params.model", "known models"),
     "mirrored": (
         _camera(imageOrientation={"mirrored": True, "rotation": 0}),
         "sensorReadings.cameraReadings.0.imageOrientation",

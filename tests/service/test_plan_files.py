@@ -24,7 +24,7 @@ from lalaloc_core.importers import Anchor, export_plan
 from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
-from tests.importers.test_pictures import vector_pdf
+from tests.importers.test_pictures import open_hall, vector_pdf
 from tests.service.conftest import StartApp, assert_problem, end_time_limits, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -104,6 +104,17 @@ def test_picture_needs_a_scale_and_is_a_draft(client: httpx.Client) -> None:
     assert plan["import_report"]["is_draft"]
     assert any("ceiling height" in line for line in plan["import_report"]["unsure"])
     assert client.get(f"/floorplans/{plan['id']}/original").headers["content-type"] == "image/png"
+
+
+def test_preview_marks_what_became_no_room(client: httpx.Client) -> None:
+    plan = store_plan(client, open_hall(), metres_per_pixel=0.01)
+    (outline,) = plan["import_report"]["no_room"]
+    assert shapely.Polygon(outline).area == pytest.approx(11.2, rel=0.1)
+    preview = client.get(f"/floorplans/{plan['id']}/preview.svg").text
+    assert preview.count('class="no-room"') == 1
+    # A corrected plan has no such area.
+    client.put(f"/floorplans/{plan['id']}", json=plan["plan"])
+    assert "no-room" not in client.get(f"/floorplans/{plan['id']}/preview.svg").text
 
 
 def test_plan_in_feet_is_converted(client: httpx.Client) -> None:
@@ -211,7 +222,7 @@ def test_unused_option_gives_a_warning(client: httpx.Client) -> None:
     ("content", "words"),
     [
         (b"hello there", "in no known format; supported formats are"),
-        (b"AC1032 dwg", "a DWG drawing, which cannot be read: save it as DXF"),
+        (b"AC1032 dwg", "DWG drawing"),
         (b"GIF89a....", "a GIF picture, which cannot be read: save it as PNG"),
         (b"%PDF-1.7 nothing", "cannot be read"),
         (b'{"type": "FeatureCollection", "features": []}', "no features"),

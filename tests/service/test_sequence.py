@@ -117,10 +117,10 @@ def test_given_headings_are_followed(client: httpx.Client, plan_id: str, picture
 @pytest.mark.parametrize(
     ("count", "fields", "field", "message"),
     [
-        (1, {}, "panorama", "is given 1 times, 2 to 4 are needed"),
-        (5, {}, "panorama", "is given 5 times, 2 to 4 are needed"),
-        (3, {"motions": [MOTION]}, "motions", "has 1 items, 3 panoramas need 2"),
-        (2, {"headings_deg": [1.0]}, "headings_deg", "has 1 items, 2 panoramas need 2"),
+        (1, {}, "photo", "is given 1 times, 2 to 4 are needed"),
+        (5, {}, "photo", "is given 5 times, 2 to 4 are needed"),
+        (3, {"motions": [MOTION]}, "motions", "has 1 items, 3 photographs need 2"),
+        (2, {"headings_deg": [1.0]}, "headings_deg", "has 1 items, 2 photographs need 2"),
         (2, {"motions": "{}"}, "motions", "not a JSON array"),
         (2, {"motions": "[" * 2000}, "motions", "not a JSON array"),
         (2, {"motions": [MOTION | {"distance_m": -1}]}, "motions.0.distance_m", "must be at least 0"),

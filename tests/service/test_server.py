@@ -16,6 +16,7 @@ import httpx
 import pytest
 from fastapi import FastAPI, Request
 
+from service.http import server
 from service.http.server import Server, bounded_protocol, server_config
 from service.settings import Settings
 from tests.service.conftest import wait_for
@@ -35,14 +36,14 @@ def test_answer_body_is_not_delayed() -> None:
     config.http = Watched
     # As the command line does: of a socket made like this, asyncio does not see that it is one of TCP.
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = Server(config, app, settings)
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        running = Server(config, app, settings)
+        thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
-            wait_for(lambda: server.started)
+            wait_for(lambda: running.started)
             httpx.get(f"http://127.0.0.1:{listener.getsockname()[1]}/openapi.json").raise_for_status()
         finally:
-            server.should_exit = True
+            running.should_exit = True
             thread.join(30.0)
     assert no_delay == [1]
 
@@ -51,14 +52,14 @@ def test_answer_body_is_not_delayed() -> None:
 def _served(app: FastAPI, settings: Settings) -> Iterator[int]:
     """Run an app as the command line does; gives its port."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = Server(server_config(app, settings), app, settings)
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        running = Server(server_config(app, settings), app, settings)
+        thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
-            wait_for(lambda: server.started)
+            wait_for(lambda: running.started)
             yield listener.getsockname()[1]
         finally:
-            server.should_exit = True
+            running.should_exit = True
             thread.join(30.0)
 
 
@@ -105,6 +106,20 @@ def test_busy_connection_is_not_closed() -> None:
         assert httpx.get(f"http://127.0.0.1:{port}/who", timeout=60.0).status_code == 200
         go_on.set()
         assert answer.result(30.0).json() == "done"
+
+
+def test_refused_bodies_are_read_slowly_to_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "_DROPPING_S", 5e-8)
+    body, clients = b"x" * (20 * 2**20), 3
+    with _served(_app(), Settings()) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
+        begin = time.monotonic()
+        with ThreadPoolExecutor(clients) as threads:
+            answers = list(threads.map(lambda _: client.post("/who", content=body), range(clients)))
+        # All but what the buffers of the sockets hold.
+        assert time.monotonic() - begin > 0.5 * clients * len(body) * 5e-8
+        assert [answer.status_code for answer in answers] == [405] * clients
+        # Their connections are in use again.
+        assert [client.get("/who").status_code for _ in range(clients)] == [200] * clients
 
 
 @pytest.mark.parametrize(("proxies", "client_host"), [(None, "127.0.0.1"), ("127.0.0.1", "203.0.113.7")])

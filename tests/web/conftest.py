@@ -58,6 +58,14 @@ class Visit:
         return self.page
 
 
+def choose_plan(page: Page, name: str) -> None:
+    """Choose a stored plan from the menu, which closes."""
+    page.get_by_text("Plans", exact=True).click()
+    page.locator("#plan-list").get_by_role("button", name=name, exact=False).first.click()
+    expect(page.locator("#plan-name")).to_have_text(name)
+    expect(page.locator("#plan-list")).to_be_hidden()
+
+
 # Not for the session: Playwright's event loop prevents other tests from running one.
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.service.conftest import FLAT, upload
-from tests.web.conftest import EXAMPLES, Visit, visit
+from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit
 
 
 def _marker(page: Page) -> tuple[float, float]:
@@ -93,7 +94,7 @@ def test_dragged_marker_moves_the_layout(desktop: Visit) -> None:
     page.locator("[data-rank='0']").click()
     assert _marker(page) == pytest.approx(begin)
     expect(page.locator("#fit-state")).to_have_text(state)
-    second = page.locator("[data-rank='1']")
+    second = page.locator("[data-rank]").nth(1)
     second.click()
     expect(second).to_have_attribute("aria-pressed", "true")
     assert _marker(page) != pytest.approx(begin)
@@ -112,7 +113,7 @@ def test_keyboard_alone_leads_to_an_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     page.locator("#heading").focus()
     for _ in range(3):
-        page.keyboard.press("Tab")
+        page.keyboard.press("Shift+Tab")
     expect(page.locator("#find")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.locator("#answer")).to_be_visible()
@@ -154,15 +155,12 @@ def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
         upload(desktop.client, FLAT | {"name": name})
     page = desktop.open()
     page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
-    page.get_by_text("Plans", exact=True).click()
-    page.get_by_role("button", name="Chosen first").first.click()
-    expect(page.locator("#plan-name")).to_have_text("Chosen first")
+    choose_plan(page, "Chosen first")
     held = list[Route]()
     page.route("**/localise", lambda route: held.append(route))
     with page.expect_request("**/localise"):
         page.locator("#find").click()
-    page.get_by_role("button", name="Chosen second").first.click()
-    expect(page.locator("#plan-name")).to_have_text("Chosen second")
+    choose_plan(page, "Chosen second")
     expect(page.locator("#find")).not_to_have_attribute("aria-busy", "true")
     (route,) = held
     # Without an abort this answer would switch the page back to the first plan.
@@ -178,9 +176,14 @@ def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
 def test_error_marks_its_field_and_hides_the_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     desktop.find()
+    page.get_by_text("Heading and hints").click()
     page.locator("#heading").fill("400")
+    page.get_by_text("Heading and hints").click()
     page.get_by_role("button", name="Find the place").click()
-    expect(page.locator("#photo-error")).to_contain_text("heading_deg")
+    expect(page.locator("#photo-error")).to_contain_text("Heading")
+    expect(page.locator("#photo-error")).not_to_contain_text("heading_deg")
+    # The form unfolds, so that its faulty field is in sight.
+    expect(page.locator("#heading")).to_be_visible()
     expect(page.locator("#heading")).to_have_attribute("aria-invalid", "true")
     expect(page.locator("#answer")).to_be_hidden()
     page.locator("#heading").fill("40")
@@ -199,7 +202,7 @@ def test_other_files_than_photographs_are_rejected(desktop: Visit, tmp_path: Pat
     page = desktop.open_example()
     (tmp_path / "notes.txt").write_text("no picture")
     page.locator("#photo-file").set_input_files(tmp_path / "notes.txt")
-    expect(page.locator("#photo-error")).to_contain_text("twice as wide as high")
+    expect(page.locator("#photo-error")).to_contain_text("must be JPEG, PNG, WebP or HEIC files")
     expect(page.locator("#photo-strip li")).to_have_count(4)
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff no picture")
     page.locator("#photo-file").set_input_files(tmp_path / "broken.jpg")
@@ -225,6 +228,55 @@ def test_dark_mode_has_enough_contrast(browser: Browser, service: httpx.Client) 
         page = visited.open_example()
         visited.find()
         _assert_accessible(page)
+
+
+@pytest.mark.parametrize("size", [{"width": 1440, "height": 900}, PHONE])
+def test_answer_is_visible_without_scrolling(browser: Browser, service: httpx.Client, size: dict[str, int]) -> None:
+    for visited in visit(browser, service, viewport=size):
+        page = visited.open_example()
+        visited.find()
+        for part in (".verdict", ".places", "#plan"):
+            expect(page.locator(part)).to_be_in_viewport(ratio=0.3)
+        expect(page.locator(".verdict")).to_be_in_viewport(ratio=1.0)
+        expect(page.locator("#heading")).to_be_hidden()
+        # The heading that was found is on the compass.
+        expect(page.locator("#compass-place")).to_contain_text(re.compile(r"found \d+°"))
+
+
+def test_near_candidates_are_one_place_and_all_places_add_up(desktop: Visit) -> None:
+    poses = [(1.0, 1.0, 0.31), (1.4, 1.0, 0.37), (5.0, 5.0, 0.2), (5.0, 5.9, 0.003), (8.0, 8.0, 0.004)]
+    candidates = [
+        {"floorplan_id": "flat", "position": {"x_m": x_m, "y_m": y_m}, "probability": probability}
+        for x_m, y_m, probability in poses
+    ]
+    answer = {"candidates": candidates, "confidence": 0.7, "probability_elsewhere": 0.05}
+    places, rest = desktop.open().evaluate(
+        """async (answer) => { const { placesOf, remainder } = await import('/web/app.js');
+        const places = placesOf(answer); return [places, remainder(answer, places)]; }""",
+        answer,
+    )
+    assert [(place["index"], place["others"]) for place in places] == [(0, [1]), (2, [])]
+    # The first place has the confidence, which counts every heading.
+    assert [place["probability"] for place in places] == pytest.approx([0.7, 0.203])
+    assert rest == pytest.approx(1.0 - 0.05 - 0.7 - 0.203)
+
+
+def test_answers_to_all_photographs_are_a_table(desktop: Visit) -> None:
+    page = desktop.open_example()
+    page.get_by_role("button", name="Find all").click()
+    table = page.locator("#all-answers table")
+    expect(table.locator("tbody tr")).to_have_count(4)
+    expect(page.locator("#plan .companion")).to_have_count(3)
+    _assert_accessible(page)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save CSV").click()
+    with download.value.path().open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["photograph"] for row in rows] == ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"]
+    table.get_by_role("button", name="bedroom.jpg").click()
+    expect(page.locator(".thumb[aria-pressed='true']")).to_contain_text("✓")
+    expect(page.locator("#answer .room")).to_have_text(rows[2]["room"])
+    expect(page.locator("#answer .where")).to_contain_text(f"x {float(rows[2]['x_m']):.2f} m")
 
 
 def test_flat_picture_without_webgl(desktop: Visit) -> None:

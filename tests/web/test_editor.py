@@ -160,7 +160,7 @@ def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page.locator("#plan-form-ceiling").fill("-1")
     page.locator("#plan-form-ceiling").press("Tab")
     page.locator("#save").click()
-    expect(page.locator("#plan-error")).to_contain_text("ceiling_height_m")
+    expect(page.locator("#plan-error")).to_contain_text("“Ceiling” is -1")
     page.locator("#stop").click()
     page.get_by_role("button", name="Continue editing").click()
     expect(page.locator("#save")).to_be_visible()

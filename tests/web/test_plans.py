@@ -15,7 +15,7 @@ from lalaloc_core.importers import export_plan
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key
-from tests.web.conftest import EXAMPLES, Visit, visit
+from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
 from tests.web.test_answer import _assert_accessible
 
 
@@ -77,14 +77,17 @@ def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path
     page = desktop.open()
     _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
-    page.get_by_role("button", name="Import the picture").click()
-    expect(page.locator("#plan-error")).to_contain_text("enter their distance in metres")
+    page.get_by_role("button", name="Read the picture").click()
+    # The missing distance is an error of its field.
+    expect(page.locator("#picture-metres-error")).to_contain_text("enter their distance in metres")
+    expect(page.get_by_label("Distance of the ends in metres")).to_be_focused()
+    expect(page.locator("#plan-error")).to_be_hidden()
     # Between the centre lines of the outer walls: 6.86 m.
     _drag_end(page, 0, 107, 350)
     _drag_end(page, 1, 793, 350)
     _assert_accessible(page)
     page.get_by_label("Distance of the ends in metres").fill("6.86")
-    page.get_by_role("button", name="Import the picture").click()
+    page.get_by_role("button", name="Read the picture").click()
     expect(page.locator("#plan-warnings")).to_contain_text("draft")
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 31.")
     page.get_by_role("button", name="Edit", exact=True).click()
@@ -108,15 +111,22 @@ def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> No
     (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
     page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
+    name = page.locator("#plan-name").inner_text()
     (tmp_path / "letter.txt").write_text("Dear landlord")
     page.locator("#plan-file").set_input_files(tmp_path / "letter.txt")
     expect(page.locator("#plan-error")).to_be_visible()
-    expect(page.locator("#plan .room")).to_have_count(0)
+    # The plan before stays, and giving up removes the error.
+    expect(page.locator("#plan .room")).to_have_count(2)
+    expect(page.locator("#plan-name")).to_have_text(name)
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.locator("#plan-error")).to_be_hidden()
+    expect(page.locator("#import-form")).to_be_empty()
 
 
 def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     expect(page.locator("#plan .room").first).to_be_visible()
+    rooms = page.locator("#plan .room").count()
     crossing = {"rooms": [{"name": "bow", "polygon": [[0, 0], [4, 3], [4, 0], [0, 3]], "ceiling_height_m": 2.5}]}
     (tmp_path / "bow.json").write_text(json.dumps(crossing))
     page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
@@ -125,7 +135,49 @@ def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
     page.get_by_label("Storey").fill("")
     with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/floorplans")):
         page.get_by_role("button", name="Import again").click()
-    expect(page.locator("#plan .room")).to_have_count(0)
+    expect(page.locator("#plan-error")).to_contain_text("bow")
+    expect(page.locator("#plan .room")).to_have_count(rooms)
+
+
+def test_plans_menu_closes(desktop: Visit) -> None:
+    upload(desktop.client, FLAT | {"name": "Closing"})
+    page = desktop.open()
+    opener, entries = page.get_by_text("Plans", exact=True), page.locator("#plan-list")
+    opener.click()
+    expect(entries).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(entries).to_be_hidden()
+    opener.click()
+    page.locator("#photo-title").click()
+    expect(entries).to_be_hidden()
+    choose_plan(page, "Closing")
+
+
+def test_levels_of_a_file_are_a_list(desktop: Visit, tmp_path: Path) -> None:
+    collection = json.loads(export_plan(FloorPlan.from_dict(FLAT), "geojson"))
+    floors = [json.loads(json.dumps(collection["features"])) for _ in range(2)]
+    for level, features in enumerate(floors):
+        for feature in features:
+            feature["properties"]["level"] = str(level)
+            feature.pop("id", None)
+    # One room is missing upstairs.
+    rooms = [feature for feature in floors[1] if feature["geometry"]["type"] == "Polygon"]
+    floors[1].remove(rooms[0])
+    collection["features"] = [*floors[0], *floors[1]]
+    (tmp_path / "house.geojson").write_text(json.dumps(collection))
+    page = desktop.open()
+    page.locator("#plan-file").set_input_files(tmp_path / "house.geojson")
+    form = page.locator("#import-form")
+    expect(form).to_contain_text("has 2 levels: choose one, or import all")
+    expect(page.locator("#plan-error")).to_be_hidden()
+    _assert_accessible(page)
+    form.get_by_role("button", name="1", exact=True).click()
+    expect(page.locator("#plan-facts")).to_contain_text(f"{len(rooms) - 1} room")
+    page.locator("#plan-file").set_input_files(tmp_path / "house.geojson")
+    form.get_by_role("button", name="Import all levels as a venue").click()
+    expect(page.locator("#venue-bar")).to_contain_text("2 plans")
+    expect(form).to_be_empty()
+    expect(page.locator("#venue-plan option")).to_have_count(2)
 
 
 def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
@@ -167,7 +219,7 @@ def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of:
             _assert_accessible(page)
             page.locator("#key-field").fill("lalaloc_wrong")
             page.keyboard.press("Enter")
-            expect(page.locator("#key-why")).to_contain_text("rejected")
+            expect(page.locator("#key-why")).to_contain_text("This key is not valid")
             page.locator("#key-field").fill(secret)
             page.keyboard.press("Enter")
             expect(dialog).to_be_hidden()
@@ -184,11 +236,12 @@ def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of:
 def test_docs_page_shows_and_sends_operations(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Documented"})
     page = desktop.open("/docs")
-    operation = page.locator("#operations-floor_plans-get_floorplan_floorplans__floorplan_id__get")
+    operation = page.locator("#operations-floor_plans-getFloorplan")
     operation.wait_for()
     found = Axe().run(page).response["violations"]
-    # Swagger UI puts its padlock buttons into the rows that open.
-    assert {fault["id"] for fault in found if fault["impact"] in ("serious", "critical")} <= {"nested-interactive"}
+    # Swagger UI puts its padlock buttons into the rows that open, and gives its list of servers no label.
+    faults = {fault["id"] for fault in found if fault["impact"] in ("serious", "critical")}
+    assert faults <= {"nested-interactive", "select-name"}
     operation.locator(".opblock-summary-control").click()
     operation.get_by_role("button", name="Try it out").click()
     operation.get_by_placeholder("floorplan_id").fill(plan_id)
@@ -216,3 +269,17 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
             page.goto("about:blank")
             page.goto(f"{link[:-32]}{'0' * 32}")
             expect(page.locator("#plan-error")).to_contain_text("no answer is kept")
+
+
+def test_photographed_rooms_are_an_example(desktop: Visit) -> None:
+    page = desktop.open()
+    for _ in range(2):
+        page.get_by_text("Plans", exact=True).click()
+        page.get_by_role("button", name="Photographed rooms").click()
+        expect(page.locator("#plan-name")).to_have_text("Six photographed rooms")
+    # Its photograph is added once, and its plan is stored once.
+    expect(page.locator("#photo-strip button.thumb", has_text="lythwood_room")).to_have_count(1)
+    page.locator("#find").click()
+    expect(page.locator("#answer-body")).to_contain_text("Possible places", timeout=60_000)
+    page.get_by_text("Plans", exact=True).click()
+    expect(page.locator("#plan-list button.plan", has_text="Six photographed rooms")).to_have_count(1)

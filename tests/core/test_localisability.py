@@ -1,0 +1,114 @@
+"""Localisability: drawn predictions, and what the plan alone says of places and rooms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lalaloc_core.draw.localisability import localisability_svg
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.bench.prediction_errors import measured
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import Bundle, Manifest, default_bundle
+from lalaloc_core.localise.localisability import CONDITIONS, HARDEST, Errors, Searches, errors_of, localisability
+from lalaloc_core.localise.localisability_report import report_of, summary_of
+from lalaloc_core.localise.prediction_errors import correlated
+from lalaloc_core.render.sampling import PoseSet
+
+
+@pytest.fixture(scope="module")
+def manifest() -> Manifest:
+    return Bundle.open(default_bundle()).manifest
+
+
+def _rooms(*sizes: tuple[float, float, float]) -> FloorPlan:
+    """Return rooms by their left sides, widths and depths (m)."""
+    rooms = [
+        {
+            "id": f"room-{number}",
+            "name": f"Room {number}",
+            "polygon": [[x, 0.0], [x + width, 0.0], [x + width, depth], [x, depth]],
+            "ceiling_height_m": 2.5,
+        }
+        for number, (x, width, depth) in enumerate(sizes)
+    ]
+    return FloorPlan.from_dict({"rooms": rooms})
+
+
+def test_drawn_scores_have_the_stated_correlation() -> None:
+    correlation = tuple(0.3 + 0.7 * np.exp(-np.arange(65) / 5.0))
+    scores = correlated(correlation, 4000, 128, np.random.default_rng(0))
+    assert scores.std() == pytest.approx(1.0, abs=0.03)
+    for lag in (1, 5, 40):
+        assert np.mean(scores * np.roll(scores, lag, axis=1)) == pytest.approx(correlation[lag], abs=0.04)
+
+
+def test_drawn_predictions_have_the_measured_errors(manifest: Manifest) -> None:
+    stated = replace(errors_of(manifest).sphere, spread=1.0)
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.0, 1.5, (800, 128))
+    kind = np.repeat(rng.integers(0, 4, (800, 8)), 16, axis=1)
+    log_m, log_scale = stated.profile(truth, rng)
+    found = measured(log_m, log_scale, kind, truth, stated.openings(kind, rng))
+    middle = slice(3, -3)
+    np.testing.assert_allclose(found.error_quantiles[middle], stated.error_quantiles[middle], atol=0.25)
+    np.testing.assert_allclose(found.scale_quantiles[middle], stated.scale_quantiles[middle], atol=0.1)
+    np.testing.assert_allclose(found.seen, stated.seen, atol=0.03)
+
+
+def test_equal_rooms_are_confused_and_a_room_hint_helps(manifest: Manifest) -> None:
+    plan = _rooms((0.0, 4.0, 3.0), (10.0, 4.0, 3.0), (20.0, 9.0, 7.0))
+    found = localisability(plan, manifest)
+    assert set(found.found) == set(CONDITIONS)
+    assert {0, 1} in [set(pair.rooms) for pair in found.confused]
+    sphere = found.rooms["sphere_known_heading"]
+    # Equal rooms tie, and every tie goes to the same one.
+    assert sphere[2] > sphere[:2].mean()
+    gain = found.gains["room_hint"]
+    assert gain is not None
+    assert gain > 0.05
+    assert found.gains["doors"] is None
+
+
+def test_room_alone_is_found_more_often_than_among_equal_rooms(manifest: Manifest) -> None:
+    alone = localisability(_rooms((0.0, 4.0, 3.0)), manifest)
+    among = localisability(_rooms((0.0, 4.0, 3.0), (10.0, 4.0, 3.0), (20.0, 4.0, 3.0)), manifest)
+    for name in ("sphere_known_heading", HARDEST):
+        assert alone.plan[name] > among.plan[name]
+
+
+def test_larger_errors_find_fewer_photographs(manifest: Manifest) -> None:
+    plan = _rooms((0.0, 4.0, 3.0), (10.0, 4.4, 3.3), (20.0, 9.0, 7.0))
+    places = PoseSet(np.tile([[1.3, 1.1], [12.0, 2.0], [22.0, 5.0]], (4, 1)), np.tile([0, 1, 2], 4))
+    errors = errors_of(manifest)
+    shares = []
+    for factor in (0.05, 3.0):
+        scaled = Errors(*(replace(part, spread=factor) for part in errors))
+        rows = Searches(plan, manifest, scaled, step_m=0.5).draws(
+            places, "sphere_known_heading", 4, np.random.default_rng(0)
+        )
+        shares.append(np.mean([draw.found for row in rows for draw in row]))
+    assert shares[0] > shares[1] + 0.1
+
+
+def test_report_has_every_room_and_is_reproducible(manifest: Manifest) -> None:
+    plan = _rooms((0.0, 4.0, 3.0), (10.0, 5.0, 3.5))
+    found = localisability(plan, manifest)
+    report = report_of(plan, found)
+    assert report == report_of(plan, localisability(plan, manifest))
+    assert [room["id"] for room in report["rooms"]] == ["room-0", "room-1"]
+    assert all(0.0 <= value <= 1.0 for room in report["rooms"] for value in room["probability"].values())
+    assert any("draw doors" in line for line in summary_of(plan, found))
+    assert "<image" in localisability_svg(plan, found)
+
+
+def test_model_without_measured_errors_is_refused(manifest: Manifest) -> None:
+    with pytest.raises(InvalidInputError, match="calibrate --errors"):
+        localisability(_rooms((0.0, 4.0, 3.0)), replace(manifest, errors=None))
+
+
+def test_plan_with_too_many_poses_is_refused(manifest: Manifest) -> None:
+    with pytest.raises(InvalidInputError, match="the limit is 40000"):
+        localisability(_rooms((0.0, 120.0, 120.0)), manifest)

@@ -1,0 +1,271 @@
+"""Tests of tracking: motions of the belief, its state in bytes, and localisation of walks photograph by photograph."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+import zlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidMotionError, InvalidStateError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.pipeline import run_steps
+from lalaloc_core.localise.poses import PoseGrid, Query
+from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.tracking import Odometry, TrackState
+from lalaloc_core.localise.tracking.filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
+from lalaloc_core.localise.tracking.state import MAX_STATES
+from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
+from tests.strategies import l_shape, plan_of, rectangle
+
+SECTORS = 16
+EXACT = (0.05, 0.05, math.radians(2.0))
+Walk = list[tuple[tuple[float, float], int, float]]
+# From the left room through its door into the right one, and back.
+WALK: Walk = [
+    ((1.0, 1.0), 0, 1.6),
+    ((2.0, 1.1), 0, 1.5),
+    ((3.0, 1.4), 0, 1.6),
+    ((4.8, 1.5), 1, 1.6),
+    ((6.0, 1.6), 1, 0.4),
+    ((6.3, 2.6), 1, 0.2),
+]
+
+
+@pytest.fixture(scope="module")
+def plan() -> FloorPlan:
+    """Return two rooms with a door between them, and a third one without."""
+    right = [[4.2, 0.0], [9.2, 0.0], [9.2, 3.0], [7.0, 3.0], [7.0, 4.5], [4.2, 4.5]]
+    whole = plan_of(l_shape(4.0, 3.0, 1.2, 0.8), right, rectangle(4.0, 3.0, corner=(0.0, 3.2))).to_dict()
+    door = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
+    return FloorPlan.from_dict(whole | {"openings": [door], "opening_kinds": ["door", "window", "passage"]})
+
+
+@pytest.fixture(scope="module")
+def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
+    return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
+
+
+@pytest.fixture(scope="module")
+def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
+    return WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
+
+
+@pytest.fixture(scope="module")
+def queries(encoders: Encoders, plan: FloorPlan) -> list[Query]:
+    return queries_along(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
+
+
+def odometry_along(walk: Walk) -> list[Odometry | None]:
+    """Return the exact motion that leads to each place; None for the first."""
+    found: list[Odometry | None] = [None]
+    for (first, _, heading), (second, _, later) in itertools.pairwise(walk):
+        x, y = np.subtract(second, first)
+        sine, cosine = math.sin(heading), math.cos(heading)
+        turn = float(wrap_angle(later - heading))
+        found.append(Odometry.of_stds(x * sine + y * cosine, x * cosine - y * sine, turn, EXACT))
+    return found
+
+
+def at(grid: PoseGrid, place: tuple[float, float], heading: float) -> States:
+    pose = int(np.linalg.norm(grid.poses.position_m - place, axis=1).argmin())
+    sector = round(heading / (math.tau / SECTORS)) % SECTORS
+    return States(np.array([pose]), np.array([sector]), np.ones(1))
+
+
+class TestMotion:
+    def test_belief_moves_by_odometry(self, grid: PoseGrid, graph: WalkGraph) -> None:
+        start = at(grid, (1.0, 1.0), math.pi / 2)
+        ahead = Odometry.of_stds(1.5, -0.5, math.pi / 2, EXACT)
+        belief = moved(graph, start, SECTORS, ahead)
+        pose, sector = np.unravel_index(int(belief.argmax()), belief.shape)
+        # The start looks along +x, so its right is along -y.
+        expected = grid.poses.position_m[start.pose[0]] + [1.5, 0.5]
+        assert np.linalg.norm(grid.poses.position_m[pose] - expected) < STEP_M
+        assert sector == SECTORS // 2
+
+    @pytest.mark.parametrize(
+        ("place", "ahead", "room", "is_open"),
+        [((3.5, 1.5), 1.0, 1, True), ((2.0, 2.5), 1.2, 2, False)],
+        ids=["door", "wall"],
+    )
+    def test_walls_stop_and_doors_do_not(
+        self, grid: PoseGrid, graph: WalkGraph, place: tuple[float, float], ahead: float, room: int, is_open: bool
+    ) -> None:
+        heading = 0.0 if room == 2 else math.pi / 2
+        belief = moved(graph, at(grid, place, heading), SECTORS, Odometry.of_stds(ahead, 0.0, 0.0, EXACT))
+        crossed = belief[grid.poses.room_index == room].sum()
+        assert crossed > 0.3 if is_open else crossed < 0.03
+
+    def test_without_odometry_the_belief_stays_within_reach(self, grid: PoseGrid, graph: WalkGraph) -> None:
+        belief = moved(graph, at(grid, (1.0, 1.0), 0.0), SECTORS, None)
+        assert belief.sum() == pytest.approx(1.0)
+        assert belief[grid.poses.room_index == 2].sum() == 0.0
+        assert np.count_nonzero(belief.sum(axis=1)) > 10
+
+    @pytest.mark.parametrize(
+        ("values", "message"),
+        [
+            ({"forward_m": math.nan}, "forward_m is nan; it must be a finite number"),
+            ({"forward_m": 1000.0}, "the motion is 1000 m long; the limit is 50 m"),
+            ({"turn": 20.0}, "the turn is 1145.92°; the limit is 720° either way"),
+            ({"covariance": np.diag([1.0, -1.0, 1.0])}, "a variance must not be negative"),
+            ({"covariance": np.full((3, 3), math.inf)}, "3 rows of 3 finite numbers"),
+            ({"covariance": np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])}, "positive semidefinite"),
+            (
+                {"covariance": np.array([[1.0, 0.5, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])},
+                "differ .* by 0.3; send rows",
+            ),
+            ({"covariance": np.diag([1e4, 1.0, 1.0])}, "the deviation of forward_m is 100 m; the limit is 50 m"),
+        ],
+    )
+    def test_impossible_odometry_is_refused(self, values: dict[str, Any], message: str) -> None:
+        usual: dict[str, Any] = {"forward_m": 1.0, "right_m": 0.0, "turn": 0.0, "covariance": np.eye(3)}
+        with pytest.raises(InvalidMotionError, match=message):
+            Odometry(**(usual | values))
+
+    def test_negative_deviation_is_refused(self) -> None:
+        with pytest.raises(InvalidMotionError, match="right_std_m is -1"):
+            Odometry.of_stds(1.0, 0.0, 0.0, (0.1, -1.0, 0.1))
+
+
+def follow(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    graph: WalkGraph,
+    encoders: Encoders,
+    queries: list[Query],
+    moves: list[Odometry | None],
+) -> list[Tracked]:
+    """Follow a walk, with the state in bytes between photographs."""
+    state, found = TrackState.first(len(grid.poses), len(queries[0].roll)), []
+    for query, move in zip(queries, moves, strict=True):
+        found.append(run_steps(track_steps(plan, grid, graph, encoders, state, query, move), lambda _job: None))
+        state = TrackState.from_bytes(found[-1].state.to_bytes())
+    return found
+
+
+class TestFilter:
+    def test_walk_is_followed_through_a_door(
+        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        found = follow(plan, grid, graph, encoders, queries, odometry_along(WALK))
+        for (place, room, heading), answer in list(zip(WALK, found, strict=True))[1:]:
+            assert answer.pose.room_index == room
+            assert np.linalg.norm(answer.pose.position_m - place) < STEP_M
+            assert abs(wrap_angle(answer.pose.heading - heading)) < math.radians(15.0)
+        last = found[-1]
+        assert last.state.suspected == ()
+        assert [int(number) for number in last.state.path[:, 0]] == [1, 2, 3, 4, 5, 6]
+        assert np.linalg.eigvalsh(last.pose.covariance).min() > 0.0
+
+    def test_camera_carried_elsewhere_is_found_again(
+        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        still = Odometry.of_stds(0.0, 0.0, 0.0, EXACT)
+        carried = [*queries[:3], *queries[5:], *queries[5:], *queries[5:]]
+        found = follow(plan, grid, graph, encoders, carried, [*odometry_along(WALK)[:3], still, still, still])
+        assert np.linalg.norm(found[-1].pose.position_m - WALK[-1][0]) < STEP_M
+
+    @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
+    def test_known_heading_is_right_within_its_tolerance(
+        self,
+        plan: FloorPlan,
+        grid: PoseGrid,
+        graph: WalkGraph,
+        encoders: Encoders,
+        queries: list[Query],
+        off_deg: float,
+        right: bool,
+    ) -> None:
+        state, heading = TrackState.first(len(grid.poses), len(queries[0].roll)), WALK[0][2]
+        beliefs = []
+        for error in (0.0, math.radians(off_deg)):
+            known = KnownHeading(heading + error, math.radians(30.0), "given")
+            steps = track_steps(plan, grid, graph, encoders, state, queries[0], None, known_heading=known)
+            belief = run_steps(steps, lambda _job: None).state.belief
+            beliefs.append(belief.weight[belief.sector == round(heading / (math.tau / state.sectors))].sum())
+        # As probable as with the exact heading; far less probable beyond the tolerance.
+        assert (beliefs[1] > 0.5 * beliefs[0]) == right
+
+    def test_other_grid_is_refused(
+        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        state = TrackState.first(len(grid.poses) + 1, len(queries[0].roll))
+        with pytest.raises(InvalidStateError, match="begin a new session"):
+            run_steps(track_steps(plan, grid, graph, encoders, state, queries[0], None), lambda _job: None)
+
+
+class TestState:
+    def test_size_does_not_grow(
+        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        state = follow(plan, grid, graph, encoders, queries[:1], [None])[0].state
+        many = np.random.default_rng(0).integers(0, 100, 4096)
+        full = replace(
+            state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)), path=np.ones((200, 6))
+        )
+        assert len(full.to_bytes()) < 100_000
+        again = TrackState.from_bytes(full.to_bytes())
+        np.testing.assert_array_equal(again.belief.pose, full.belief.pose)
+        np.testing.assert_allclose(again.belief.weight, full.belief.weight)
+        assert again.pose is not None
+        assert state.pose is not None
+        np.testing.assert_allclose(again.pose.covariance, state.pose.covariance)
+
+    def test_other_number_of_sectors_keeps_the_belief(self) -> None:
+        belief = States(np.array([3, 3, 7]), np.array([0, 15, 4]), np.array([0.2, 0.3, 0.5]))
+        state = replace(TrackState.first(10, 16), belief=belief)
+        assert state.with_sectors(16) is state
+        for sectors in (8, 32, 48):
+            other = state.with_sectors(sectors)
+            assert other.sectors == sectors
+            assert other.belief.weight.sum() == pytest.approx(1.0)
+            assert other.belief.weight[other.belief.pose == 7].sum() == pytest.approx(0.5)
+            of_seven = other.belief.pose == 7
+            heading = np.exp(1j * math.tau / sectors * other.belief.sector[of_seven]) @ other.belief.weight[of_seven]
+            assert np.angle(heading) == pytest.approx(math.pi / 2)
+
+    def test_long_session_does_not_grow(
+        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
+        order = [there[index % len(there)] for index in range(260)]
+        walk = [WALK[index] for index in order]
+        found = follow(plan, grid, graph, encoders, [queries[index] for index in order], odometry_along(walk))
+        sizes = [len(answer.state.to_bytes()) for answer in found]
+        # The path of the first photographs grows; bytes of digits and of compressed weights differ.
+        assert max(sizes[200:]) < max(sizes[:200]) + 2000
+        assert max(sizes) < 100_000
+        last = found[-1].state
+        assert len(last.belief.pose) <= MAX_STATES
+        assert [int(number) for number in last.path[:, 0]] == list(range(61, 261))
+        # Still right.
+        assert np.linalg.norm(found[-1].pose.position_m - walk[-1][0]) < STEP_M
+
+    @pytest.mark.parametrize("damage", ["cut", "flipped", "version", "number"])
+    def test_damaged_state_is_refused(self, damage: str) -> None:
+        state = replace(TrackState.first(10, 4), belief=States(np.array([9]), np.array([3]), np.ones(1)))
+        content = state.to_bytes()
+        if damage == "number":
+            content = replace(state, poses=9).to_bytes()
+        elif damage == "cut":
+            content = content[:12]
+        elif damage == "version":
+            content = content[:4] + struct.pack("<H", 9) + content[6:]
+        else:
+            body = bytearray(zlib.decompress(content[10:]))
+            body[-1] ^= 1
+            content = content[:10] + zlib.compress(bytes(body))
+        with pytest.raises(InvalidStateError):
+            TrackState.from_bytes(content)

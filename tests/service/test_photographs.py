@@ -1,0 +1,271 @@
+"""Photographs that are no full spheres, over HTTP, with an encoder of views whose weights are random."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from tests.core.taken import EXAMPLES, jpeg, sphere, take
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.test_oscp import oscp_request
+
+Tag = ExifTags.Base
+MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
+PHONE: dict[Any, Any] = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 640, Tag.ExifImageHeight: 480}
+ANCHOR = {"latitude": 48.1, "longitude": 11.5, "north_deg": 0.0}
+QUICK = {"refine": "none", "top_k": 1}
+
+
+@pytest.fixture(scope="module")
+def client(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def flat(client: httpx.Client) -> str:
+    return upload(client, FLAT | {"anchor": ANCHOR})
+
+
+def shown(heading_deg: float = 0.0, **tilt: float) -> np.ndarray:
+    return take(sphere("living_room"), MAIN, heading_deg=heading_deg, **tilt)
+
+
+def ask(client: httpx.Client, plan_id: str, *photos: bytes, path: str = "/localise", **fields: Any) -> httpx.Response:
+    data = {"floorplan_id": plan_id} | {name: str(value) for name, value in (QUICK | fields).items()}
+    return client.post(path, data=data, files=[("photo", ("p", photo)) for photo in photos])
+
+
+def turn(client: httpx.Client, plan_id: str, *photos: bytes, **fields: Any) -> httpx.Response:
+    return ask(client, plan_id, *photos, path="/localise/sequence", **{"motion": "turn", **fields})
+
+
+def test_phone_photograph_is_localised(client: httpx.Client, flat: str) -> None:
+    answer = ask(client, flat, jpeg(shown(), PHONE), include="posterior").json()
+    view = answer["view"]
+    assert (view["projection"], view["projection_source"], view["hfov"]["source"]) == ("perspective", "exif", "exif")
+    assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
+    assert view["pitch"]["source"] == view["roll"]["source"] == "estimated"
+    assert abs(view["pitch"]["value_deg"]) < 3.0
+    (arc,) = view["seen"]
+    assert arc["to_deg"] - arc["from_deg"] == pytest.approx(67.0, abs=4.0)
+    focal = view["camera"]["fx"]
+    assert 2.0 * math.degrees(math.atan(320.0 / focal)) == pytest.approx(view["hfov"]["value_deg"], abs=0.02)
+    # The divergence of the posterior from the shares of area, as the answer itself has it.
+    probability = np.array(answer["posterior"]["probability"])
+    assert view["ruled_out"] == pytest.approx(1.0 - 2.0 ** -view["information_bits"], abs=1e-3)
+    assert 0.0 <= view["information_bits"] <= math.log2(9.0 * 6.0 / 0.25)
+    entropy_bits = -float((probability * np.log2(probability)).sum())
+    assert view["information_bits"] + entropy_bits < math.log2(9.0 * 6.0 / 0.25) + 1.0
+    assert (answer["confidence"] or 0.0) >= 0.5 or view["advice"].startswith("turn around: 6")
+
+
+def test_sphere_is_read_as_before(client: httpx.Client, flat: str) -> None:
+    content = (EXAMPLES / "kitchen.jpg").read_bytes()
+    data = {"floorplan_id": flat} | {name: str(value) for name, value in QUICK.items()}
+    renamed, usual = (client.post("/localise", data=data, files={name: content}) for name in ("panorama", "photo"))
+    assert renamed.json() | {"timings_ms": None} == usual.json() | {"timings_ms": None}
+    view = usual.json()["view"]
+    assert (view["projection"], view["hfov"]["value_deg"], view["camera"]) == ("equirectangular", 360.0, None)
+    assert view["seen"] == [{"from_deg": -180.0, "to_deg": 180.0}]
+    assert view["advice"] is None
+    both = client.post("/localise", data=data, files=[("panorama", content), ("photo", content)])
+    assert assert_problem(both, 422, "invalid-request")["errors"][0]["field"] == "photo"
+
+
+@pytest.mark.parametrize(
+    ("fields", "projection", "hfov_deg"),
+    [
+        ({"hfov_deg": "80"}, "perspective", 80.0),
+        ({"intrinsics": json.dumps({"fx": 400, "fy": 400, "k1": -0.05})}, "perspective", 79.8),
+        ({"intrinsics": json.dumps({"fx": 300, "fy": 300}), "projection": "fisheye"}, "fisheye", 122.2),
+        ({"hfov_deg": "200", "projection": "cylindrical"}, "cylindrical", 200.0),
+    ],
+)
+def test_statements_are_used(
+    client: httpx.Client, flat: str, fields: dict[str, str], projection: str, hfov_deg: float
+) -> None:
+    answer = ask(client, flat, jpeg(shown(), PHONE), pitch_deg=2, roll_deg=-1, **fields).json()
+    view = answer["view"]
+    assert (view["projection"], view["hfov"]["source"]) == (projection, "given")
+    assert view["hfov"]["value_deg"] == pytest.approx(hfov_deg, abs=3.0)
+    tilt = {"std_deg": 0.5, "source": "given"}
+    assert (view["pitch"], view["roll"]) == ({"value_deg": 2.0, **tilt}, {"value_deg": -1.0, **tilt})
+
+
+def test_files_of_phones_are_read(client: httpx.Client, flat: str) -> None:
+    portrait = take(sphere("living_room"), Perspective.of_hfov(480, 640, math.radians(53.1)))
+    turned = ask(client, flat, jpeg(np.rot90(portrait).copy(), PHONE, orientation=6)).json()["view"]
+    assert turned["hfov"]["value_deg"] == pytest.approx(53.1, abs=0.2)
+    assert (turned["camera"]["width"], turned["camera"]["height"]) == (480, 640)
+    absurd = ask(client, flat, jpeg(shown(), PHONE | {Tag.FocalLengthIn35mmFilm: 60_000})).json()["view"]
+    assert absurd["hfov"]["source"] == "estimated"
+    assert any("FocalLengthIn35mmFilm is 60000 mm" in warning for warning in absurd["warnings"])
+    zero = ask(client, flat, jpeg(shown(), PHONE | {Tag.FocalLengthIn35mmFilm: 0})).json()["view"]
+    assert zero["hfov"]["source"] == "estimated"
+
+
+def test_heic_is_read(client: httpx.Client, flat: str) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    buffer = io.BytesIO()
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(PHONE)
+    heif.from_pillow(Image.fromarray(shown())).save(buffer, exif=exif.tobytes())
+    view = ask(client, flat, buffer.getvalue()).json()["view"]
+    assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"intrinsics": '{"fx": 0, "fy": 400}'}, "intrinsics: fx is 0; it must be positive"),
+        ({"intrinsics": '{"fx": 400, "fy": 400, "cx": 9000}'}, "cx is 9000, outside of the upright picture of 640 x"),
+        ({"intrinsics": '{"fx": 400, "fy": 400}', "hfov_deg": "70"}, "hfov_deg and intrinsics exclude each other"),
+        ({"hfov_deg": "0"}, "hfov_deg is 0; it must be between 10 and 360"),
+        ({"pitch_deg": "80"}, "pitch_deg is 80; it must be between -60 and 60"),
+        ({"projection": "fisheye"}, "a fisheye photograph needs hfov_deg"),
+    ],
+)
+def test_impossible_statements_are_refused(
+    client: httpx.Client, flat: str, fields: dict[str, str], reason: str
+) -> None:
+    problem = assert_problem(ask(client, flat, jpeg(shown(), PHONE), **fields), 422, "invalid-panorama")
+    assert reason in problem["detail"]
+    assert problem["detail"].endswith("see docs/how-to/take-photographs.md")
+
+
+@pytest.mark.parametrize(
+    ("fields", "field"),
+    [
+        ({"intrinsics": "fx=400"}, "intrinsics"),
+        ({"intrinsics": '{"fx": 400}'}, "intrinsics.fy"),
+        ({"intrinsics": '{"fx": NaN, "fy": 400}'}, "intrinsics.fx"),
+        ({"projection": "flat"}, "projection"),
+        ({"roll_deg": "1_0"}, "roll_deg"),
+    ],
+)
+def test_malformed_statements_name_their_field(
+    client: httpx.Client, flat: str, fields: dict[str, str], field: str
+) -> None:
+    problem = assert_problem(ask(client, flat, jpeg(shown(), PHONE), **fields), 422, "invalid-request")
+    assert [fault["field"] for fault in problem["errors"]] == [field]
+
+
+def test_white_picture_is_no_sphere(client: httpx.Client, flat: str) -> None:
+    white = jpeg(np.full((256, 512, 3), 255, np.uint8))
+    assert "is not a full 360° sphere" in assert_problem(ask(client, flat, white), 422, "invalid-panorama")["detail"]
+
+
+def test_venue_picture_and_feature_work(client: httpx.Client, flat: str) -> None:
+    photo = jpeg(shown(), PHONE)
+    data = {"floorplan_id": flat, "refine": "none"}
+    for media in ("image/png", "application/geo+json"):
+        response = client.post("/localise", data=data, files={"photo": photo}, headers={"Accept": media})
+        assert response.headers["content-type"] == media, response.text
+    assert response.json()["properties"]["view"]["projection"] == "perspective"
+    venue = client.post("/venues", json={"plans": [{"floorplan_id": flat, "level": 0}]}).json()["id"]
+    answer = client.post("/localise", data={"venue_id": venue, **QUICK}, files={"photo": photo}).json()
+    assert answer["view"]["projection"] == "perspective"
+
+
+def test_camera_of_the_geopose_protocol_is_used(client: httpx.Client, flat: str) -> None:
+    request = oscp_request(jpeg(shown()))
+    (reading,) = request["sensorReadings"]["cameraReadings"]
+    reading["params"] = {"model": "SIMPLE_RADIAL", "modelParams": [480.5, 319.5, 239.5, 0.0]}
+    found = client.post(f"/geopose?floorplan_id={flat}", json=request)
+    assert found.status_code == 200, found.text
+    reading["params"]["modelParams"][0] = 0.0
+    problem = assert_problem(client.post(f"/geopose?floorplan_id={flat}", json=request), 422, "invalid-panorama")
+    assert "intrinsics: fx is 0; it must be positive" in problem["detail"]
+
+
+class TestTurn:
+    PHOTOS = tuple(jpeg(shown(heading_deg), PHONE) for heading_deg in (0.0, 60.0, 120.0))
+
+    def test_known_angles_make_one_wide_view(self, client: httpx.Client, flat: str) -> None:
+        answer = turn(client, flat, *self.PHOTOS, relative_heading_deg="[10, 70, 130]").json()
+        headings = [pose["heading_deg"] for pose in answer["poses"]]
+        assert [(heading - headings[0]) % 360.0 for heading in headings] == pytest.approx([0.0, 60.0, 120.0], abs=0.02)
+        assert len({json.dumps(pose["position"]) for pose in answer["poses"]}) == 1
+        for pose in answer["poses"]:
+            (arc,) = pose["view"]["seen"]
+            assert arc["to_deg"] - arc["from_deg"] == pytest.approx(187.0, abs=5.0)
+
+    def test_known_heading_of_one_gives_those_of_all(self, client: httpx.Client, flat: str) -> None:
+        fields = {"relative_heading_deg": "[0, 60, 120]", "headings_deg": "[null, 100, null]"}
+        answer = turn(client, flat, *self.PHOTOS, heading_tolerance_deg=0, **fields).json()
+        assert [pose["heading_deg"] for pose in answer["poses"]] == pytest.approx([40.0, 100.0, 160.0], abs=0.02)
+
+    @pytest.mark.parametrize("fields", [{}, {"relative_heading_deg": "[0, 60, null]"}])
+    def test_unknown_angles_are_searched(self, client: httpx.Client, flat: str, fields: dict[str, str]) -> None:
+        answer = turn(client, flat, *self.PHOTOS, **fields).json()
+        places = np.array([[pose["position"][axis] for axis in ("x_m", "y_m")] for pose in answer["poses"]])
+        assert np.linalg.norm(places - places[0], axis=1).max() < 1.0
+
+    @pytest.mark.parametrize(
+        ("fields", "field", "message"),
+        [
+            ({"relative_heading_deg": "[0, 60]"}, "relative_heading_deg", "has 2 items, 3 photographs need 3"),
+            ({"motion": "walk", "relative_heading_deg": "[0, 1, 2]"}, "relative_heading_deg", "needs motion=turn"),
+            ({"motions": "[null, null]"}, "motions", "does not go with motion=turn"),
+            ({"motion": "fly"}, "motion", "'walk' or 'turn'"),
+        ],
+    )
+    def test_contradictory_fields_are_refused(
+        self, client: httpx.Client, flat: str, fields: dict[str, str], field: str, message: str
+    ) -> None:
+        problem = assert_problem(turn(client, flat, *self.PHOTOS, **fields), 422, "invalid-request")
+        (fault,) = problem["errors"]
+        assert fault["field"] == field
+        assert message in fault["message"]
+
+
+def test_model_for_spheres_refuses_other_photographs(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        plan_id = upload(client)
+        problem = assert_problem(ask(client, plan_id, jpeg(shown(), PHONE)), 422, "invalid-panorama")
+    assert "reads full 360° spheres only; send an equirectangular picture" in problem["detail"]
+
+
+def test_fisheye_circle_is_read(client: httpx.Client, flat: str) -> None:
+    circle = take(sphere("kitchen"), Fisheye.of_hfov(480, 480, math.radians(190.0)))
+    view = ask(client, flat, jpeg(circle), projection="fisheye", hfov_deg=190).json()["view"]
+    (arc,) = view["seen"]
+    assert arc["to_deg"] - arc["from_deg"] == pytest.approx(190.0, abs=1.0)
+
+
+def test_session_takes_photographs_of_any_projection(client: httpx.Client, flat: str) -> None:
+    session_id = client.post("/sessions", json={"floorplan_id": flat}).json()["id"]
+
+    def send(content: bytes, **fields: Any) -> httpx.Response:
+        data = {name: str(value) for name, value in fields.items()}
+        return client.post(f"/sessions/{session_id}/photographs", data=data, files={"photo": content})
+
+    phone = send(jpeg(shown(), PHONE)).json()["pose"]
+    assert (phone["view"]["projection"], phone["view"]["hfov"]["source"]) == ("perspective", "exif")
+    # Gravity of the device.
+    level = send(jpeg(shown(roll_deg=3.0)), hfov_deg=67.3, pitch_deg=0, roll_deg=3, forward_m=0, turn_deg=0).json()
+    assert [level["pose"]["view"][name]["source"] for name in ("hfov", "pitch", "roll")] == ["given"] * 3
+    assert level["pose"]["view"]["roll"]["value_deg"] == 3.0
+    intrinsics = json.dumps({"fx": 480.7, "fy": 480.7})
+    assert send(jpeg(shown()), intrinsics=intrinsics).json()["pose"]["view"]["camera"]["fx"] == 480.7
+    # A sphere has other sectors of the heading.
+    sphere_file = (EXAMPLES / "living_room.jpg").read_bytes()
+    assert send(sphere_file, forward_m=0, turn_deg=0).json()["pose"]["view"]["projection"] == "equirectangular"
+    assert send(jpeg(shown(), PHONE)).json()["photographs"] == 5
+    refused = assert_problem(send(jpeg(shown()), projection="fisheye"), 422, "invalid-panorama")
+    assert "a fisheye photograph needs hfov_deg" in refused["detail"]
+    refused = assert_problem(send(jpeg(shown(), PHONE), heading_tolerance_deg=5), 422, "invalid-request")
+    assert refused["errors"] == [{"field": "heading_tolerance_deg", "message": "is '5': needs heading_deg"}]

@@ -1,0 +1,117 @@
+"""Sessions of a service that is killed: real processes, on SQLite and PostgreSQL."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+from functools import partial
+from pathlib import Path
+from time import sleep
+
+import httpx
+import pytest
+
+from service.storage.store import Store
+from tests.service.conftest import upload, wait_for
+from tests.service.test_process import children
+from tests.service.test_sessions import begin, send
+from tests.service.test_stopping import RunningService, running_service
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def settings(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
+    """Return the settings of a service that is started again on the same database."""
+    usual = {"DECODE_STALL_S": "100", "DECODE_WORKERS": "1"}
+    if request.param == "sqlite":
+        return usual
+    return usual | {"DATABASE_URL": request.getfixturevalue("postgres").new_database()}
+
+
+def database_of(settings: dict[str, str], tmp_path: Path) -> str:
+    return settings.get("DATABASE_URL", f"sqlite:///{tmp_path / 'data' / 'lalaloc.sqlite3'}")
+
+
+def kill(service: RunningService) -> None:
+    service.process.kill()
+    service.process.wait(60.0)
+
+
+def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
+    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], panorama: bytes
+) -> None:
+    with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
+        session_id = begin(service.client, upload(service.client))
+        assert send(service.client, session_id, panorama, number=1).status_code == 200
+        before = service.client.get(f"/sessions/{session_id}").json()
+        for decoder in children(service.process.pid):
+            os.kill(decoder, signal.SIGSTOP)
+        lost: list[httpx.TransportError] = []
+
+        def send_second() -> None:
+            with httpx.Client(base_url=service.client.base_url, timeout=120.0) as client:
+                try:
+                    send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+                except httpx.TransportError as error:
+                    lost.append(error)
+
+        sender = threading.Thread(target=send_second)
+        sender.start()
+        # A number out of order claims nothing, and is refused differently while the photograph holds the claim.
+        probe = partial(send, service.client, session_id, panorama, number=9)
+        wait_for(lambda: probe().json()["type"] == "urn:lalaloc:problem:session-busy")
+        kill(service)
+        sender.join(60.0)
+        assert lost
+    with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
+        assert service.client.get(f"/sessions/{session_id}").json() == before
+        # The claim of the killed process ends with its lease.
+        answers: list[httpx.Response] = []
+
+        def accepted() -> bool:
+            answers.append(send(service.client, session_id, panorama, number=2, forward_m=0, turn_deg=0))
+            assert answers[-1].status_code in (200, 409), answers[-1].text
+            return answers[-1].status_code == 200
+
+        wait_for(accepted, 120.0)
+        after = answers[-1].json()
+        assert (after["photographs"], [point["number"] for point in after["path"]]) == (2, [1, 2])
+
+
+@pytest.mark.slow
+def test_session_survives_kills_at_any_moment(
+    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], panorama: bytes
+) -> None:
+    rng, answered, session_id = random.Random(5), 0, ""
+    for _ in range(5):
+        with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
+            if not session_id:
+                session_id = begin(service.client, upload(service.client))
+            stored = service.client.get(f"/sessions/{session_id}").json()["photographs"]
+            # An answered photograph is stored; the one in work at the kill either counted or did not.
+            assert stored in (answered, answered + 1)
+            answered = stored
+            killer = threading.Timer(rng.uniform(0.0, 1.0), service.process.kill)
+            try:
+                while True:
+                    answer = send(service.client, session_id, panorama, number=answered + 1)
+                    if answer.status_code == 200:
+                        answered += 1
+                        assert answer.json()["photographs"] == answered
+                        if killer.ident is None:
+                            killer.start()
+                    else:
+                        # Claimed by the process that was killed before.
+                        assert answer.status_code == 409, answer.text
+                        sleep(0.2)
+            except httpx.TransportError:
+                killer.join()
+            service.process.wait(60.0)
+    store = Store(database_of(settings, tmp_path))
+    record = store.sessions.get("default", session_id)
+    assert record.photographs in (answered, answered + 1)
+    # What the quota counts is what is stored.
+    used = store.quota.account("default").used.sessions
+    assert used >= len(record.state or b"") + len(record.pose or "")
+    store.close()

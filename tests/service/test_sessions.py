@@ -1,0 +1,224 @@
+"""Sessions of tracked cameras: photographs in order, stored states, refusals."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+import httpx
+import pytest
+
+from service.storage.store import Store
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
+
+
+def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
+    """Begin a session; return its id."""
+    answer = client.post("/sessions", json={"floorplan_id": plan_id} | fields)
+    assert answer.status_code == 201, answer.text
+    assert answer.headers["location"] == f"/sessions/{answer.json()['id']}"
+    return answer.json()["id"]
+
+
+def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -> httpx.Response:
+    """Send a photograph."""
+    data = {name: str(value) for name, value in fields.items()}
+    files = {"photo": ("p.jpg", picture, "image/jpeg")}
+    return client.post(f"/sessions/{session_id}/photographs", data=data, files=files)
+
+
+@pytest.fixture(scope="module")
+def plan_id(client: httpx.Client) -> str:
+    return upload(client)
+
+
+def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id, camera_height_m=1.5)
+    empty = client.get(f"/sessions/{session_id}").json()
+    assert (empty["photographs"], empty["mode"], empty["pose"], empty["path"]) == (0, "searching", None, [])
+    first = send(client, session_id, panorama, number=1).json()
+    second = send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+    assert second.status_code == 200, second.text
+    answer = second.json()
+    assert answer == client.get(f"/sessions/{session_id}").json()
+    assert answer["photographs"] == answer["pose"]["number"] == 2
+    assert [point["number"] for point in answer["path"]] == [1, 2]
+    assert answer["path"][0]["position"] == first["pose"]["position"]
+    pose = answer["pose"]
+    assert pose["room"] in {room["name"] for room in FLAT["rooms"]}
+    covariance = pose["covariance"]
+    assert all(covariance[i][j] == covariance[j][i] for i in range(3) for j in range(3))
+    assert min(covariance[i][i] for i in range(3)) > 0.0
+    assert answer["expires_at"] > first["expires_at"]
+    assert client.delete(f"/sessions/{session_id}").status_code == 204
+    assert_problem(client.get(f"/sessions/{session_id}"), 404, "unknown-session")
+    assert_problem(send(client, session_id, panorama), 404, "unknown-session")
+    assert_problem(client.delete(f"/sessions/{session_id}"), 404, "unknown-session")
+
+
+def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id)
+    assert send(client, session_id, panorama, number=1).status_code == 200
+    problem = assert_problem(send(client, session_id, panorama, number=1), 409, "photograph-out-of-order")
+    assert "number is 1; the next photograph" in problem["detail"]
+    assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
+    assert send(client, session_id, panorama, number=2).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("fields", "slug", "message"),
+    [
+        ({"forward_m": "nan", "turn_deg": 0}, "invalid-request", "forward_m"),
+        ({"forward_m": 1, "right_m": "inf", "turn_deg": 0}, "invalid-request", "is 'inf': must be finite"),
+        ({"forward_m": 1000, "turn_deg": 0}, "invalid-motion", "is 1000 m long; the limit is 50 m between two"),
+        ({"forward_m": 0, "turn_deg": 900}, "invalid-motion", "the turn is 900\\u00b0; the limit is 720\\u00b0"),
+        ({"forward_m": 40, "right_m": 40, "turn_deg": 0}, "invalid-motion", "the limit is 50 m"),
+        ({"forward_m": 1, "turn_deg": 0, "forward_std_m": -1}, "invalid-motion", "forward_std_m is -1; it must not be"),
+        ({"forward_m": 1, "turn_deg": 0, "right_std_m": 60}, "invalid-motion", "of right_m is 60 m; the limit is 50 m"),
+        (
+            {"forward_m": 1, "turn_deg": 0, "covariance": json.dumps([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])},
+            "invalid-motion",
+            "a variance must not be negative",
+        ),
+        (
+            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
+            "invalid-motion",
+            "not positive semidefinite: the smallest eigenvalue of its correlations is -1",
+        ),
+        (
+            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]"},
+            "invalid-motion",
+            "not symmetric",
+        ),
+        (
+            {"forward_m": 1, "turn_deg": 0, "covariance": "[[NaN, 0, 0], [0, 1, 0], [0, 0, 1]]"},
+            "invalid-request",
+            "must be finite",
+        ),
+        ({"forward_m": 1, "turn_deg": 0, "covariance": "[[1]]"}, "invalid-request", "covariance"),
+        ({"forward_m": 1}, "invalid-request", "forward_m and turn_deg are needed together"),
+        ({"turn_std_deg": 1}, "invalid-request", "need forward_m and turn_deg"),
+        ({"number": 0}, "invalid-request", "must be at least 1"),
+    ],
+)
+def test_impossible_motion_is_refused(
+    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], slug: str, message: str
+) -> None:
+    session_id = begin(client, plan_id)
+    problem = assert_problem(send(client, session_id, panorama, **fields), 422, slug)
+    assert message in json.dumps(problem)
+    # The session is free and unchanged.
+    assert send(client, session_id, panorama, number=1).status_code == 200
+
+
+def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id)
+    assert_problem(send(client, session_id, b"no picture"), 422, "invalid-panorama")
+    assert send(client, session_id, panorama, number=1).status_code == 200
+
+
+def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id)
+    answers: list[httpx.Response] = []
+    threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, panorama))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    accepted = [answer for answer in answers if answer.status_code == 200]
+    for answer in answers:
+        if answer not in accepted:
+            assert_problem(answer, 409, "session-busy")
+            assert answer.headers["retry-after"] == "1"
+    assert sorted(answer.json()["photographs"] for answer in accepted) == list(range(1, len(accepted) + 1))
+    assert client.get(f"/sessions/{session_id}").json()["photographs"] == len(accepted) >= 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "slug"),
+    [
+        ({"near": {"x_m": 1, "y_m": 1}}, "invalid-request"),
+        ({"near": {"x_m": 900, "y_m": 1}, "radius_m": 2}, "invalid-hint"),
+        ({"rooms": ["attic"]}, "invalid-hint"),
+        ({"camera_height_m": 9}, "invalid-pose"),
+        ({"top_k": 1000}, "invalid-request"),
+        ({"colour": "red"}, "invalid-request"),
+    ],
+)
+def test_impossible_session_is_refused(client: httpx.Client, plan_id: str, fields: dict[str, Any], slug: str) -> None:
+    assert_problem(client.post("/sessions", json={"floorplan_id": plan_id} | fields), 422, slug)
+
+
+def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id, rooms=["kitchen"])
+    assert send(client, session_id, panorama).json()["pose"]["room"] == "kitchen"
+
+
+def test_replaced_plan_ends_its_sessions(client: httpx.Client, panorama: bytes) -> None:
+    own = upload(client)
+    session_id = begin(client, own)
+    client.put(f"/floorplans/{own}", json=FLAT | {"name": "changed", "ceiling_height_m": 2.6}).raise_for_status()
+    assert_problem(send(client, session_id, panorama), 409, "session-outdated")
+    client.delete(f"/floorplans/{own}").raise_for_status()
+    assert_problem(client.get(f"/sessions/{session_id}"), 404, "unknown-session")
+
+
+def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path) as client:
+        session_id = begin(client, upload(client))
+        before = send(client, session_id, panorama).json()
+    with start_app(tmp_path) as client:
+        assert client.get(f"/sessions/{session_id}").json() == before
+        after = send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+        assert after.json()["photographs"] == 2, after.text
+
+
+def test_sessions_expire_and_are_limited(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, session_ttl_s=1.0, max_sessions=2) as client:
+        own = upload(client)
+        first, _ = begin(client, own), begin(client, own)
+        assert_problem(client.post("/sessions", json={"floorplan_id": own}), 507, "too-many-sessions")
+        assert client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"] > 0
+        sleep(1.1)
+        assert_problem(send(client, first, panorama), 404, "unknown-session")
+        begin(client, own)
+        store = Store(database_of(tmp_path))
+        sleep(1.1)
+        assert store.sessions.purge() == 1
+        assert store.quota.account("default").used.sessions == 0
+        store.close()
+
+
+def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        session_id = begin(client, upload(client))
+        store = Store(database_of(tmp_path), claim_s=0.5)
+        store.sessions.claim("default", session_id, None)
+        picture = encode_picture(512, 256, "JPEG")
+        assert_problem(send(client, session_id, picture), 409, "session-busy")
+        sleep(0.6)
+        assert send(client, session_id, picture, number=1).status_code == 200
+        assert_problem(client.get(f"/sessions/{'0' * 32}"), 404, "unknown-session")
+        store.close()
+
+
+@pytest.mark.slow
+def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path) as client:
+        session_id = begin(client, upload(client))
+        stored, answers = [], []
+        for number in range(1, 241):
+            motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
+            answer = send(client, session_id, panorama, number=number, **motion)
+            answers.append(len(answer.content))
+            stored.append(client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"])
+        assert [point["number"] for point in answer.json()["path"]] == list(range(41, 241))
+        # The path grows until it has 200 poses; later sizes differ by digits only.
+        assert max(stored[200:]) < max(stored[:200]) + 2000
+        assert max(answers[200:]) < max(answers[:200]) + 2000
+        assert max(stored) < 200_000

@@ -1,0 +1,276 @@
+"""Venues made from a plan file of several levels: all of its plans and the venue, or nothing."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import httpx
+import pytest
+from sqlalchemy import text
+from sqlalchemy.exc import IntegrityError
+
+from lalaloc_core.floorplan import FloorPlan
+from service.storage.database import Database
+from service.storage.records import Original
+from service.storage.store import Store
+from service.storage.venue_imports import NewPlan
+from tests.importers.conftest import zip_file
+from tests.importers.test_ifc import DUPLEX, ifc_flat, ifc_house
+from tests.importers.test_roomplan import two_stories
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, wait_for
+from tests.service.test_security import bearer, make_key
+from tests.service.test_venues import plans_of
+
+SQUARE = [[11.0, 48.0], [11.00005, 48.0], [11.00005, 48.00005], [11.0, 48.00005], [11.0, 48.0]]
+
+
+def room(level: str, side: float = 1.0, **properties: Any) -> dict[str, Any]:
+    """Return a room of `side` times 4 m x 5.5 m as a feature of GeoJSON."""
+    (x0, y0), ring = SQUARE[0], SQUARE
+    ring = [[x0 + side * (x - x0), y0 + side * (y - y0)] for x, y in ring]
+    properties = {"indoor": "room", "level": level, "name": f"room {level}"} | properties
+    return {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+
+
+def geojson(*features: dict[str, Any]) -> bytes:
+    return json.dumps({"type": "FeatureCollection", "features": features or [room("0"), room("1")]}).encode()
+
+
+def osm() -> bytes:
+    root = ElementTree.Element("osm", version="0.6")
+    for number, (x, y) in enumerate(SQUARE[:4]):
+        ElementTree.SubElement(root, "node", id=str(number), lon=str(x), lat=str(y))
+    for level in (0, 1):
+        way = ElementTree.SubElement(root, "way", id=str(level))
+        for node in (0, 1, 2, 3, 0):
+            ElementTree.SubElement(way, "nd", ref=str(node))
+        for key, value in (("indoor", "room"), ("level", str(level)), ("name", f"room {level}")):
+            ElementTree.SubElement(way, "tag", k=key, v=value)
+    return ElementTree.tostring(root)
+
+
+def imdf() -> bytes:
+    def collection(*features: dict[str, Any]) -> str:
+        return json.dumps({"type": "FeatureCollection", "features": features})
+
+    levels = [
+        {"id": f"level-{n}", "type": "Feature", "feature_type": "level", "geometry": None,
+         "properties": {"ordinal": n, "name": {"en": f"Level {n}"}}}
+        for n in (0, 1)
+    ]  # fmt: skip
+    units = []
+    for n in (0, 1):
+        properties = {"level_id": f"level-{n}", "category": "room", "name": {"en": f"room {n}"}}
+        units.append({**room(""), "id": f"unit-{n}", "feature_type": "unit", "properties": properties})
+    files = {"manifest.json": "{}", "level.geojson": collection(*levels), "unit.geojson": collection(*units)}
+    return zip_file(files)
+
+
+def send(client: httpx.Client, content: bytes, file_name: str = "Duplex.bin", **fields: Any) -> httpx.Response:
+    headers = fields.pop("headers", {})
+    return client.post("/venues", files={"file": (file_name, content)}, data=fields, headers=headers)
+
+
+def counts(client: httpx.Client, headers: dict[str, str] | None = None) -> tuple[int, int]:
+    """Return the numbers of stored plans and venues."""
+
+    def count(path: str) -> int:
+        answer = client.get(path, params={"limit": 500}, headers=headers or {}).json()
+        return len(answer[path.removeprefix("/")])
+
+    return count("/floorplans"), count("/venues")
+
+
+@pytest.mark.parametrize("make", [geojson, osm, imdf, two_stories], ids=["GeoJSON", "OSM", "IMDF", "RoomPlan"])
+def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) -> None:
+    response = send(client, make())
+    assert response.status_code == 201, response.text
+    venue = response.json()
+    assert response.headers["location"] == f"/venues/{venue['id']}"
+    assert (venue["name"], venue["plans"], venue["plans_ready"], venue["anchor"]) == ("Duplex", 2, 2, None)
+    entries = plans_of(client, venue["id"])
+    assert [entry["level"] for entry in entries] == [0.0, 1.0]
+    assert [entry["name"].casefold().replace("story", "level") for entry in entries] == [
+        "duplex – level 0",
+        "duplex – level 1",
+    ]
+    for number, entry in enumerate(entries):
+        plan = client.get(f"/floorplans/{entry['floorplan_id']}").json()
+        assert (plan["name"], plan["status"]) == (entry["name"], "ready")
+        assert plan["import_report"]["level"]["number"] == number
+    assert client.delete(f"/venues/{venue['id']}").status_code == 204
+
+
+def test_levels_of_a_model_are_searched(client: httpx.Client, panorama: bytes) -> None:
+    venue = send(client, ifc_house().content(), name="Haus", ceiling_height_m="2.5").json()
+    entries = plans_of(client, venue["id"])
+    assert [(entry["name"], entry["level"], entry["rooms"]) for entry in entries] == [
+        ("Haus – EG", 0.0, 2),
+        ("Haus – Obergeschoss", 1.0, 1),
+    ]
+    query = {"venue_id": venue["id"], "refine": "none"}
+    answer = client.post("/localise", data=query, files={"panorama": ("p.jpg", panorama, "image/jpeg")}).json()
+    assert answer["floorplan_id"] in {entry["floorplan_id"] for entry in entries}
+
+
+@pytest.mark.skipif(DUPLEX is None, reason="the sample model is not available")
+def test_sample_model_becomes_a_venue(client: httpx.Client) -> None:
+    assert DUPLEX is not None
+    venue = send(client, DUPLEX.read_bytes(), "Duplex.ifc").json()
+    names = [entry["name"] for entry in plans_of(client, venue["id"])]
+    assert names == ["Duplex – Level 1", "Duplex – Level 2", "Duplex – Roof"]
+
+
+def test_levels_keep_their_plan_as_a_file(client: httpx.Client) -> None:
+    venue = send(client, geojson()).json()
+    for entry in plans_of(client, venue["id"]):
+        original = client.get(f"/floorplans/{entry['floorplan_id']}/original")
+        assert original.headers["content-type"] == "application/json"
+        again = client.post("/floorplans", content=original.content, headers={"content-type": "application/json"})
+        stored = client.get(f"/floorplans/{entry['floorplan_id']}").json()
+        assert again.json()["plan"] == stored["plan"]
+
+
+def test_file_without_levels_becomes_a_venue_of_one_plan(client: httpx.Client) -> None:
+    content = json.dumps(FLAT).encode()
+    for file, name, plan_name, level in (
+        (content, "house", "Flat 3", 0.0),
+        (ifc_flat().content(), "house", "EG", 0.0),
+        (geojson(room("2")), "house", "floor plan", 2.0),
+    ):
+        venue = send(client, file, "house.x").json()
+        [entry] = plans_of(client, venue["id"])
+        assert (venue["name"], entry["name"], entry["level"]) == (name, plan_name, level)
+        assert client.get(f"/floorplans/{entry['floorplan_id']}/original").content == file
+
+
+def test_levels_without_numbers_are_ordered(client: httpx.Client) -> None:
+    venue = send(client, geojson(room("Ground"), room("Attic"))).json()
+    found = [(entry["name"], entry["level"]) for entry in plans_of(client, venue["id"])]
+    assert found == [("Duplex – Ground", 0.0), ("Duplex – Attic", 1.0)]
+
+
+def test_large_levels_are_prepared_in_the_background(client: httpx.Client) -> None:
+    halls = [room(str(level), side=12.0) for level in range(2)]
+    venue = send(client, geojson(*halls)).json()
+    path = f"/venues/{venue['id']}"
+    wait_for(lambda: client.get(path).json()["plans_ready"] == 2)
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "words"),
+    [
+        (geojson(room("0"), room("1", side=1e3)), "invalid-floorplan", "level '1': "),
+        (b"AC1032 dwg", "invalid-floorplan", "DWG"),
+        (b"  ", "invalid-floorplan", "the body is empty"),
+    ],
+)
+def test_invalid_file_stores_nothing(client: httpx.Client, content: bytes, kind: str, words: str) -> None:
+    before = counts(client)
+    assert words in assert_problem(send(client, content), 422, kind)["detail"]
+    assert counts(client) == before
+
+
+def test_options_are_checked(client: httpx.Client) -> None:
+    problem = assert_problem(send(client, geojson(), level="1", units="miles"), 422, "invalid-request")
+    assert {fault["field"] for fault in problem["errors"]} == {"level", "units"}
+    unnamed = client.post("/venues", data={"name": "x"}, files={"plan": ("a", b"b")})
+    assert "file" in assert_problem(unnamed, 422, "invalid-request")["detail"]
+    text_body = client.post("/venues", content=b"x", headers={"content-type": "text/plain"})
+    assert_problem(text_body, 415, "unsupported-media")
+
+
+def test_repeated_request_makes_one_venue(client: httpx.Client) -> None:
+    key = {"Idempotency-Key": uuid.uuid4().hex}
+    before = counts(client)
+    first, second = (send(client, geojson(), headers=key) for _ in range(2))
+    assert (first.status_code, second.content) == (201, first.content)
+    assert second.headers["idempotency-replayed"] == "true"
+    assert counts(client) == (before[0] + 2, before[1] + 1)
+    assert_problem(send(client, geojson(), headers=key, name="x"), 422, "idempotency-key-reused")
+
+
+@pytest.mark.parametrize(
+    ("limits", "status", "kind", "words"),
+    [
+        ({"max_floorplans": 1}, 507, "too-many-floorplans", "LALALOC_MAX_FLOORPLANS"),
+        ({"max_venues": 1}, 507, "too-many-venues", "LALALOC_MAX_VENUES"),
+        ({"max_venue_plans": 1}, 422, "invalid-request", "has 2 levels; the limit is 1"),
+        ({"max_grid_poses": 20}, 422, "floorplan-too-large", "the plan of level '0' needs"),
+        ({"max_stored_bytes": 2000}, 507, "storage-quota", "LALALOC_MAX_STORED_BYTES"),
+        ({"max_plan_bytes": 200}, 413, "upload-too-large", "LALALOC_MAX_PLAN_BYTES"),
+        ({"max_rooms": 1}, 422, "invalid-floorplan", "level '0': "),
+    ],
+)
+def test_limits_refuse_the_whole_file(
+    start_app: StartApp, tmp_path: Path, limits: dict[str, Any], status: int, kind: str, words: str
+) -> None:
+    with start_app(tmp_path, **limits) as client:
+        if "max_venues" in limits:
+            assert client.post("/venues", json={}).status_code == 201
+        before = counts(client)
+        content = geojson(room("0"), room("0", side=0.9), room("1")) if "max_rooms" in limits else geojson()
+        assert words in assert_problem(send(client, content), status, kind)["detail"]
+        assert counts(client) == before
+        assert client.get("/usage").json()["stored_bytes"]["by_kind"]["plans"] == 0
+
+
+def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+    with start_app(tmp_path, api_keys=True) as client:
+        store = Store(database_of(tmp_path))
+        mine, theirs = (
+            bearer(make_key(store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
+        )
+        venue = send(client, geojson(), headers=mine).json()
+        assert (counts(client, mine), counts(client, theirs)) == ((2, 1), (0, 0))
+        assert_problem(client.get(f"/venues/{venue['id']}", headers=theirs), 404, "unknown-venue")
+        reader = bearer(make_key(store, tenant="mine", scopes=("read", "localise")))
+        assert_problem(send(client, geojson(), headers=reader), 403, "insufficient-scope")
+        used = client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"]
+        store.quota.recount()
+        assert client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"] == used
+        store.close()
+
+
+def new_plans(count: int = 3) -> list[NewPlan]:
+    plans = [FloorPlan.from_dict(FLAT | {"name": f"Level {number}"}) for number in range(count)]
+    return [NewPlan(plan=plan, level=float(level), original=Original(b"{}")) for level, plan in enumerate(plans)]
+
+
+def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: DatabaseOf) -> None:
+    url = database_of(tmp_path)
+    store = Store(url)
+    database = Database(url)
+    if database.is_postgresql:
+        pytest.skip("the trigger is in SQLite's dialect")
+    with database.writing() as connection:
+        refuse = "BEGIN SELECT RAISE(ABORT, 'no'); END"
+        connection.execute(text(f"CREATE TRIGGER t BEFORE INSERT ON floorplans WHEN NEW.name = 'Level 2' {refuse}"))
+    with pytest.raises(IntegrityError):
+        store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(), max_plans=9, max_venues=9)
+    assert store.plans.list_plans("t", limit=9) == []
+    assert store.venues.list_venues("t", limit=9) == []
+    assert store.quota.account("t").used.total == 0
+    database.close()
+    store.close()
+
+
+def test_attempts_at_the_same_time_store_one_venue(tmp_path: Path, database_of: DatabaseOf) -> None:
+    store, venue_id = Store(database_of(tmp_path)), uuid.uuid4().hex
+
+    def attempt(_number: int) -> tuple[str, int]:
+        venue, records = store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
+        return venue.revision_id, len(records)
+
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(attempt, range(4)))
+    assert len({revision for revision, _ in found}) == 1
+    assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
+    assert len(store.plans.list_plans("t", limit=99)) == 3
+    store.close()

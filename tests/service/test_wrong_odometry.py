@@ -1,0 +1,90 @@
+"""Odometry that photographs contradict is named in answers, with the shipped model."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from lalaloc_core.localise.bundle import default_bundle
+from tests.core.taken import EXAMPLES, sphere
+from tests.service.conftest import StartApp, upload, wait_for
+
+# The robot turns on the spot.
+TURN_DEG = 45.0
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("data")
+    with start_app(folder, bundle=default_bundle(), workers=1, lpo_deadline_s=9.0) as client:
+        wait_for(lambda: client.get("/readyz").json()["lpo_pool"]["ready"] > 0, 120.0)
+        yield client
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    return upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def turning() -> list[bytes]:
+    """Return photographs of a camera that turns clockwise on the spot."""
+    files, pixels = [], sphere("kitchen")
+    for number in range(6):
+        buffer = io.BytesIO()
+        Image.fromarray(np.roll(pixels, -round(number * TURN_DEG / 360.0 * pixels.shape[1]), axis=1)).save(
+            buffer, "JPEG"
+        )
+        files.append(buffer.getvalue())
+    return files
+
+
+def follow(client: httpx.Client, plan_id: str, photos: list[bytes], **motion: Any) -> list[dict[str, Any]]:
+    """Return the poses of photographs with the same stated motion between all of them."""
+    session = client.post("/sessions", json={"floorplan_id": plan_id, "camera_height_m": 1.5}).json()["id"]
+    poses = []
+    for number, photo in enumerate(photos):
+        data = {name: str(value) for name, value in motion.items()} if number else {}
+        answer = client.post(f"/sessions/{session}/photographs", data=data, files={"photo": photo})
+        assert answer.status_code == 200, answer.text
+        poses.append(answer.json()["pose"])
+    return poses
+
+
+def test_right_odometry_is_not_contradicted(shipped: httpx.Client, home: str, turning: list[bytes]) -> None:
+    poses = follow(shipped, home, turning, forward_m=0, turn_deg=TURN_DEG)
+    assert [pose["motion_contradicted"] for pose in poses] == [[]] * len(poses)
+    assert all(pose["probability"] > 0.5 for pose in poses[2:])
+    assert [pose["warnings"] for pose in poses] == [[]] * len(poses)
+
+
+@pytest.mark.parametrize(
+    ("motion", "component"),
+    [
+        ({"forward_m": 0, "turn_deg": -TURN_DEG}, "turn_deg"),
+        ({"forward_m": 2.5, "turn_deg": TURN_DEG}, "forward_m"),
+        ({"forward_m": 0, "right_m": -2.5, "turn_deg": TURN_DEG}, "right_m"),
+    ],
+    ids=["sign of the turn", "slipping wheels", "sideways"],
+)
+def test_wrong_odometry_is_named(
+    shipped: httpx.Client, home: str, turning: list[bytes], motion: dict[str, Any], component: str
+) -> None:
+    poses = follow(shipped, home, turning, **motion)
+    # The photographs are believed.
+    assert {pose["room"] for pose in poses} == {"kitchen"}
+    assert [component in pose["motion_contradicted"] for pose in poses[1:]] == [True] * (len(poses) - 1)
+    stated = (
+        f"{component} is {motion[component]:g}, which the photographs contradict by more than 4 standard deviations"
+    )
+    assert stated in poses[1]["warnings"]
+    assert len(poses[1]["warnings"]) == len(poses[1]["motion_contradicted"])
+    again = f"{component} contradicts at least 3 of the last 8 photographs: check its sign, unit and standard deviation"
+    assert again in poses[-1]["warnings"]

@@ -1,0 +1,119 @@
+"""Photographs that are no full spheres, on the page."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from PIL import ExifTags
+from playwright.sync_api import expect
+
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.taken import jpeg, sphere, take
+from tests.service.conftest import StartApp
+from tests.web.conftest import Visit
+
+
+@pytest.fixture(scope="module")
+def service(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as client:
+        yield client
+
+
+def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    camera = Perspective.of_hfov(640, 480, math.radians(67.3))
+    picture = jpeg(take(sphere("living_room"), camera), {ExifTags.Base.FocalLengthIn35mmFilm: 26})
+    (tmp_path / "phone.jpg").write_bytes(picture)
+    page.locator("#photo-file").set_input_files(tmp_path / "phone.jpg")
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "flat")
+    desktop.find()
+    expect(page.locator("#answer-body .assumed").last).to_contain_text(
+        re.compile(r"Read as an ordinary photograph, 67° ± \d° wide \(from the file\), tilted up by .* \(.+\)\.")
+    )
+    expect(page.locator("#answer-body .advice")).to_contain_text("choose “Taken from one spot, turning”")
+    # The overlay is drawn on the photograph, which the stage contains, and nowhere beside it.
+    beside, on = page.evaluate(
+        """() => { const canvas = document.querySelector('canvas.overlay');
+        const { width, height } = canvas, shown = height * 4 / 3, left = (width - shown) / 2;
+        const pixels = canvas.getContext('2d').getImageData(0, 0, width, height).data;
+        const count = [0, 0];
+        for (let i = 0; i < width * height; i++)
+            if (pixels[4 * i + 3] > 0)
+                count[Number(i % width >= left - 4 && i % width <= left + shown + 4)]++;
+        return count; }"""
+    )
+    assert beside == 0
+    assert on > 100
+    page.locator("#photo-strip button").first.click()
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
+
+
+def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:
+    """Write photographs of a phone that turns on one spot of the example flat."""
+    camera = Perspective.of_hfov(640, 480, math.radians(67.3))
+    paths = [folder / f"turned_{heading_deg:g}.jpg" for heading_deg in headings_deg]
+    for path, heading_deg in zip(paths, headings_deg, strict=True):
+        pixels = take(sphere("living_room"), camera, heading_deg=heading_deg)
+        path.write_bytes(jpeg(pixels, {ExifTags.Base.FocalLengthIn35mmFilm: 26}))
+    return paths
+
+
+def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    for _ in range(4):
+        page.locator("#photo-strip .remove").first.click()
+    expect(page.locator("#together")).to_be_hidden()
+    page.locator("#photo-file").set_input_files(_phone_photographs(tmp_path, [0.0, 60.0, 120.0]))
+    together = page.get_by_role("group", name="These photographs are")
+    together.get_by_label("Taken from one spot, turning").check()
+    expect(page.get_by_role("button", name="Find all")).to_be_hidden()
+    with page.expect_response("**/localise/sequence") as received:
+        desktop.find()
+    assert len(received.value.json()["poses"]) == 3
+    expect(page.locator("#answer-body")).to_contain_text("From 3 photographs together")
+    expect(page.locator(".thumb span", has_text="✓")).to_have_count(3)
+    # The other two photographs are on the plan, and a click shows their answer.
+    expect(page.locator("#plan .companion")).to_have_count(2)
+    page.locator(".thumb").nth(2).click()
+    expect(page.locator("#answer-body")).to_contain_text("From 3 photographs together")
+    page.locator("#copy-curl").click()
+    copied = page.locator("#copied").inner_text()
+    assert "/localise/sequence" in copied
+    assert "motion=turn" in copied
+    assert copied.count("photo=@turned_") == 3
+    # A change for one photograph makes the common answer invalid.
+    page.get_by_text("Heading and hints").click()
+    page.locator("#heading").fill("40")
+    expect(page.locator("#answer")).to_be_hidden()
+    expect(page.locator(".thumb span", has_text="✓")).to_have_count(0)
+    desktop.find()
+    page.locator("#copy-python").click()
+    expect(page.locator("#copied")).to_contain_text("headings_deg=[None,None,40]")
+    together.get_by_label("A walk").check()
+    expect(page.locator("#find")).to_have_text("Find the places")
+
+
+def test_statements_about_the_camera_are_sent(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    (photograph,) = _phone_photographs(tmp_path, [0.0])
+    page.locator("#photo-file").set_input_files(photograph)
+    expect(page.get_by_label("Field of view, °")).to_be_hidden()
+    page.get_by_text("More about this photograph").click()
+    page.get_by_label("Kind").select_option("ordinary photograph")
+    page.get_by_label("Field of view, °").fill("70")
+    page.get_by_label("Tilted up by, °").fill("-3")
+    desktop.find()
+    words = page.locator("#answer-body .assumed").last
+    expect(words).to_contain_text(re.compile(r"70°.* wide \(as entered\), tilted down by 3° ± 1°"))
+    page.get_by_text("Heading and hints").click()
+    page.get_by_label("Field of view, °").fill("400")
+    page.get_by_role("button", name="Find the place").click()
+    expect(page.locator("#photo-error")).to_contain_text("“Field of view”")
+    expect(page.locator("#photo-error")).not_to_contain_text("hfov_deg")
