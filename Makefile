@@ -24,12 +24,14 @@ demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
 	$(BIN)/python -m examples.serve --port $(PORT)
 
-# The core's tests run in two processes with one thread each; the service's tests need an otherwise idle machine. The
-# second half runs even if the first fails.
-test: lint site ## lint, build the site, run the tests
+# Two processes with one thread each; each takes over tests of the other when it has no more of its own. Browsers need an
+# otherwise idle machine, so their tests are last and alone; they run even if others fail.
+ALONE := tests/web
+test: $(STAMP) ## lint, build the site, run the tests
+	$(MAKE) --no-print-directory -j 2 lint site
 	@status=0; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web || status=1; \
-	$(BIN)/python -m pytest tests/service tests/client tests/web || status=1; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ALONE:%=--ignore=%) || status=1; \
+	$(BIN)/python -m pytest $(ALONE) || status=1; \
 	exit $$status
 
 # A new cluster per file, so that files do not share state.
@@ -49,7 +51,7 @@ openapi: $(STAMP) ## write openapi.yaml from the application
 docs: $(STAMP) ## write the generated parts of docs/
 	$(BIN)/python -m scripts.write_docs
 
-neighbours: $(STAMP) ## measure every route beside another tenant, write the table in docs/results.md (about 10 minutes)
+neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 10 minutes)
 	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
 

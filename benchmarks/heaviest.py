@@ -25,7 +25,7 @@ from benchmarks.harness import Answer, Caller, form
 from examples.launch import ROOT
 from examples.truth import read_poses
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import export_plan
+from lalaloc_core.importers import ImportLimits, export_plan
 
 # Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
@@ -265,6 +265,31 @@ def _post_venue(caller: Caller, stored: Stored, _size: int) -> None:
         caller.send("DELETE", f"/venues/{answer.json()['id']}")
 
 
+@cache
+def _levels_body(rooms: int) -> tuple[bytes, str]:
+    """Return a form with a file of rooms on a tenth as many levels, at most as many as are accepted."""
+    levels = min(max(rooms // 10, 1), ImportLimits().max_levels)
+    features = []
+    for number in range(rooms):
+        x = 1.1 * (number // levels)
+        ring = [[x, 0.0], [x + 1.0, 0.0], [x + 1.0, 1.0], [x, 1.0], [x, 0.0]]
+        properties = {"indoor": "room", "level": str(number % levels)}
+        geometry = {"type": "Polygon", "coordinates": [ring]}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    content = _body({"type": "FeatureCollection", "units": "m", "features": features})
+    return form((("ceiling_height_m", "2.5"),), (("file", content),))
+
+
+def _post_levels(caller: Caller, _stored: Stored, size: int) -> None:
+    answer = caller.send("POST", "/venues", *_levels_body(size))
+    if answer.status == 201:
+        path = f"/venues/{answer.json()['id']}"
+        plans = caller.send("GET", f"{path}/plans?limit=500").json()["plans"]
+        caller.send("DELETE", path)
+        for plan in plans:
+            caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
+
+
 def _put_venue(caller: Caller, stored: Stored, _size: int) -> None:
     caller.send("PUT", f"/venues/{stored.venue_id}", _venue(stored.member_ids, f"venue {next(_names)}"))
 
@@ -279,6 +304,17 @@ def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
     answer = caller.send("POST", "/localise", *form(fields, (("panorama", _panorama()),)))
     if answer.status == 200:
         path = f"/answers/{answer.json()['answer_id']}"
+        caller.send("GET", path)
+        caller.send("DELETE", path)
+
+
+def _follow_session(caller: Caller, stored: Stored, _size: int) -> None:
+    answer = caller.send("POST", "/sessions", _body({"floorplan_id": stored.plan_id}))
+    if answer.status == 201:
+        path = f"/sessions/{answer.json()['id']}"
+        sphere = (("projection", "equirectangular"),)
+        for fields in (sphere, (*sphere, ("forward_m", "1"), ("turn_deg", "0"))):
+            caller.send("POST", f"{path}/photographs", *form(fields, (("panorama", _panorama()),)))
         caller.send("GET", path)
         caller.send("DELETE", path)
 
@@ -299,7 +335,7 @@ LOADS = (
             f"{kind}, {VERTICES_PLAN}",
             _get("/floorplans/{floorplan_id}/export", format=kind),
         )
-        for kind in ("native", "geojson", "imdf", "dxf", "svg")
+        for kind in ("native", "geojson", "imdf", "dxf", "svg", "ros")
     ),
     Load(
         ("GET /floorplans/{floorplan_id}/preview.svg",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}/preview.svg")
@@ -317,7 +353,7 @@ LOADS = (
         plan=ROOMS_PLAN,
     ),
     Load(
-        ("GET /floorplans/{floorplan_id}/events",),
+        ("GET /floorplans/{floorplan_id}/events", "POST /floorplans"),
         "64 streams of plans in preparation",
         _follow_events,
         9_600,
@@ -341,6 +377,7 @@ LOADS = (
     Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
     Load(("PUT /floorplans/{floorplan_id}",), ROOMS_PLAN, _put_plan, 10_000),
     Load(("POST /venues", "DELETE /venues/{venue_id}"), "{homes} homes", _post_venue),
+    Load(("POST /venues",), "file of 200 levels × 50 rooms", _post_levels, 10_000),
     Load(("GET /venues",), "pages of 500", _get("/venues", limit=None), 500),
     Load(("GET /venues/{venue_id}",), "{homes} homes", _get("/venues/{venue_id}")),
     Load(("GET /venues/{venue_id}",), "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),
@@ -354,7 +391,12 @@ LOADS = (
     ),
     Load(("POST /localise",), VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
     Load(("POST /localise",), "{homes} homes", _localise(venue_id="{venue}"), connections=16),
-    Load(("POST /localise",), "JPEG of 98 megapixels", _localise(_jpeg, floorplan_id="{plan}"), 98_000),
+    Load(
+        ("POST /localise",),
+        "JPEG of 98 megapixels",
+        _localise(_jpeg, floorplan_id="{plan}", projection="equirectangular"),
+        98_000,
+    ),
     Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(
         ("POST /localise/sequence",),
@@ -362,6 +404,17 @@ LOADS = (
         _sequence(padded=True),
         1_000,
         connections=44,
+    ),
+    Load(
+        (
+            "POST /sessions",
+            "POST /sessions/{session_id}/photographs",
+            "GET /sessions/{session_id}",
+            "DELETE /sessions/{session_id}",
+        ),
+        f"two photographs, {ROOMS_PLAN}",
+        _follow_session,
+        plan=ROOMS_PLAN,
     ),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(

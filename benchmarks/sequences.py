@@ -123,7 +123,7 @@ def main() -> None:
     options = parser.parse_args()
     bundle = Bundle.open(options.bundle)
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
-    model, renderers = bundle.manifest.confidence, split_renderer_cache(SPLIT_NUMBERS["test"], options.seed, None)
+    renderers = split_renderer_cache(SPLIT_NUMBERS["test"], options.seed, None)
     ways = {"alone": None, "distance and turn": False, "distance, turn and direction": True}
     tallies = {name: Tally([], [], [], []) for name in ways}
     index = done = 0
@@ -151,7 +151,7 @@ def main() -> None:
                 ).pictures
             spent_s = (time.perf_counter() - begin) / (1 if directed is not None else len(shots))
             for shot, answer in zip(shots, answers, strict=True):
-                confidence = answer.confidence(model)
+                confidence = answer.confidence(bundle.manifest.confidence_for(view=False))
                 note(tallies[name], shot, answer, None if confidence is None else confidence.position, spent_s)
             far = sum(error >= 1.0 for error in tallies[name].errors_m[-len(shots) :])
             print(f"  walk {done}, {home.plan.area_m2:.0f} m², {name}: {far} of {len(shots)} beyond 1 m", flush=True)

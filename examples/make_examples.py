@@ -1,4 +1,4 @@
-"""Render the example panoramas and write their true poses.
+"""Render the example panoramas and a phone photograph, and write the panoramas' true poses.
 
 Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
 hand, and no training data contains its plan, furniture or lighting.
@@ -15,9 +15,11 @@ from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.homes.plans import Home, Opening, OpeningKind
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.photograph.cameras import Perspective
 
 HEIGHT, WIDTH = 512, 1024
 # Rays per pixel and axis, for smooth edges.
@@ -76,6 +78,15 @@ VIEWS = (
     View(file="study.jpg", position_m=(7.7, 7.6), heading_deg=340.0, camera_height_m=1.4, seed=43),
 )
 
+# A photograph by a phone's 0.5x lens, which its EXIF data name, held by hand.
+PHONE = View(file="phone.jpg", position_m=(2.9, 1.5), heading_deg=335.0, camera_height_m=1.45, seed=15)
+_PHONE_FOCAL_MM = 13
+# Focal lengths of other formats are stated for equal diagonals: 4:3 is 34.6 mm wide where film is 36 by 24.
+_PHONE_HFOV = 2.0 * math.atan(0.5 * 0.8 * math.hypot(36.0, 24.0) / _PHONE_FOCAL_MM)
+_PHONE_PITCH, _PHONE_ROLL = math.radians(-4.0), math.radians(1.5)
+_PHONE_SPHERE, _PHONE_SIZE = (1536, 3072), (1280, 960)
+_EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
+
 
 def main() -> None:
     """Render every view of the flat and write the true poses."""
@@ -87,6 +98,18 @@ def main() -> None:
         Image.fromarray(pixels).save(FOLDER / view.file, quality=_JPEG_QUALITY, optimize=True)
         print(FOLDER / view.file)
     write_poses([true_pose(home.plan, view) for view in VIEWS])
+    _write_phone_photograph(home, materials)
+
+
+def _write_phone_photograph(home: Home, materials: MaterialLibrary) -> None:
+    height, width = _PHONE_SPHERE
+    (sphere,) = PanoramaRenderer(materials, height=height, width=width).render([shot_of(home, PHONE)]).numpy()
+    camera = Perspective.of_hfov(*_PHONE_SIZE, _PHONE_HFOV)
+    pixels = cut_view(sphere, camera, azimuth=0.0, pitch=_PHONE_PITCH, roll=_PHONE_ROLL)
+    exif = Image.Exif()
+    exif.get_ifd(_EXIF_IFD)[_FOCAL_LENGTH_35MM] = _PHONE_FOCAL_MM
+    Image.fromarray(pixels).save(FOLDER / PHONE.file, quality=_JPEG_QUALITY, optimize=True, exif=exif)
+    print(FOLDER / PHONE.file)
 
 
 def example_home() -> Home:
