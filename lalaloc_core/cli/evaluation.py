@@ -107,6 +107,12 @@ def add_commands(commands: Any) -> None:
         help="weight of openings relative to walls, such as one tuned on photographs (default: fitted)",
     )
     calibrate.add_argument(
+        "--tail",
+        type=positive,
+        metavar="FACTOR",
+        help="scale of the errors of walls over the predicted one (default: the bundle's)",
+    )
+    calibrate.add_argument(
         "--keep-evidence", action="store_true", help="keep the bundle's matching weights and fit only confidence"
     )
     calibrate.add_argument(
@@ -320,6 +326,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on predictions made with them.
     weights = bundle.manifest.evidence_for(view=arguments.views)
+    weights = replace(weights, tail=arguments.tail or weights.tail)
     if not arguments.keep_evidence:
         # Views are of the same plans, so they share the appearance that was fitted on spheres.
         appearance = bundle.manifest.evidence.appearance
@@ -329,7 +336,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             scenes = (dataset.load(name) for dataset in datasets for name in dataset.scenes("validation"))
             appearance = fit_appearance(encoders, scenes)
         store_matching_weights(bundle, replace(weights, appearance=appearance), views=arguments.views)
-        default = MatchingWeights(appearance=appearance)
+        default = MatchingWeights(appearance=appearance, tail=weights.tail)
         weights = fit_matching_weights(
             [prediction for heading in (True, False) for prediction in predictions(own, heading, "unweighed")], default
         )

@@ -96,6 +96,7 @@ class MatchingWeights:
 
     Attributes:
         openings, ceiling, room_type: weights in units of the walls'.
+        tail: κ, the scale of errors of walls and ceilings over the predicted one.
         temperature: T, the number of independent azimuths: likelihoods are `exp(-T cost)`.
         appearance: for every opening class of a plan (rows, in the order of `conventions.OPENING_CLASSES`) the
             probabilities of what it looks like (columns); None if every class looks like itself.
@@ -107,6 +108,7 @@ class MatchingWeights:
     openings: float = 0.7
     ceiling: float = 0.05
     room_type: float = 0.05
+    tail: float = 3.0
     temperature: float = 16.0
     appearance: tuple[tuple[float, ...], ...] | None = None
     usual_cost: float = 0.0

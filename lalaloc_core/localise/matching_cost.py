@@ -7,13 +7,13 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
     cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
 
 * **Walls.** The image encoder predicts a log wall profile μ and a scale b for every azimuth w. The term has the heavy
-  tails of a Cauchy distribution: `mean_w log(1 + r_w²)`, with `r_w = (log d_w - μ_w - δ) / (κ s_w)` and
-  `s_w² = b_w² + (reach / exp μ_w)²`. κ is the tail factor, δ the log of true over stated camera height, and `reach` the
-  distance (m) from the camera within which the best of the compared poses lies. At a door or passage the prediction can
-  be of the wall behind it. `1 / (1 + r²)` is then replaced by `min(1, 1 / (1 + r²) + o / (1 + r'²))`, with r' for the
-  wall behind and o for the odds that the prediction is of that wall. Likewise for a model that predicts a second mode,
-  with r' for that mode and o for its odds. Azimuths that the photograph does not show have an infinite b and cost
-  nothing.
+  tails of a Cauchy distribution: `mean_w log(1 + r_w²)`, with `r_w = (log d_w - μ_w - δ) / (κ s_w)` and `s_w² = b_w² +
+  (reach / exp μ_w)²`. κ (`MatchingWeights.tail`) is chosen on validation queries, δ is the log of true over stated
+  camera height, and `reach` the distance (m) from the camera within which the best of the compared poses lies. At a
+  door or passage the prediction can be of the wall behind it. `1 / (1 + r²)` is then replaced by `min(1, 1 / (1 + r²) +
+  o / (1 + r'²))`, with r' for the wall behind and o for the odds that the prediction is of that wall. Likewise for a
+  model that predicts a second mode, with r' for that mode and o for its odds. Azimuths that the photograph does not
+  show have an infinite b and cost nothing.
 * **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))` for the class c_w that the plan shows, with
   `q_w(c) = ε + (1 - ε) sum_s a(s | c) p_w(s) / π(s)`: the predicted probability p of seeing the class s, over its
   frequency π. a is the probability that a class of the plan looks like another (`MatchingWeights.appearance`): an open
@@ -61,7 +61,6 @@ class MatchingConfig:
         use_profile: compare wall profiles if the model predicts them; else latents alone.
         use_openings, use_ceiling, use_room_type, use_see_through: switches of terms that model and plan provide.
         latent_weight: weight of the latent distance in the cost.
-        tail: κ.
         grid_reach: reach of grid poses, in units of the grid's step; cameras are at most 0.7 from the nearest pose.
         fine_reach_m: reach of re-sampled and refined poses.
         open_door, open_passage: probability that the prediction is of the wall behind a door or a passage.
@@ -75,7 +74,6 @@ class MatchingConfig:
     use_room_type: bool = True
     use_see_through: bool = True
     latent_weight: float = 0.0
-    tail: float = 3.0
     grid_reach: float = 0.6
     fine_reach_m: float = 0.07
     open_door: float = 0.05
@@ -146,10 +144,10 @@ class MatchingCost:
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
-        self._first = WallMode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, config.tail, stride)
+        self._first = WallMode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, weights.tail, stride)
         self._rival = None
         if rival is not None:
-            self._rival = WallMode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, config.tail, stride)
+            self._rival = WallMode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, weights.tail, stride)
 
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
@@ -351,4 +349,4 @@ class MatchingCost:
         if predicted is None or not self._config.use_ceiling:
             return np.zeros((len(offset), len(self._plan.rooms)))
         clearance_m = self._plan.ceiling_heights_m[None] - height.height_m * np.exp(offset)[:, None]
-        return ceiling_costs(predicted, clearance_m, offset[:, None], self._config.tail)
+        return ceiling_costs(predicted, clearance_m, offset[:, None], self._weights.tail)

@@ -22,9 +22,9 @@ from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType, Query
 from tests.strategies import seeds
 
-CONFIG = MatchingConfig(tail=2.0)
+CONFIG = MatchingConfig()
 EXACT = CameraHeight(1.5, 0.0)
-WEIGHTS = MatchingWeights(openings=0.5, ceiling=0.25, room_type=0.125, temperature=10.0)
+WEIGHTS = MatchingWeights(openings=0.5, ceiling=0.25, room_type=0.125, tail=2.0, temperature=10.0)
 PRIOR = np.array([0.7, 0.15, 0.1, 0.05])
 PLAN = FloorPlan.from_dict(
     {
@@ -81,13 +81,13 @@ class TestWalls:
 
     def test_reach_lowers_the_precision_most_beside_walls(self) -> None:
         profile = np.log(np.array([[0.3, 1.0, 4.0]])), np.full((1, 3), -3.0)
-        fine, coarse = (precisions(*profile, reach_m, CONFIG.tail)[0] for reach_m in (0.05, 0.3))
+        fine, coarse = (precisions(*profile, reach_m, WEIGHTS.tail)[0] for reach_m in (0.05, 0.3))
         assert (coarse < fine).all()
         assert (np.diff(coarse / fine) > 0.0).all()
 
     def test_precision_is_bounded(self) -> None:
         np.testing.assert_allclose(
-            precisions(np.zeros((1, 4)), np.full((1, 4), -80.0), 0.0, CONFIG.tail), 1.0 / (2.0 * 1e-3)
+            precisions(np.zeros((1, 4)), np.full((1, 4), -80.0), 0.0, WEIGHTS.tail), 1.0 / (2.0 * 1e-3)
         )
 
     def test_opening_fits_the_wall_or_the_room_behind(self) -> None:

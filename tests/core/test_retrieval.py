@@ -170,7 +170,7 @@ class TestRetrieval:
         config = MatchingConfig(latent_weight=0.7)
         profile = present(query.profile)
         residual = np.log(grid.profile_m)[None] - profile.log_m[:, None]
-        precision = precisions(profile.log_m, profile.log_scale, 0.3, config.tail)
+        precision = precisions(profile.log_m, profile.log_scale, 0.3, MatchingWeights.tail)
         costs = np.log1p(np.square(residual * precision[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(present(grid.latents), query.latents)
         best = best_candidates(grid, query, top_k=1, config=config)[0]

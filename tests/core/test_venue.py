@@ -141,7 +141,7 @@ def reference_cost(row: Any, query: Query, hypothesis: int, delta: float) -> flo
     walls = 0.0
     for azimuth in range(AZIMUTHS):
         s = np.hypot(scale[azimuth], reach_m * np.exp(-centre[azimuth]))
-        r = (float(row["log_profile"][azimuth]) - centre[azimuth] - delta) / (CONFIG.tail * s)
+        r = (float(row["log_profile"][azimuth]) - centre[azimuth] - delta) / (WEIGHTS.tail * s)
         walls += np.log1p(r * r) / AZIMUTHS
     # Openings are blurred by the reach at the median distance.
     spread = reach_m / np.exp(np.median(query.profile.log_m[0, ::every]))
@@ -162,7 +162,7 @@ def reference_cost(row: Any, query: Query, hypothesis: int, delta: float) -> flo
         openings += np.log(best / ratio) / AZIMUTHS
     height_m = query.camera_height.height_m * np.exp(delta)
     difference = np.log(float(row["ceiling_m"]) - height_m) - query.ceiling.log_m - delta
-    ceiling = np.log1p((difference / (CONFIG.tail * np.hypot(np.exp(query.ceiling.log_scale), 0.04))) ** 2)
+    ceiling = np.log1p((difference / (WEIGHTS.tail * np.hypot(np.exp(query.ceiling.log_scale), 0.04))) ** 2)
     ratio = floor + (1.0 - floor) * np.exp(query.room_type.log_probability) / query.room_type.prior
     room_type = np.log(ratio[1:].max()) - (np.log(ratio[row["room_type"]]) if row["room_type"] else 0.0)
     cost = walls + 0.6 * WEIGHTS.openings * openings + WEIGHTS.ceiling * ceiling

@@ -63,7 +63,7 @@ class PrototypeCosts:
         self._every = max(1, len(query.roll) // AZIMUTHS)
         self._reach_m = config.grid_reach * STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
-        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, config.tail)[
+        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, weights.tail)[
             :: self._every, self._columns
         ].astype(np.float32)
         self.offsets = _offsets(query)
@@ -122,7 +122,7 @@ class PrototypeCosts:
 
     def _ceilings(self, predicted: PredictedCeiling, ceiling_m: np.ndarray, offset: np.ndarray) -> np.ndarray:
         clearance_m = ceiling_m - self._query.camera_height.height_m * np.exp(offset)
-        return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._config.tail)
+        return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._weights.tail)
 
     def _openings(self, rows: np.ndarray, hypothesis: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the openings' term, by one table entry for every byte."""
