@@ -89,12 +89,12 @@ def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, p
         lines = client.get("/metrics").text.splitlines()
         return sum(float(line.split()[-1]) for line in lines if line.startswith(name))
 
-    before = metric("lalaloc_answers_total")
+    before = metric("lalaloc_localise_answers_total")
     files = [("photo", ("p.jpg", panorama, "image/jpeg"))] * 30
     with client.stream("POST", "/localise/batch", data={"floorplan_id": plan_id}, files=files) as response:
         assert json.loads(next(response.iter_lines()))["index"] == 0
     wait_for(lambda: metric("lalaloc_requests_in_flight") == 0)
-    answered = metric("lalaloc_answers_total") - before
+    answered = metric("lalaloc_localise_answers_total") - before
     assert 1 <= answered < 30
 
 
