@@ -61,9 +61,10 @@ site: $(STAMP) ## build the documentation site into build/site; warnings are err
 client: $(STAMP) ## generate lalaloc_client/blocking from lalaloc_client/asynchronous
 	$(BIN)/python -m scripts.generate_client
 
-web: ## build the web pages from web/ into service/web (needs node and npm)
+web: ## build the web pages from web/ into service/web, and clients/typescript (needs node and npm)
 	cd web && npm ci --no-audit --no-fund && npm run types && npm run check && npm run build
+	cd clients/typescript && npm run build
 
 clean: ## remove .venv and all build products; keep ./data and ./runs
-	rm -rf $(VENV) web/node_modules build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
+	rm -rf $(VENV) web/node_modules clients/typescript/node_modules clients/typescript/dist build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

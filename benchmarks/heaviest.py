@@ -29,7 +29,7 @@ from lalaloc_core.importers import ImportLimits, export_plan
 
 # Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
-# Panoramas of a sequence.
+# Panoramas of a sequence and of a batch.
 _PANORAMAS = 10
 _ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}
 
@@ -247,6 +247,12 @@ def _sequence(*, padded: bool) -> Work:
     return work
 
 
+def _batch(caller: Caller, stored: Stored, _size: int) -> None:
+    # More photographs take longer, but no more at a time.
+    files = _PANORAMAS * (("photo", _panorama()),)
+    caller.send("POST", "/localise/batch", *form((("floorplan_id", stored.plan_id),), files))
+
+
 def _geopose(caller: Caller, stored: Stored, _size: int) -> None:
     privacy = {f"data{name}": [] for name in ("Retention", "AcceptableUse", "SanitizationApplied")}
     privacy["dataSanitizationRequested"] = []
@@ -397,6 +403,7 @@ LOADS = (
         _localise(_jpeg, floorplan_id="{plan}", projection="equirectangular"),
         98_000,
     ),
+    Load(("POST /localise/batch",), f"10 panoramas, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(
         ("POST /localise/sequence",),

@@ -10,6 +10,7 @@ Begin with `asynchronous/client.py`; `make client` generates `blocking/` from it
 """
 
 from lalaloc_client.answers import (
+    BatchAnswer,
     Candidate,
     GeoPoseAnswer,
     Localisation,
@@ -63,6 +64,7 @@ from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOp
 __all__ = [
     "AsyncClient",
     "AsyncTracker",
+    "BatchAnswer",
     "Bounds",
     "Candidate",
     "Client",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from lalaloc_client.errors import problem_from
 from lalaloc_client.model import Position
 
 
@@ -217,6 +219,37 @@ class Localisation:
     posterior: Posterior | None = None
     view: View | None = None
     probability_elsewhere: float | None = None
+
+
+@dataclass(frozen=True)
+class BatchAnswer:
+    """Answer to one photograph of a batch.
+
+    Attributes:
+        index: number of the photograph, from 0.
+        status: HTTP status code of the photograph.
+        name: name of the photograph's file; `photo` for photographs without one.
+        answer: None if the photograph could not be localised.
+        problem: problem document; None if it could.
+        retry_after_s: seconds after which the photograph can be sent again; None if that does not help.
+    """
+
+    index: int
+    status: int
+    name: str | None = None
+    answer: Localisation | None = None
+    problem: Mapping[str, Any] | None = None
+    retry_after_s: int | None = None
+
+    def result(self) -> Localisation:
+        """Return the answer.
+
+        Raises:
+            ProblemError: the photograph could not be localised.
+        """
+        if self.answer is None:
+            raise problem_from(self.problem or {}, self.status)
+        return self.answer
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ Tree of the classes::
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import httpx
 
@@ -126,15 +127,22 @@ def problem_of(response: httpx.Response) -> ProblemError:
         document = json.loads(response.content)
     except ValueError:
         document = None
-    if not isinstance(document, dict):
-        document = {}
     text = response.text.strip()[:_SHOWN_CHARACTERS] or response.reason_phrase
+    return problem_from(
+        document if isinstance(document, dict) else {}, response.status_code, text, response.headers.get("x-request-id")
+    )
+
+
+def problem_from(
+    document: Mapping[str, Any], status: int, text: str = "no detail given", request_id: str | None = None
+) -> ProblemError:
+    """Return the error for a problem document; `text` and `request_id` stand for what it does not state."""
     faults = document.get("errors")
-    return _BY_STATUS.get(response.status_code, ProblemError)(
+    return _BY_STATUS.get(status, ProblemError)(
         str(document.get("type", "about:blank")),
-        response.status_code,
+        status,
         str(document.get("detail", text)),
-        request_id=document.get("request_id") or response.headers.get("x-request-id"),
+        request_id=document.get("request_id") or request_id,
         faults=[
             (str(fault.get("field")), str(fault.get("message")))
             for fault in (faults if isinstance(faults, list) else [])

@@ -33,7 +33,8 @@ PictureFormat = Literal["png", "svg"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
-_JSON, _FILE = "application/json", "application/octet-stream"
+NDJSON = "application/x-ndjson"
+_JSON, _FILE, _PHOTO = "application/json", "application/octet-stream", "photo"
 _JPEG_QUALITY = 95
 # Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
 _IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
@@ -189,7 +190,7 @@ def plan_request(
     if options:
         # The default name of a venue.
         name = os.path.basename(document) if isinstance(document, str | os.PathLike) else "venue"
-        media, content = _form("file", [content], options, file_name=name)
+        media, content = _form("file", [(name, content)], options)
     else:
         media = _JSON if isinstance(document, Mapping) else _FILE
     headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}
@@ -204,8 +205,9 @@ def query_request(
     *,
     params: Mapping[str, str] | None = None,
     accept: str = _JSON,
+    streamed: bool = False,
 ) -> Request:
-    """Return a query; repeating it is safe, as it stores nothing.
+    """Return a query; repeating it is safe, as it stores nothing. Streamed queries state the names of the files.
 
     Raises:
         TypeError: an option is unknown.
@@ -216,8 +218,9 @@ def query_request(
         raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
     if isinstance(rooms := known.get("rooms"), str):
         known["rooms"] = [rooms]
-    media, content = _form("photo", [_picture(photograph) for photograph in photographs], {**values, **known})
-    return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content)
+    files = [(_name(photograph) if streamed else _PHOTO, _picture(photograph)) for photograph in photographs]
+    media, content = _form(_PHOTO, files, {**values, **known})
+    return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content, streamed=streamed)
 
 
 def geopose_request(
@@ -293,20 +296,22 @@ def _safety(if_match: str | None, safety: Safety = Safety.ANY) -> Safety:
     return safety if if_match is None else Safety.UNSENT
 
 
-def _form(
-    name: str, contents: Sequence[bytes], values: Mapping[str, object], *, file_name: str | None = None
-) -> tuple[str, bytes]:
-    """Return media type and content of a form with files, all in the field `name`."""
+def _form(name: str, files: Sequence[tuple[str, bytes]], values: Mapping[str, object]) -> tuple[str, bytes]:
+    """Return media type and content of a form with files, by name and content, all in the field `name`."""
     # Derived from the content, so that the same request has the same bytes.
-    boundary = hashlib.sha256(b"".join(contents)).hexdigest()
+    boundary = hashlib.sha256(b"".join(content for _, content in files)).hexdigest()
     encoded = httpx.Request(
         "POST",
         "http://service/",
         headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
         data=text_values(values),
-        files=[(name, (file_name or name, content, _FILE)) for content in contents],
+        files=[(name, (file_name, content, _FILE)) for file_name, content in files],
     )
     return encoded.headers["content-type"], encoded.read()
+
+
+def _name(photograph: Photograph) -> str:
+    return os.path.basename(photograph) if isinstance(photograph, str | os.PathLike) else _PHOTO
 
 
 def _picture(photograph: Photograph) -> bytes:

@@ -21,6 +21,7 @@ _NAMES = {
     "asynchronous": "blocking",
     "aclose": "close",
     "aclosing": "closing",
+    "aiter_lines": "iter_lines",
     "aiter_sse": "iter_sse",
     "aread": "read",
 }

@@ -155,7 +155,7 @@ class AccessSettings(SettingGroup):
         ge=0,
         le=10**6,
         description="Rate limit per API key and replica, in requests per minute, for keys without a rate of their own; "
-        "an answer to GET counts as one more request per 256 KiB. 0: no limit.",
+        "each photograph of a batch counts as one, and an answer to GET as one more per 256 KiB. 0: no limit.",
     )
     rate_burst: int = Field(
         default=60,
@@ -412,7 +412,13 @@ class PanoramaSettings(SettingGroup):
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Size of a panorama file.")
     max_sequence_panoramas: int = Field(default=10, ge=2, le=20, description="Panoramas per sequence query.")
     max_sequence_bytes: Count = Field(
-        default=100 * 2**20, description="Size of all panorama files of a sequence query."
+        default=100 * 2**20, description="Size of all photographs of a sequence query or a batch."
+    )
+    max_batch_photographs: int = Field(
+        default=100,
+        ge=1,
+        le=1000,
+        description="Photographs of a batch; `LALALOC_MAX_SEQUENCE_BYTES` limits their size.",
     )
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")

@@ -22,7 +22,8 @@ function digest(path) {
 }
 
 // Sorted by name, so that renaming a file changes the digest; with slashes on every system.
-const sources = [...files(join(here, "src")), ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map(
+const client = join(root, "clients", "typescript", "src");
+const sources = [...files(join(here, "src")), ...files(client), ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map(
   (name) => join(here, name))].map((path) => relative(root, path).split(sep).join("/")).sort();
 const sum = createHash("sha256");
 for (const name of sources) sum.update(`${name}\n${digest(join(root, name))}\n`);
@@ -31,7 +32,10 @@ rmSync(out, { recursive: true, force: true });
 mkdirSync(out, { recursive: true });
 await build({
   absWorkingDir: here,
-  entryPoints: ["src/app.ts", "src/sphere.ts", "src/docs.ts", "src/style.css", "src/docs.css"],
+  entryPoints: [
+    ...["app.ts", "sphere.ts", "docs.ts", "style.css", "docs.css"].map((name) => ({ in: `src/${name}`, out: name.replace(/\..*/, "") })),
+    { in: join(client, "index.ts"), out: "client" },
+  ],
   outdir: out,
   bundle: true,
   minify: true,

@@ -12,11 +12,17 @@ from typing import Any, Literal, Unpack
 import httpx
 from httpx_sse import EventSource
 
-from lalaloc_client.answers import GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.tracker import AsyncTracker
 from lalaloc_client.asynchronous.transport import AsyncTransport
-from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
+from lalaloc_client.errors import (
+    ConnectionFailedError,
+    FloorPlanFailedError,
+    MalformedAnswerError,
+    NotFoundError,
+    NotReadyError,
+)
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
@@ -31,6 +37,7 @@ from lalaloc_client.model import (
 )
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
+    NDJSON,
     PICTURE_MEDIA,
     Covariance,
     Document,
@@ -361,6 +368,35 @@ class AsyncClient(AsyncTransport):
         """
         values = {"venue_id": venue_id, "level": level}
         return parse(Localisation, await self.query(query_request, "/localise", [panorama], values, options))
+
+    async def localise_batch(
+        self, floorplan_id: str, panoramas: Sequence[Photograph], **options: Unpack[QueryOptions]
+    ) -> AsyncIterator[BatchAnswer]:
+        """Localise many photographs, each by itself, in a plan; yield their answers in order, as they are computed.
+
+        A photograph that cannot be localised does not stop the others; `BatchAnswer.result` raises its error.
+
+        Args:
+            floorplan_id: id of the plan.
+            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+            **options: see `QueryOptions`; they hold for all photographs.
+
+        Raises:
+            ConnectionFailedError: the connection broke off before the last answer.
+        """
+        values = {"floorplan_id": floorplan_id}
+        async with self._concurrency.hold():
+            request = await run_blocking(
+                query_request, "/localise/batch", panoramas, values, options, accept=NDJSON, streamed=True
+            )
+            async with aclosing(await self._send(request)) as response:
+                try:
+                    async for line in response.aiter_lines():
+                        yield parse(BatchAnswer, line, "line")
+                except httpx.TransportError as error:
+                    raise ConnectionFailedError(
+                        f"POST /localise/batch broke off: {type(error).__name__} {error}".rstrip()
+                    ) from error
 
     async def localise_sequence(
         self,

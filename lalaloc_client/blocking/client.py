@@ -13,11 +13,17 @@ from typing import Any, Literal, Unpack
 import httpx
 from httpx_sse import EventSource
 
-from lalaloc_client.answers import GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.blocking.transport import Transport
-from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
+from lalaloc_client.errors import (
+    ConnectionFailedError,
+    FloorPlanFailedError,
+    MalformedAnswerError,
+    NotFoundError,
+    NotReadyError,
+)
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
@@ -32,6 +38,7 @@ from lalaloc_client.model import (
 )
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
+    NDJSON,
     PICTURE_MEDIA,
     Covariance,
     Document,
@@ -357,6 +364,35 @@ class Client(Transport):
         """
         values = {"venue_id": venue_id, "level": level}
         return parse(Localisation, self.query(query_request, "/localise", [panorama], values, options))
+
+    def localise_batch(
+        self, floorplan_id: str, panoramas: Sequence[Photograph], **options: Unpack[QueryOptions]
+    ) -> Iterator[BatchAnswer]:
+        """Localise many photographs, each by itself, in a plan; yield their answers in order, as they are computed.
+
+        A photograph that cannot be localised does not stop the others; `BatchAnswer.result` raises its error.
+
+        Args:
+            floorplan_id: id of the plan.
+            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+            **options: see `QueryOptions`; they hold for all photographs.
+
+        Raises:
+            ConnectionFailedError: the connection broke off before the last answer.
+        """
+        values = {"floorplan_id": floorplan_id}
+        with self._concurrency.hold():
+            request = run_blocking(
+                query_request, "/localise/batch", panoramas, values, options, accept=NDJSON, streamed=True
+            )
+            with closing(self._send(request)) as response:
+                try:
+                    for line in response.iter_lines():
+                        yield parse(BatchAnswer, line, "line")
+                except httpx.TransportError as error:
+                    raise ConnectionFailedError(
+                        f"POST /localise/batch broke off: {type(error).__name__} {error}".rstrip()
+                    ) from error
 
     def localise_sequence(
         self,

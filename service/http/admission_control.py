@@ -25,7 +25,8 @@ EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 # Errors of every request whose path is not exempt.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
-_QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose"})
+BATCH = "/localise/batch"
+_QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose", BATCH})
 _STREAMS, _PHOTOGRAPHS = "/events", "/photographs"
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
@@ -46,6 +47,11 @@ def is_query(path: str) -> bool:
 def is_stream(method: str, path: str) -> bool:
     """Return True for an event stream."""
     return method in _READING and path.endswith(_STREAMS)
+
+
+def bounds_itself(method: str, path: str) -> bool:
+    """Return True for answers that are sent part by part, and bound the time of each part."""
+    return is_stream(method, path) or path == BATCH
 
 
 class Slots:
@@ -181,7 +187,7 @@ class AdmissionLimits:
         streams: event streams, and WebSockets of sessions.
         tenant_bytes: bytes of bodies in progress per client, for clients without a limit of their own.
         total_bytes: bytes of bodies in progress.
-        deadline_s: timeout of every request except streams; other timeouts normally end a request earlier.
+        deadline_s: timeout of every request except streams and batches; other timeouts normally end a request earlier.
     """
 
     requests: int

@@ -62,9 +62,21 @@ def add_problems(operation: dict[str, Any], *errors: type[Exception]) -> None:
     operation["responses"] = dict(sorted(responses.items()))
 
 
-def problem_answer(request: Request, error: Exception) -> JSONResponse:
-    """Return the problem document of an error."""
+def problem_document(request: Request, error: Exception) -> Problem:
+    """Return the problem document of an error, and note its kind for the request's log line."""
     kind = problem_kind(error)
+    return _document(
+        request,
+        kind,
+        str(error) if kind.public else _HIDDEN,
+        room=error.room if isinstance(error, InvalidFloorPlanError) else None,
+        levels=list(error.levels) if isinstance(error, SeveralLevelsError) else None,
+        faults=error.faults if isinstance(error, InvalidRequestError) else None,
+    )
+
+
+def problem_answer(request: Request, error: Exception) -> JSONResponse:
+    """Return the answer to a request that failed: the problem document of an error."""
     headers = {}
     if isinstance(error, ServiceError) and error.retry_after_s is not None:
         headers["Retry-After"] = str(error.retry_after_s)
@@ -74,15 +86,7 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
         headers["Accept-Encoding"] = "identity"
     elif isinstance(error, UnsupportedMediaError):
         headers["Accept-Post"] = ", ".join(error.accepted)
-    return _answer(
-        request,
-        kind,
-        str(error) if kind.public else _HIDDEN,
-        headers=headers,
-        room=error.room if isinstance(error, InvalidFloorPlanError) else None,
-        levels=list(error.levels) if isinstance(error, SeveralLevelsError) else None,
-        faults=error.faults if isinstance(error, InvalidRequestError) else None,
-    )
+    return _answer(problem_document(request, error), headers)
 
 
 def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
@@ -94,7 +98,7 @@ def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
     # The framework lists the methods of the first matching route; the path can have more routes.
     if error.status_code == 405 and (methods := [*permissions_needed(routed_path(request.scope))]):
         headers["Allow"] = ", ".join([*methods, *(["HEAD"] if "GET" in methods else [])])
-    return _answer(request, kind, detail, headers=headers)
+    return _answer(_document(request, kind, detail), headers)
 
 
 def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:
@@ -103,22 +107,21 @@ def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:
 
 
 def _on_unexpected_error(request: Request, _error: Exception) -> JSONResponse:
-    return _answer(request, INTERNAL, _HIDDEN)
+    return _answer(_document(request, INTERNAL, _HIDDEN))
 
 
-def _answer(
+def _document(
     request: Request,
     kind: ProblemKind,
     detail: str,
     *,
-    headers: dict[str, str] | None = None,
     room: str | None = None,
     levels: list[str] | None = None,
     faults: list[tuple[str, str]] | None = None,
-) -> JSONResponse:
+) -> Problem:
     if kind is not INTERNAL:
         add_log_fields(request, rejection=kind.slug)
-    problem = Problem(
+    return Problem(
         type=kind.type,
         title=kind.title,
         status=kind.status,
@@ -128,7 +131,10 @@ def _answer(
         levels=levels,
         errors=None if faults is None else [Fault(field=field, message=message) for field, message in faults],
     )
-    return _ProblemResponse(problem.model_dump(exclude_none=True), status_code=kind.status, headers=headers)
+
+
+def _answer(problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
+    return _ProblemResponse(problem.model_dump(exclude_none=True), status_code=problem.status, headers=headers)
 
 
 class _ProblemResponse(JSONResponse):

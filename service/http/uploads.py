@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from tempfile import SpooledTemporaryFile, TemporaryFile
 from time import monotonic
 from types import MappingProxyType
-from typing import Literal, Self, TypeVar
+from typing import Literal, NamedTuple, Self, TypeVar
 
 from fastapi import Request
 from pydantic import BaseModel, ValidationError
@@ -41,6 +41,8 @@ MULTIPART = "multipart/form-data"
 _ENVELOPE_BYTES = 16 * 1024
 _MAX_PARTS = 20
 _MAX_FIELD_BYTES = 4096
+# Beginning of the parser's message about more files than it was allowed to read.
+_TOO_MANY_FILES = "Too many files"
 _UTF_8 = b"utf-8"
 
 # Settings that limit an upload.
@@ -79,6 +81,18 @@ class UploadLimits:
             bytes_per_s=settings.uploads.bytes_per_s,
             memory_bytes=settings.uploads.memory_bytes,
         )
+
+
+class Repeats(NamedTuple):
+    """Smallest and largest number of files of one name, and the setting of the largest."""
+
+    least: int
+    most: int
+    setting: str
+
+    def fault(self, count: str) -> str:
+        """Return the message about a wrong number of files."""
+        return f"is given {count} times, {self.least} to {self.most} are needed (LALALOC_{self.setting.upper()})"
 
 
 @dataclass(frozen=True)
@@ -141,7 +155,7 @@ async def read_parts(
     files: set[str],
     fields: set[str],
     check: Check = _no_fields,
-    repeated: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+    repeated: Mapping[str, Repeats] = MappingProxyType({}),
     aliases: Mapping[str, str] = MappingProxyType({}),
 ) -> Parts:
     """Read a multipart body.
@@ -152,7 +166,7 @@ async def read_parts(
         files: names of required files.
         fields: names of optional fields.
         check: returns (field, message) for invalid values of fields.
-        repeated: files that can be repeated, with the smallest and largest number of them.
+        repeated: files that can be repeated.
         aliases: other names of files, and the names under which they are returned.
 
     Raises:
@@ -168,7 +182,8 @@ async def read_parts(
     parser = MultiPartParser(
         request.headers,
         _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES),
-        max_files=_MAX_PARTS,
+        # One more than allowed, so that the error states the limit.
+        max_files=max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS,
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
     )
@@ -178,6 +193,9 @@ async def read_parts(
             async with _in_time(limits):
                 form = await parser.parse()
     except MultiPartException as error:
+        if repeated and error.message.startswith(_TOO_MANY_FILES):
+            faults = [(name, repeats.fault(f"more than {repeats.most}")) for name, repeats in repeated.items()]
+            raise InvalidRequestError(faults) from error
         raise MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
@@ -218,7 +236,7 @@ def _sort(
     files: set[str],
     fields: set[str],
     check: Check,
-    repeated: Mapping[str, tuple[int, int]],
+    repeated: Mapping[str, Repeats],
 ) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
@@ -247,9 +265,9 @@ def _sort(
             faults.append((label, "must be a file (a part with a file name)"))
     given = {name for name, _ in items}
     faults.extend((name, "is missing") for name in sorted(files - given))
-    for name, (low, high) in repeated.items():
-        if name in given and not low <= counts[name] <= high:
-            faults.append((name, f"is given {counts[name]} times, {low} to {high} are needed"))
+    for name, repeats in repeated.items():
+        if name in given and not repeats.least <= counts[name] <= repeats.most:
+            faults.append((name, repeats.fault(str(counts[name]))))
     faults.extend(check(found.fields))
     if faults:
         raise InvalidRequestError(faults)

@@ -149,26 +149,26 @@ async def _response(answer: LocaliseAnswer, media: str, tenant: str, runtime: Ru
         UnanchoredPlanError: GeoJSON is requested, and neither the plan nor the venue has an anchor.
     """
     if media != GEOJSON:
-        return Response(await _text(answer, tenant, runtime), headers=_VARY, media_type=JSON)
+        kept = await kept_answer(answer, tenant, runtime)
+        return Response(kept.model_dump_json(), headers=_VARY, media_type=JSON)
     feature = geojson_feature(answer)
     if feature is None:
         raise UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
     return Response(json.dumps(feature), headers=_VARY, media_type=GEOJSON)
 
 
-async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
-    """Return an answer as JSON; store it under an id first if `keep_answers_s` is set."""
+async def kept_answer(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> LocaliseAnswer:
+    """Store an answer if `keep_answers_s` is set; return it with its id."""
     if runtime.settings.storage.keep_answers_s == 0.0:
-        return answer.model_dump_json()
-    texts = {"": answer.model_dump_json()}
+        return answer
 
     def with_id(answer_id: str) -> str:
-        texts[answer_id] = answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
-        return texts[answer_id]
+        return answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
 
     keep = partial(runtime.store.answers.add, limit=runtime.settings.storage.max_kept_answers)
     try:
-        return texts[await runtime.reads.run(tenant, keep, tenant, answer.floorplan_id, with_id) or ""]
+        answer_id = await runtime.reads.run(tenant, keep, tenant, answer.floorplan_id, with_id)
     except (StoreUnavailableError, StorageQuotaError):
         # The answer is valid although it could not be kept.
-        return texts[""]
+        return answer
+    return answer.model_copy(update={"answer_id": answer_id})

@@ -12,7 +12,7 @@ from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLa
 from service.http import IdempotentRequest
 from service.http.accept import preferred
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, media_type
+from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, Repeats, media_type
 from service.query import SequenceQuery
 from service.query.geopose import geojson_features
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query
@@ -57,7 +57,8 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     check_idempotent_media(request, media)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
     media_type(request, (MULTIPART,))
-    repeated = {PHOTO: (_MIN_PHOTOGRAPHS, settings.panoramas.max_sequence_panoramas)}
+    most = settings.panoramas.max_sequence_panoramas
+    repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_panoramas")}
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )

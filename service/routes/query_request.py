@@ -31,7 +31,17 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
-from service.http.uploads import JSON, MULTIPART, Parts, Settable, UploadLimits, faults_of, read_parts, validate_fields
+from service.http.uploads import (
+    JSON,
+    MULTIPART,
+    Parts,
+    Repeats,
+    Settable,
+    UploadLimits,
+    faults_of,
+    read_parts,
+    validate_fields,
+)
 from service.query import QueryContext
 from service.routes.dependencies import IDEMPOTENCY_KEY
 from service.schemas import LocaliseForm, PhotographForm, SequenceForm
@@ -98,7 +108,7 @@ async def read_query(
     limit: Settable,
     *,
     files: Collection[str] = (),
-    repeated: Mapping[str, tuple[int, int]] | None = None,
+    repeated: Mapping[str, Repeats] | None = None,
 ) -> tuple[Form, Parts, QueryContext]:
     """Read the form of a query and start the clock of its deadline.
 

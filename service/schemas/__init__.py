@@ -21,6 +21,7 @@ Begin with `localise_answer.py`.
 
 from service.schemas.fields import ResponseModel
 from service.schemas.localise_answer import (
+    BatchLine,
     CandidateAnswer,
     GeoPose,
     GeoPoseAngles,
@@ -93,6 +94,7 @@ from service.schemas.venues import (
 )
 
 __all__ = [
+    "BatchLine",
     "BoundsAnswer",
     "BytesInFlightAnswer",
     "CandidateAnswer",

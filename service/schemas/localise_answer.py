@@ -19,6 +19,7 @@ from service.schemas.fields import (
 )
 from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import ViewAnswer
+from service.schemas.problem_details import Problem
 
 
 class GeoPosePosition(ResponseModel):
@@ -191,3 +192,16 @@ class LocaliseAnswer(ResponseModel):
     )
     timings_ms: TimingsAnswer
     model: ModelAnswer
+
+
+class BatchLine(ResponseModel):
+    """Line of the answer to a batch: the answer to one photograph, or a problem."""
+
+    index: int = Field(description="Number of the photograph in the request, from 0.")
+    name: str | None = Field(None, description="File name of the photograph in the request.")
+    status: int = Field(description="HTTP status that `POST /localise` would answer with.")
+    answer: LocaliseAnswer | None = Field(None, description="Null if `status` is not 200.")
+    problem: Problem | None = Field(None, description="Null if `status` is 200.")
+    retry_after_s: int | None = Field(
+        None, description="Seconds after which the photograph can be sent again; null if that does not help."
+    )

@@ -89,6 +89,15 @@ class AccessControl:
         if caller.key is not None:
             await self._rates.charge(caller.key, sent_bytes)
 
+    async def count_photographs(self, caller: Caller, photographs: int) -> None:
+        """Count each photograph of a request against the rate limit of its caller's key.
+
+        Raises:
+            RateLimitedError, InvalidRequestError: see `RateLimits.count_photographs`.
+        """
+        if caller.key is not None:
+            await self._rates.count_photographs(caller.key, photographs)
+
     async def still_authorised(self, request: Request) -> bool:
         """Return True while the key of an accepted request is valid, or keys are off."""
         presented = parse_authorization(Headers(scope=request.scope).getlist("authorization"))

@@ -57,6 +57,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/answers/{answer_id}"): Permission.READ,
     ("DELETE", "/answers/{answer_id}"): Permission.LOCALISE,
     ("POST", "/localise"): Permission.LOCALISE,
+    ("POST", "/localise/batch"): Permission.LOCALISE,
     ("POST", "/localise/sequence"): Permission.LOCALISE,
     ("POST", "/geopose"): Permission.LOCALISE,
     ("POST", "/sessions"): Permission.LOCALISE,

@@ -9,7 +9,7 @@ from limits import RateLimitItem, RateLimitItemPerMinute, RateLimitItemPerSecond
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
 
-from service.errors import RateLimitedError, TooManyRefusedKeysError
+from service.errors import InvalidRequestError, RateLimitedError, TooManyRefusedKeysError
 from service.security.permissions import network_of
 from service.settings import Settings
 from service.storage.records import ApiKey
@@ -43,6 +43,21 @@ class RateLimits:
         if (limit := self._limit_of(key)) is not None:
             await self._count(limit, key.id, "minute")
 
+    async def count_photographs(self, key: ApiKey, photographs: int) -> None:
+        """Count each photograph of a request, which was counted once, as a request; all of them or none.
+
+        Raises:
+            RateLimitedError: they exceed the limit per minute now.
+            InvalidRequestError: they always exceed it.
+        """
+        limit = self._limit_of(key)
+        if limit is None or photographs <= 1:
+            return
+        if photographs > limit.amount:
+            fault = f"is given {photographs} times; the rate limit of the key is {limit.amount} per minute: send fewer"
+            raise InvalidRequestError([("photo", fault)])
+        await self._count(limit, key.id, "minute", cost=photographs - 1)
+
     async def charge(self, key: ApiKey, sent_bytes: int) -> None:
         """Count an answer as one more request per `BYTES_PER_REQUEST`, up to the limit."""
         more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(key)
@@ -72,8 +87,8 @@ class RateLimits:
         per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
         return RateLimitItemPerMinute(per_minute, namespace="rate") if per_minute else None
 
-    async def _count(self, limit: RateLimitItem, key_id: str, period: str) -> None:
-        if not await self._limiter.hit(limit, key_id):
+    async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
+        if not await self._limiter.hit(limit, key_id, cost=cost):
             raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
 
     async def _too_many_refused(self, client: str) -> TooManyRefusedKeysError:

@@ -236,3 +236,20 @@ def test_options_are_sent(service: Any, panorama: bytes) -> None:
         service.localise(plan_id, panorama, near={"x_m": float("inf"), "y_m": 0.0}, radius_m=1.0)
     with pytest.raises(TypeError, match="unknown options: headng_deg"):
         service.localise(plan_id, panorama, headng_deg=90.0)
+
+
+def test_batch_yields_an_answer_per_photograph(service: Any, panorama: bytes, tmp_path: Path) -> None:
+    (tmp_path / "hall.jpg").write_bytes(panorama)
+    plan = service.wait_until_ready(service.upload_floorplan(FLAT).id, timeout_s=60.0)
+    answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", panorama], refine="none"))
+    assert [(answer.index, answer.name, answer.status) for answer in answers] == [
+        (0, "hall.jpg", 200),
+        (1, "photo", 422),
+        (2, "photo", 200),
+    ]
+    assert answers[0].result().floorplan_id == plan.id
+    with pytest.raises(InvalidError) as caught:
+        answers[1].result()
+    assert caught.value.type == "urn:lalaloc:problem:invalid-panorama"
+    with pytest.raises(NotFoundError):
+        list(service.localise_batch("f" * 32, [panorama]))

@@ -128,7 +128,7 @@ class Guarded:
             body = {"files": {"photo": picture}} if method == "POST" else {}
         elif path == "/sessions":
             body = {"json": {PLAN: plan_id}}
-        elif path == "/localise":
+        elif path in ("/localise", "/localise/batch"):
             body = form
         elif path == "/geopose":
             venue = {"plans": [{"floorplan_id": plan_id}], "anchor": {"latitude": 48.0, "longitude": 11.0}}

@@ -18,7 +18,8 @@ def _digest(path: Path) -> str:
 
 def _sources() -> str:
     """Return the digest of the sources, as in `web/build.mjs`."""
-    paths = [path for path in (WEB / "src").rglob("*") if path.is_file()]
+    folders = (WEB / "src", ROOT / "clients" / "typescript" / "src")
+    paths = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
     paths += [WEB / name for name in ("build.mjs", "package.json", "package-lock.json", "tsconfig.json")]
     lines = sorted((path.relative_to(ROOT).as_posix(), _digest(path)) for path in paths)
     return hashlib.sha256("".join(f"{name}\n{digest}\n" for name, digest in lines).encode()).hexdigest()

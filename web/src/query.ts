@@ -11,7 +11,7 @@ export async function askSingle(place: Venue | Plan, photo: Photo, signal: Abort
   const fields: Record<string, string> = isVenue ? { venue_id: place.id, ...photo.settings } :
     { floorplan_id: place.id, ...hintFields(photo.hints), ...photo.settings };
   photo.asked = { fields, files: [photo.file] };
-  const answer = await api.localise(isVenue ? fields : { ...fields, include: "posterior" }, photo.file, signal);
+  const answer = await api.localise(isVenue ? fields : { ...fields, include: "posterior" }, photo.file, { signal });
   if (!signal.aborted) photo.answer = answer;
 }
 
@@ -25,7 +25,7 @@ export async function askTogether(plan: Plan, { motion, photos }: Group, signal:
     if (tolerance !== undefined) fields.heading_tolerance_deg = tolerance;
   }
   const files = photos.map(({ file }) => file);
-  const found = await api.localiseSequence(fields, files, signal);
+  const found = await api.localiseSequence(fields, files, { signal });
   if (signal.aborted) return;
   photos.forEach((photo, index) => {
     photo.asked = { fields, files };

@@ -1,8 +1,6 @@
-/** Types of the API, which `npm run types` generates from openapi.yaml, and of the page. Units are in the names. */
+/** Types of the API, which the client generates from openapi.yaml, and of the page. Units are in the names. */
 
-import type { components } from "../generated/api";
-
-type Schemas = components["schemas"];
+import type { Schemas } from "../../clients/typescript/src/index";
 
 export type Point = [number, number];
 export type RoomDocument = Schemas["RoomDocument"];
@@ -27,8 +25,7 @@ export type ViewAnswer = Schemas["ViewAnswer"];
 export type Problem = Schemas["Problem"];
 export type Fault = Schemas["Fault"];
 
-/** A stored plan; `etag` is the entity tag of its revision, for `If-Match`. */
-export type Plan = Schemas["FloorPlanAnswer"] & { etag: string };
+export type { Plan } from "../../clients/typescript/src/index";
 
 export interface Pose {
   x_m: number;

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.http.admission_control import EXEMPT, Admission, is_query, is_read, is_stream
+from service.http.admission_control import EXEMPT, Admission, bounds_itself, is_query, is_read
 from service.http.bytes_in_flight import BodyBudget
 from service.http.problems import problem_answer
 from service.http.request_end import ending_request
@@ -59,7 +59,7 @@ class AdmissionMiddleware:
         body = BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
         rests = _Rests(admission.cpu_accounts, client, query=is_query(path))
         connection = _Connection(receive, send, body, rests)
-        limit_s = None if is_stream(scope["method"], path) else admission.limits.deadline_s
+        limit_s = None if bounds_itself(scope["method"], path) else admission.limits.deadline_s
         try:
             async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client, rests) as permit:
                 connection.on_answer = permit.end

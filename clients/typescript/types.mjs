@@ -1,10 +1,10 @@
-// Generates generated/api.d.ts, the types of the API, from openapi.yaml.
+// Generates generated/api.ts, the types of the API, from openapi.yaml.
 import { mkdirSync, writeFileSync } from "node:fs";
 
 import openapiTS, { astToString, transformSchemaObject } from "openapi-typescript";
 import ts from "typescript";
 
-const nodes = await openapiTS(new URL("../openapi.yaml", import.meta.url), {
+const nodes = await openapiTS(new URL("../../openapi.yaml", import.meta.url), {
   defaultNonNullable: false,
   // Arrays of fixed length are tuples: points, lines, matrices.
   transform(schema, options) {
@@ -14,4 +14,4 @@ const nodes = await openapiTS(new URL("../openapi.yaml", import.meta.url), {
   },
 });
 mkdirSync(new URL("generated", import.meta.url), { recursive: true });
-writeFileSync(new URL("generated/api.d.ts", import.meta.url), astToString(nodes));
+writeFileSync(new URL("generated/api.ts", import.meta.url), astToString(nodes));

@@ -1,0 +1,165 @@
+/** Client of the LaLaLoc service for browsers and Node. Units are in the names; headings are degrees. */
+
+import type { components, operations } from "../generated/api.js";
+import { ServiceError } from "./errors.js";
+import { linesOf, pause, upload } from "./transport.js";
+
+export { ServiceError } from "./errors.js";
+/** Schemas of the API by name. */
+export type Schemas = components["schemas"];
+/** A stored plan; `etag` is the entity tag of its revision, for `replacePlan`. */
+export type Plan = Schemas["FloorPlanAnswer"] & { etag: string };
+type Text = Readonly<Record<string, string>>;
+type Form<Name extends keyof operations> = operations[Name] extends
+  { requestBody?: { content: { "multipart/form-data": infer Body } } } ? Partial<Omit<Body, "photo" | "panorama" | "file">> : never;
+/** Fields of a form; lists and objects are sent as JSON, undefined and null are left out. */
+export type Fields<Name extends keyof operations> = Form<Name> | Text;
+
+export interface ClientOptions {
+  /** Address of the service. Default: the server of the page. */
+  baseUrl?: string;
+  /** API key, or a function that returns the current one. */
+  apiKey?: string | (() => string | null);
+  /** Timeout of each attempt, its answer included. Default: 120 s. */
+  timeoutMs?: number;
+  /** Attempts of a request that is answered 429 or 503, the first included. Default: 4. */
+  attempts?: number;
+  /** Time after which no further attempt begins. Default: 60 s. */
+  retryMs?: number;
+  /** Called after 401; the request is sent again with the current key if it returns true. */
+  onUnauthenticated?: () => Promise<boolean>;
+}
+
+export interface CallOptions {
+  signal?: AbortSignal | null;
+  /** Overrides the client's; 0: no timeout. */
+  timeoutMs?: number;
+  /** Called as the upload proceeds, in browsers. */
+  onProgress?: (sentBytes: number, totalBytes: number) => void;
+}
+
+/** Connection to a service. Every method throws `ServiceError`, or the reason of an aborted `signal`. */
+export class Client {
+  constructor(private readonly options: ClientOptions = {}) {}
+
+  /** Send a request, again after 429 and 503 as the options allow; return an answer of success. */
+  async request(path: string, init: RequestInit & CallOptions = {}): Promise<Response> {
+    const begin = Date.now();
+    for (let attempt = 1; ;) {
+      const sent = this.key();
+      const response = await this.send(path, init, sent);
+      if (response.ok || response.status === 304) return response;
+      const failure = await ServiceError.of(response);
+      if (response.status === 401 && (await this.hasNewKey(sent))) continue;
+      const waitMs = this.waitMs(failure, attempt++, Date.now() - begin);
+      if (waitMs === null) throw failure;
+      await pause(waitMs, init.signal);
+    }
+  }
+
+  /** Send a request and return the JSON of its answer. */
+  async json<T>(path: string, init?: RequestInit & CallOptions): Promise<T> {
+    return (await this.request(path, init)).json();
+  }
+
+  plans = (name = "", cursor: string | null = null) => this.json<Schemas["FloorPlanList"]>(`/floorplans?${page(name, cursor)}`);
+  plan = async (id: string, revision?: string) => planOf(await this.request(of("floorplans", id, revisionQuery(revision))));
+  layout = (id: string, revision?: string) =>
+    this.json<Schemas["LayoutAnswer"]>(of("floorplans", id, `/layout${revisionQuery(revision)}`));
+  createPlan = async (plan: Schemas["FloorPlanDocument"]) => planOf(await this.request("/floorplans", json("POST", plan)));
+  /** Upload a plan as a file; `fields` are import options. */
+  uploadPlan = async (file: Blob, fields: Text = {}, options: CallOptions = {}) =>
+    planOf(await this.request("/floorplans", { ...options, ...form(fields, "file", file) }));
+  /** Store a new revision; fails with 412 if `etag` is not that of the latest one. */
+  replacePlan = async (id: string, plan: Schemas["FloorPlanDocument"], etag: string) =>
+    planOf(await this.request(of("floorplans", id), json("PUT", plan, { "If-Match": etag })));
+  deletePlan = (id: string) => this.delete(of("floorplans", id));
+  /** Return the uploaded file of a plan's current revision. */
+  original = async (id: string) => (await this.request(of("floorplans", id, "/original"))).blob();
+  localise = (fields: Fields<"localise">, photo: Blob, options: CallOptions = {}) =>
+    this.json<Schemas["LocaliseAnswer"]>("/localise", { ...options, ...form(fields, "photo", photo) });
+  /** Localise photographs of one visit, in the order in which they were taken. */
+  localiseSequence = (fields: Fields<"localiseSequence">, photos: Blob[], options: CallOptions = {}) =>
+    this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...form(fields, "photo", ...photos) });
+  /** Localise many photographs, each by itself; yield a line for each, in order, as they are computed. */
+  async *localiseBatch(fields: Fields<"localiseBatch">, photos: Blob[], options: CallOptions = {}): AsyncGenerator<Schemas["BatchLine"]> {
+    // XMLHttpRequest would return all lines at the end.
+    const init = { timeoutMs: 0, ...options, onProgress: undefined, ...form(fields, "photo", ...photos) };
+    for await (const line of linesOf(await this.request("/localise/batch", init))) yield JSON.parse(line);
+  }
+  /** Return the answer to a query as a picture: the photograph with the layout, and the plan with the place. */
+  picture = async ({ include: _, ...fields }: Fields<"localise">, photo: Blob, options: CallOptions = {}) =>
+    (await this.request("/localise", { ...options, ...form(fields, "photo", photo), headers: { Accept: "image/png" } })).blob();
+  answer = (id: string) => this.json<Schemas["LocaliseAnswer"]>(of("answers", id));
+  /** Begin a session, which follows one camera. */
+  createSession = (session: Schemas["SessionDocument"]) => this.json<Schemas["SessionAnswer"]>("/sessions", json("POST", session));
+  session = (id: string) => this.json<Schemas["SessionAnswer"]>(of("sessions", id));
+  /** Send the next photograph of a session, with the motion since the one before. */
+  addPhotograph = (id: string, fields: Fields<"addPhotograph">, photo: Blob, options: CallOptions = {}) =>
+    this.json<Schemas["SessionAnswer"]>(of("sessions", id, "/photographs"), { ...options, ...form(fields, "photo", photo) });
+  deleteSession = (id: string) => this.delete(of("sessions", id));
+  venues = (name = "", cursor: string | null = null) => this.json<Schemas["VenueList"]>(`/venues?${page(name, cursor)}`);
+  venue = (id: string) => this.json<Schemas["VenueSummary"]>(of("venues", id));
+  /** Return the first page of a venue's plans, from the lowest level up. */
+  venuePlans = (id: string) => this.json<Schemas["VenuePlanList"]>(of("venues", id, "/plans?limit=500"));
+  createVenue = (name: string, plans: Schemas["VenuePlanDocument"][]) =>
+    this.json<Schemas["VenueSummary"]>("/venues", json("POST", { name, plans }));
+  /** Upload a file with several levels: each becomes a plan, and all of them a venue. */
+  uploadLevels = (file: Blob, fields: Text = {}, options: CallOptions = {}) =>
+    this.json<Schemas["VenueSummary"]>("/venues", { ...options, ...form(fields, "file", file) });
+
+  private delete = async (path: string): Promise<void> => void (await this.request(path, { method: "DELETE" }));
+
+  private key = (): string | null => (typeof this.options.apiKey === "function" ? this.options.apiKey() : this.options.apiKey ?? null);
+
+  private async hasNewKey(sent: string | null): Promise<boolean> {
+    const ask = this.options.onUnauthenticated;
+    return ask !== undefined && ((this.key() !== null && this.key() !== sent) || ask());
+  }
+
+  private async send(path: string, init: RequestInit & CallOptions, key: string | null): Promise<Response> {
+    const { timeoutMs = this.options.timeoutMs ?? 120_000, onProgress, signal, ...rest } = init;
+    const headers = new Headers(rest.headers);
+    if (key !== null) headers.set("Authorization", `Bearer ${key}`);
+    const signals = [...(signal ? [signal] : []), ...(timeoutMs > 0 ? [AbortSignal.timeout(timeoutMs)] : [])];
+    const request = { ...rest, headers, signal: AbortSignal.any(signals) };
+    const url = (this.options.baseUrl ?? "").replace(/\/$/, "") + path;
+    try {
+      return await (onProgress && typeof XMLHttpRequest !== "undefined" ? upload(url, request, onProgress) : fetch(url, request));
+    } catch {
+      signal?.throwIfAborted();
+      if (request.signal.aborted) throw new ServiceError(0, "The service took too long", `The limit is ${timeoutMs / 1000} s.`);
+      throw new ServiceError(0, "The service does not answer", "Check that it is running and that the network works, then try again.");
+    }
+  }
+
+  /** Return the time until the next attempt; null if there is none. */
+  private waitMs({ status, retryAfterS }: ServiceError, attempt: number, spentMs: number): number | null {
+    const { attempts = 4, retryMs = 60_000 } = this.options;
+    if ((status !== 429 && status !== 503) || attempt >= attempts) return null;
+    // Clients that failed together are spread.
+    const waitMs = (retryAfterS === null ? 250 * 2 ** attempt : 1000 * retryAfterS) + 250 * Math.random();
+    return spentMs + waitMs <= retryMs ? waitMs : null;
+  }
+}
+
+const of = (collection: string, id: string, rest = ""): string => `/${collection}/${encodeURIComponent(id)}${rest}`;
+const revisionQuery = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
+const page = (name: string, cursor: string | null) => new URLSearchParams({ limit: "50", ...(name && { name }), ...(cursor && { cursor }) });
+
+async function planOf(response: Response): Promise<Plan> {
+  return { ...(await response.json()), etag: response.headers.get("etag") ?? "" };
+}
+
+function json(method: string, document: unknown, headers: Text = {}): RequestInit {
+  return { method, headers: { "Content-Type": "application/json", ...headers }, body: JSON.stringify(document) };
+}
+
+function form(fields: object, name: string, ...files: Blob[]): { method: string; body: FormData } {
+  const body = new FormData();
+  for (const [field, value] of Object.entries(fields)) {
+    if (value !== undefined && value !== null) body.set(field, typeof value === "object" ? JSON.stringify(value) : String(value));
+  }
+  for (const file of files) body.append(name, file);
+  return { method: "POST", body };
+}

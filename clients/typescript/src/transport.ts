@@ -1,0 +1,48 @@
+/** Wait; throw the reason of an abort meanwhile. */
+export function pause(ms: number, signal?: AbortSignal | null): Promise<void> {
+  return new Promise((resolve, reject) => {
+    signal?.throwIfAborted();
+    setTimeout(resolve, ms);
+    signal?.addEventListener("abort", () => reject(signal.reason), { once: true });
+  });
+}
+
+/** Send a request with XMLHttpRequest, which reports the progress of the upload, as fetch does not. */
+export function upload(
+  url: string, { method, headers, body, signal }: RequestInit & { headers: Headers; signal: AbortSignal },
+  onProgress: (sentBytes: number, totalBytes: number) => void,
+): Promise<Response> {
+  return new Promise((resolve, reject) => {
+    signal.throwIfAborted();
+    const sending = new XMLHttpRequest();
+    sending.open(method ?? "GET", url);
+    sending.responseType = "blob";
+    headers.forEach((value, name) => sending.setRequestHeader(name, value));
+    sending.upload.onprogress = ({ loaded, total }) => onProgress(loaded, total);
+    sending.onerror = () => reject(new TypeError("no answer"));
+    sending.onload = () => {
+      const lines = sending.getAllResponseHeaders().trim().split("\r\n").map((line) => line.split(": "));
+      const answered = lines.map(([name, ...value]): [string, string] => [name!, value.join(": ")]);
+      const { status, statusText } = sending, body = status === 204 || status === 304 ? null : sending.response;
+      resolve(new Response(body, { status, statusText, headers: answered }));
+    };
+    sending.onabort = () => reject(signal.reason);
+    signal.addEventListener("abort", () => sending.abort(), { once: true });
+    sending.send(body as XMLHttpRequestBodyInit);
+  });
+}
+
+/** Yield the lines of an answer as they arrive; a caller that stops early closes the connection. */
+export async function* linesOf(response: Response): AsyncGenerator<string> {
+  const reader = response.body!.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  try {
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      const lines = (text + part.value).split("\n");
+      text = lines.pop()!;
+      yield* lines;
+    }
+  } finally {
+    await reader.cancel();
+  }
+}

@@ -1,0 +1,194 @@
+"""Batches: many photographs of one plan or venue in one request, each a query of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from service.errors import (
+    OverloadedError,
+    PlanFailedError,
+    PlanNotReadyError,
+    RateLimitedError,
+    ServiceError,
+    StoppingError,
+    UnknownVenueError,
+    UploadTooLargeError,
+    VenueNotReadyError,
+    VenueUnsearchableError,
+)
+from service.http.admission_control import BATCH
+from service.http.lines import NDJSON, LinesResponse
+from service.http.problems import problem_document, problem_responses
+from service.http.uploads import MULTIPART, Repeats, media_type
+from service.query import PanoramaQuery, QueryContext
+from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
+from service.routes.localise import kept_answer
+from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.runtime import Runtime
+from service.schemas import BatchLine, LocaliseAnswer, LocaliseForm
+from service.security import caller_of
+from service.telemetry import LOGGER_NAME, add_log_fields
+from service.uploaded_file import UploadedFile
+
+router = APIRouter(tags=["localisation"])
+_PHOTOS_SCHEMA: dict[str, Any] = {
+    "type": "array",
+    "items": {"type": "string", "format": "binary"},
+    "minItems": 1,
+    "description": "Photographs, one part named `photo` each, as for `POST /localise`; limits: "
+    "`max_batch_photographs`, and `max_sequence_bytes` together.",
+}
+# Errors that every further photograph of the batch would meet.
+_COMMON_ERRORS = (
+    InvalidHintError,
+    PlanFailedError,
+    PlanNotReadyError,
+    StoppingError,
+    VenueNotReadyError,
+    VenueUnsearchableError,
+)
+# Pause (s) before a photograph asks again for a slot, while the tenant's other queries have them.
+_BUSY_PAUSE_S = 0.25
+_MAX_NAME = 255
+
+Localise = Callable[[PanoramaQuery], Awaitable[LocaliseAnswer]]
+
+
+@router.post(
+    BATCH,
+    summary="Localise many photographs, one by one",
+    status_code=200,
+    response_class=LinesResponse,
+    response_model=BatchLine,
+    openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA),
+    responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
+    | problem_responses(InvalidHintError, RateLimitedError, UnknownVenueError, *QUERY_ERRORS),
+)
+async def localise_batch(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+    """Localise many photographs, each by itself, in a stored floor plan or in the plans of a venue.
+
+    The fields hold for all photographs. The answer is a stream of lines of JSON, one per photograph in the order of the
+    request, each sent as soon as it is computed. A photograph that cannot be localised gets a line with the problem
+    that `POST /localise` would answer with; the others continue. Each photograph has the deadline of a query and counts
+    as a request for the rate limit. The batch ends if its client leaves, or does not take a line within
+    `request_deadline_s`.
+    """
+    settings = runtime.settings
+    check_idempotent_media(request, NDJSON)
+    media_type(request, (MULTIPART,))
+    most = settings.panoramas.max_batch_photographs
+    form, parts, _ = await read_query(
+        request,
+        settings,
+        client,
+        LocaliseForm,
+        "max_sequence_bytes",
+        repeated={PHOTO: Repeats(1, most, "max_batch_photographs")},
+    )
+    photographs = parts.repeated(PHOTO)
+    await runtime.access_control.count_photographs(caller_of(request.scope), len(photographs))
+    localise = await _localiser_of(request, form, tenant, runtime)
+    batch = _Batch(request, runtime, client, tenant, form, localise)
+    return LinesResponse(batch.lines(photographs), settings.requests.request_deadline_s)
+
+
+async def _localiser_of(request: Request, form: LocaliseForm, tenant: str, runtime: Runtime) -> Localise:
+    """Return the function that answers queries in the form's plan or venue."""
+    if form.venue_id is not None:
+        venue = await venue_for_query(tenant, form.venue_id, runtime)
+        add_log_fields(request, venue=venue.id)
+        return lambda query: runtime.venue_localiser.localise(venue, query)
+    assert form.floorplan_id is not None
+    record = await plan_for_query(tenant, form.floorplan_id, runtime)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
+    return lambda query: runtime.localiser.localise(record, query)
+
+
+class _Batch:
+    """Photographs of one request; as many at a time as there are cores that compute."""
+
+    def __init__(
+        self, request: Request, runtime: Runtime, client: str, tenant: str, form: LocaliseForm, localise: Localise
+    ) -> None:
+        self._request = request
+        self._runtime = runtime
+        self._client = client
+        self._tenant = tenant
+        self._form = form
+        self._localise = localise
+        self._common_error: Exception | None = None
+
+    async def lines(self, photographs: Sequence[UploadedFile]) -> AsyncGenerator[str]:
+        """Yield the line of every photograph, in order. While a line is not taken, no further photograph begins."""
+        cores = self._runtime.settings.cores
+        at_a_time = max(cores.workers + cores.compute_threads, 1)
+        begun = deque[asyncio.Task[str]]()
+        try:
+            for index, photograph in enumerate(photographs):
+                begun.append(asyncio.create_task(self._charged_line(index, photograph)))
+                if len(begun) >= at_a_time:
+                    yield await begun[0]
+                    begun.popleft()
+            while begun:
+                yield await begun[0]
+                begun.popleft()
+        finally:
+            for task in begun:
+                task.cancel()
+            await asyncio.gather(*begun, return_exceptions=True)
+
+    async def _charged_line(self, index: int, photograph: UploadedFile) -> str:
+        # A task is not part of the request's own steps.
+        return await self._runtime.admission.cpu_accounts.charged_steps(self._client, self._line(index, photograph))
+
+    async def _line(self, index: int, photograph: UploadedFile) -> str:
+        answer = problem = retry_after_s = None
+        try:
+            answer = await self._answer(photograph)
+        except Exception as error:
+            if not isinstance(error, LaLaLocError):
+                logging.getLogger(LOGGER_NAME).exception("unexpected error")
+            if isinstance(error, _COMMON_ERRORS):
+                self._common_error = error
+            problem = problem_document(self._request, error)
+            retry_after_s = error.retry_after_s if isinstance(error, ServiceError) else None
+        finally:
+            photograph.close()
+        line = BatchLine(
+            index=index,
+            name=None if photograph.name is None else photograph.name[:_MAX_NAME],
+            status=200 if problem is None else problem.status,
+            answer=answer,
+            problem=problem,
+            retry_after_s=retry_after_s,
+        )
+        # In ASCII: names and details quote the request, which is not always encodable as UTF-8.
+        return json.dumps(line.model_dump(mode="json", exclude_none=problem is not None))
+
+    async def _answer(self, photograph: UploadedFile) -> LocaliseAnswer:
+        """Localise one photograph; wait for a slot while the tenant's other queries have them all."""
+        settings = self._runtime.settings
+        limit = settings.panoramas.max_panorama_bytes
+        if len(photograph) > limit:
+            raise UploadTooLargeError("max_panorama_bytes", limit, len(photograph))
+        context = QueryContext.starting(self._client, settings.requests.request_deadline_s)
+        while True:
+            if self._runtime.admission.stopping:
+                raise StoppingError()
+            if self._common_error is not None:
+                raise self._common_error
+            try:
+                answer = await self._localise(PanoramaQuery(self._form, photograph, context))
+                return await kept_answer(answer, self._tenant, self._runtime)
+            except OverloadedError:
+                if context.left_s < _BUSY_PAUSE_S:
+                    raise
+            await asyncio.sleep(_BUSY_PAUSE_S)

@@ -1,0 +1,63 @@
+"""The TypeScript client: its package compiles, and the example of its README works in Node."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.service.conftest import StartApp
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "clients" / "typescript"
+_RUN = """
+import { readFileSync } from "node:fs";
+import { findHeading, findRooms } from "./example.js";
+
+const [plan, photo] = process.argv.slice(2).map((path) => new Blob([readFileSync(path)]));
+console.log(JSON.stringify(await findRooms(plan, [photo, plan])));
+const { floorplans } = await (await fetch("ADDRESS/floorplans")).json();
+console.log(await findHeading(floorplans[0].id, photo, AbortSignal.timeout(60000)));
+console.log(await findHeading(floorplans[0].id, plan, AbortSignal.timeout(60000)));
+console.log(await findHeading("f".repeat(32), photo, AbortSignal.timeout(60000)).catch((error) => error.slug));
+"""
+
+
+@pytest.mark.skipif(
+    shutil.which("node") is None or not (PACKAGE / "node_modules").is_dir(),
+    reason="needs Node and the packages that `make web` installs",
+)
+def test_readme_example_works_in_node(start_app: StartApp, tmp_path: Path) -> None:
+    def tsc(*arguments: str, cwd: Path) -> None:
+        done = subprocess.run(
+            ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments],
+            cwd=cwd,
+            stdout=subprocess.PIPE,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stdout
+
+    subprocess.run(["node", "types.mjs"], cwd=PACKAGE, check=True, timeout=300)
+    installed = tmp_path / "node_modules" / "lalaloc-client"
+    tsc("--outDir", str(installed / "dist"), cwd=PACKAGE)
+    shutil.copy(PACKAGE / "package.json", installed)
+    (example,) = re.findall(r"```ts\n(.*?)```", (PACKAGE / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    with start_app(tmp_path / "data") as app:
+        address = str(app.base_url).rstrip("/")
+        (tmp_path / "example.ts").write_text(example.replace("http://127.0.0.1:8000", address))
+        (tmp_path / "package.json").write_text('{"type": "module"}')
+        (tmp_path / "run.js").write_text(_RUN.replace("ADDRESS", address))
+        strict = ["--strict", "--target", "ES2022", "--module", "nodenext", "--lib", "ES2022,DOM,DOM.Iterable"]
+        tsc(*strict, "--types", "", "example.ts", cwd=tmp_path)
+        files = [str(ROOT / "examples" / name) for name in ("flat.json", "study.jpg")]
+        done = subprocess.run(
+            ["node", "run.js", *files], cwd=tmp_path, stdout=subprocess.PIPE, text=True, timeout=300, check=True
+        )
+    rooms, heading, unread, unknown = done.stdout.splitlines()
+    assert re.fullmatch(r'\["(bedroom|study)","not localised: .*"\]', rooms, re.IGNORECASE), rooms
+    assert 0.0 <= float(heading) < 360.0
+    assert (unread, unknown) == ("null", "unknown-floorplan")

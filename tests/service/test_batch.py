@@ -1,0 +1,150 @@
+"""Batches: lines in order, problems per photograph, limits, clients that leave or do not read."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncGenerator, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.http.lines import LinesResponse
+from service.storage.store import Store
+from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.test_security import bearer, make_key
+
+
+@pytest.fixture(scope="module")
+def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    limits = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_panorama_bytes": 500_000}
+    with start_app(tmp_path_factory.mktemp("data"), **limits) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def plan_id(client: httpx.Client) -> str:
+    return upload(client)
+
+
+def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: str) -> httpx.Response:
+    files = [("photo", (f"{number}.jpg", picture, "image/jpeg")) for number, picture in enumerate(pictures)]
+    return client.post("/localise/batch", data={"floorplan_id": plan_id, "refine": "none"} | fields, files=files)
+
+
+def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/x-ndjson"
+    return [json.loads(line) for line in response.text.splitlines()]
+
+
+def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    lines = lines_of(ask(client, plan_id, [panorama, b"no picture", bytes(500_001), panorama], heading_deg="90"))
+    assert [(line["index"], line["name"], line["status"]) for line in lines] == [
+        (0, "0.jpg", 200),
+        (1, "1.jpg", 422),
+        (2, "2.jpg", 413),
+        (3, "3.jpg", 200),
+    ]
+    assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-panorama"
+    assert "LALALOC_MAX_PANORAMA_BYTES" in lines[2]["problem"]["detail"]
+    alone = localise(client, plan_id, panorama, refine="none", heading_deg=90).json()
+    for line in (lines[0], lines[3]):
+        assert line["answer"]["position"] == alone["position"]
+        assert line["answer"]["heading_source"] == alone["heading_source"]
+
+
+def test_batch_searches_a_venue(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    venue = client.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 2}]}).json()
+    files = [("photo", ("p.jpg", panorama, "image/jpeg"))]
+    response = client.post("/localise/batch", data={"venue_id": venue["id"], "refine": "none"}, files=files)
+    assert [line["answer"]["level"] for line in lines_of(response)] == [2]
+
+
+@pytest.mark.parametrize("count", [31, 40])
+def test_number_of_photographs_is_limited(client: httpx.Client, plan_id: str, count: int) -> None:
+    problem = assert_problem(ask(client, plan_id, count * [b"x"]), 422, "invalid-request")
+    assert "1 to 30 are needed (LALALOC_MAX_BATCH_PHOTOGRAPHS)" in problem["errors"][0]["message"]
+    assert client.get("/limits").json()["max_batch_photographs"] == 30
+
+
+def test_refusals_of_the_whole_batch_precede_the_lines(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    assert_problem(ask(client, "f" * 32, [panorama]), 404, "unknown-floorplan")
+    assert_problem(ask(client, plan_id, 9 * [bytes(480_000)]), 413, "upload-too-large")
+    assert_problem(ask(client, plan_id, [panorama], heading_deg="x"), 422, "invalid-request")
+
+
+def test_error_about_the_plan_is_the_error_of_all_photographs(
+    client: httpx.Client, plan_id: str, panorama: bytes
+) -> None:
+    lines = lines_of(ask(client, plan_id, 5 * [panorama], rooms="attic"))
+    assert {line["problem"]["type"] for line in lines} == {"urn:lalaloc:problem:invalid-hint"}
+
+
+@pytest.mark.one_replica
+def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    def metric(name: str) -> float:
+        lines = client.get("/metrics").text.splitlines()
+        return sum(float(line.split()[-1]) for line in lines if line.startswith(name))
+
+    before = metric("lalaloc_localise_answers_total")
+    files = [("photo", ("p.jpg", panorama, "image/jpeg"))] * 30
+    with client.stream("POST", "/localise/batch", data={"floorplan_id": plan_id}, files=files) as response:
+        assert json.loads(next(response.iter_lines()))["index"] == 0
+    wait_for(lambda: metric("lalaloc_requests_in_flight") == 0)
+    answered = metric("lalaloc_localise_answers_total") - before
+    assert 1 <= answered < 30
+
+
+@pytest.mark.one_replica
+def test_each_photograph_counts_for_the_rate_limit(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, api_keys=True, rate_per_minute=8, rate_burst=0) as client:
+        store = Store(database_of(tmp_path))
+        unlimited = make_key(store, rate_per_minute=0)
+        client.headers.update(bearer(unlimited))
+        plan_id = upload(client)
+        client.headers.update(bearer(make_key(store)))
+        assert len(lines_of(ask(client, plan_id, 6 * [panorama]))) == 6
+        problem = assert_problem(ask(client, plan_id, 6 * [panorama]), 429, "rate-limited")
+        assert "8 requests per minute" in problem["detail"]
+        client.headers.update(bearer(make_key(store)))
+        problem = assert_problem(ask(client, plan_id, 9 * [panorama]), 422, "invalid-request")
+        assert "the rate limit of the key is 8 per minute" in problem["errors"][0]["message"]
+        store.close()
+
+
+@pytest.mark.parametrize("reader", ["stops", "leaves"])
+def test_lines_end_without_a_reader(reader: str) -> None:
+    begun: list[int] = []
+    ended = asyncio.Event()
+
+    async def lines() -> AsyncGenerator[str]:
+        try:
+            for number in range(100):
+                begun.append(number)
+                yield str(number)
+                if reader == "leaves" and number == 2:
+                    await asyncio.sleep(60.0)
+        finally:
+            ended.set()
+
+    async def receive() -> dict[str, Any]:
+        while reader == "stops" or len(begun) < 3:
+            await asyncio.sleep(0.01)
+        return {"type": "http.disconnect"}
+
+    async def send(_message: object) -> None:
+        if reader == "stops" and len(begun) == 3:
+            await asyncio.sleep(60.0)
+
+    async def run() -> None:
+        async with asyncio.timeout(30.0):
+            await LinesResponse(lines(), patience_s=0.05)({"type": "http"}, receive, send)
+        assert ended.is_set()
+
+    asyncio.run(run())
+    assert begun == [0, 1, 2]
