@@ -186,7 +186,7 @@ class Localiser:
             known_heading(form.heading_of(index), plan.north, view, compass_deg) for index, view in enumerate(views)
         ]
         # A sphere shows all that other photographs from its spot could add.
-        one_query = form.motion == "turn" and not any(view.panorama is not None for view in views)
+        one_query = form.motion == "turn" and not any(view.is_sphere for view in views)
         turns = form.known_turns
         if one_query and turns is not None:
             grid, joint = await self._search_turn(record, query, views, known, turns, height)
@@ -307,7 +307,7 @@ class Localiser:
                 query.form.stated_view,
                 context.deadline,
                 context.client,
-                is_sphere=view.panorama is not None,
+                is_sphere=view.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
 
