@@ -172,9 +172,7 @@ class Encoders:
         frames = (np.roll(image, int(shift) * width // sectors, axis=1) for shift in shifts)
         return np.concatenate([self.images.run(frame[None], camera_height_m, ["latent"])[0] for frame in frames])
 
-    def _query_in_frame(
-        self, outputs: Mapping[str, np.ndarray], frame: _Frame, camera_height: CameraHeight
-    ) -> Query:
+    def _query_in_frame(self, outputs: Mapping[str, np.ndarray], frame: _Frame, camera_height: CameraHeight) -> Query:
         """Return the query of a panorama by the outputs of its image encoder."""
         sectors = self.manifest.ring_sectors
         shifts = frame.shift + _shifts(frame.heading, frame.tolerance, sectors)
@@ -194,8 +192,8 @@ class Encoders:
     ) -> Query:
         """Return a query with one hypothesis for each shift, its heading unknown.
 
-        The ring and the predictions in `outputs` (see `SphereNetwork.outputs`) are rolled to the right by `shifts` sectors; the
-        image was rolled by `frame_roll` (radians) before it was encoded.
+        The ring and the predictions in `outputs`, see `SphereNetwork.outputs`, are rolled to the right by `shifts`
+        sectors; the image was rolled by `frame_roll` (radians) before it was encoded.
         """
         assert self._head is not None
         sectors = outputs["ring"].shape[1]

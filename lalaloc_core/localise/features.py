@@ -25,7 +25,7 @@ from lalaloc_core.errors import (
     InvalidFeaturesError,
     InvalidPanoramaError,
 )
-from lalaloc_core.localise.bundle import Bundle, Manifest
+from lalaloc_core.localise.bundle import IMAGE_ONNX, MANIFEST_NAME, VIEW_ONNX, Bundle, Manifest, MatchingWeights
 from lalaloc_core.localise.image_network import SphereNetwork
 from lalaloc_core.localise.view_encoder import OnnxViewEncoder
 from lalaloc_core.photograph import Assumed, Encoded, Intrinsics, StatedView, View
@@ -34,6 +34,8 @@ from lalaloc_core.photograph.projection import Source
 from lalaloc_core.photograph.stated import Projection, camera_of_intrinsics, intrinsics_of
 
 MAX_BYTES = 2**18
+# Files of a bundle that `FeatureEncoder` reads, those that it has.
+DEVICE_FILES = (MANIFEST_NAME, IMAGE_ONNX, VIEW_ONNX)
 _MAGIC, _VERSION, _PREFIX = b"LLFT", 1, struct.Struct("<4sHI")
 _MAX_HEADER_BYTES, _MAX_PATCHES, _MAX_SIDE = 2**14, 16, 2**16
 _MAX_WARNINGS, _MAX_WARNING_CHARACTERS = 8, 300
@@ -87,6 +89,20 @@ class _Header:
     warnings: list[str] = field(default_factory=list)
 
 
+def device_manifest(manifest: Manifest) -> Manifest:
+    """Return the parts of a manifest that `FeatureEncoder` needs; the bundle keeps its digest."""
+    view = manifest.view
+    return dataclasses.replace(
+        manifest,
+        confidence=None,
+        evidence=MatchingWeights(),
+        errors=None,
+        training={},
+        metrics={},
+        view=None if view is None else dataclasses.replace(view, evidence=None, confidence=None, errors=None),
+    )
+
+
 class FeatureEncoder:
     """Image encoders of a bundle, which turn photographs into features; safe to share between threads.
 
@@ -112,17 +128,17 @@ class FeatureEncoder:
         """Return a decoded photograph with the outputs of its image encoder instead of its pixels.
 
         Raises:
-            InvalidPanoramaError: the photograph is no sphere, and the bundle has no encoder of views.
+            InvalidPanoramaError: the model gives no features of such photographs.
         """
-        if view.panorama is not None:
+        if view.panorama is not None and _encodes_spheres(self._bundle.manifest):
             by_height = [self._spheres.outputs(view.panorama.pixels, height_m) for height_m in _RING_HEIGHTS_M]
             outputs = by_height[_RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
-        elif self._views is not None:
+        elif view.panorama is None and self._views is not None:
             outputs = self._views.predicted([patch.rgba for patch in view.patches], 1.0)
         else:
             raise InvalidPanoramaError(
-                f"the photograph is {view.projection}, and model '{self._bundle.manifest.name}' reads full 360° "
-                "spheres only"
+                f"the photograph is {view.projection}, of which model '{self._bundle.manifest.name}' gives no "
+                "features; send the photograph itself"
             )
         encoded = Encoded(outputs, tuple(patch.azimuth_rad for patch in view.patches))
         return dataclasses.replace(view, panorama=None, patches=(), encoded=encoded)
@@ -138,7 +154,12 @@ class FeatureEncoder:
 
 
 def gives_features(manifest: Manifest) -> bool:
-    """Return whether features of a model exist: its image encoder depends on the camera height as they presume."""
+    """Return whether a model gives features of any photographs."""
+    return manifest.view is not None or _encodes_spheres(manifest)
+
+
+def _encodes_spheres(manifest: Manifest) -> bool:
+    """Return whether the encoder of spheres depends on the camera height as `at_height` presumes."""
     return bool(manifest.ring_sectors and manifest.room_types)
 
 
@@ -156,8 +177,6 @@ def read_features(content: bytes, bundle: Bundle) -> View:
     manifest = bundle.manifest
     if header.model != bundle.sha256:
         raise ForeignFeaturesError(header.model[:64], manifest.name, bundle.sha256)
-    if not gives_features(manifest):
-        raise InvalidFeaturesError(f"model '{manifest.name}' takes photographs only")
     view = _view_of(header, manifest)
     shapes = _layout(manifest, len(header.patches))
     expected = 4 * sum(math.prod(shape) for shape in shapes.values())
@@ -186,7 +205,7 @@ def at_height(encoded: Encoded, camera_height_m: float) -> dict[str, np.ndarray]
 
 
 def _ring_at(rings: Float[np.ndarray, "h c s"], camera_height_m: float) -> Float[np.ndarray, "c s"]:
-    """Return the ring for a camera height, by polynomial interpolation in its log; beyond the heights, that of the last."""
+    """Return the ring for a camera height: a polynomial in its log through all rings, constant beyond them."""
     knots = [math.log(height_m) for height_m in _RING_HEIGHTS_M]
     place = min(max(math.log(camera_height_m), knots[0]), knots[-1])
     weights = [math.prod((place - knot) / (own - knot) for knot in knots if knot != own) for own in knots]
@@ -197,12 +216,12 @@ def _layout(manifest: Manifest, patches: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays, in the order of the file, of a full sphere or of some patches."""
     columns = manifest.profile_columns
     if not patches:
-        walls = {name: (columns,) for name in ("log_profile", "log_scale")}
+        walls = dict.fromkeys(("log_profile", "log_scale"), (columns,))
         ring = (len(_RING_HEIGHTS_M), manifest.layout_config["channels"], manifest.ring_sectors)
         return {"ring": ring, **walls, **_structure((), columns)}
     assert manifest.view is not None
     columns = manifest.view.sectors * columns // manifest.ring_sectors
-    modes = {name: (patches, columns, _MODES) for name in ("log_profile", "log_scale", "log_share")}
+    modes = dict.fromkeys(("log_profile", "log_scale", "log_share"), (patches, columns, _MODES))
     return {**modes, "seen": (patches, columns), **_structure((patches,), columns)}
 
 
@@ -225,7 +244,9 @@ def _split(content: bytes) -> tuple[_Header, memoryview]:
     if version != _VERSION:
         raise InvalidFeaturesError(f"the features have version {version}; this version reads {_VERSION}")
     if length > min(_MAX_HEADER_BYTES, len(content) - _PREFIX.size):
-        raise InvalidFeaturesError(f"the header has {length} bytes; the limit is {_MAX_HEADER_BYTES}, and the file's end")
+        raise InvalidFeaturesError(
+            f"the header has {length} bytes; the limit is {_MAX_HEADER_BYTES}, and the rest of the file"
+        )
     end = _PREFIX.size + length
     try:
         header = build_config(_Header, json.loads(content[_PREFIX.size : end]), path="header")
@@ -236,9 +257,7 @@ def _split(content: bytes) -> tuple[_Header, memoryview]:
 
 def _header_of(view: View, bundle: Bundle) -> _Header:
     def angle(assumed: Assumed) -> _Angle:
-        return _Angle(
-            value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source
-        )
+        return _Angle(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
 
     column = TWO_PI / bundle.manifest.profile_columns
     return _Header(
@@ -300,8 +319,10 @@ def _view_of(header: _Header, manifest: Manifest) -> View:
     for name, is_wrong in faults.items():
         if is_wrong:
             raise InvalidFeaturesError(f"{name} of the header is out of range")
-    if header.patches and manifest.view is None:
-        raise InvalidFeaturesError(f"the features are of patches, and model '{manifest.name}' reads spheres only")
+    if manifest.view is None if header.patches else not _encodes_spheres(manifest):
+        raise InvalidFeaturesError(
+            f"model '{manifest.name}' gives no features of {header.projection} photographs"
+        )
     if not header.patches and header.projection != "equirectangular":
         raise InvalidFeaturesError(f"the projection is '{header.projection}', and there are no patches")
     try:

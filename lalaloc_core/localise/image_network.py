@@ -59,9 +59,7 @@ class SphereNetwork:
             averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
         return {"ring": ring[0], **averaged}
 
-    def run(
-        self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]
-    ) -> list[np.ndarray]:
+    def run(self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]) -> list[np.ndarray]:
         """Run the image encoder on a batch; return some outputs.
 
         Raises:

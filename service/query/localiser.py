@@ -301,6 +301,7 @@ class Localiser:
     ) -> bytes:
         context, photograph, view = query.context, None, outcome.view
         if request.picture != "plan":
+            assert not isinstance(query.content, View)
             # Decode again, because the encoder's input is too small for a picture.
             photograph = await self._decoder.picture(
                 query.content,

@@ -104,6 +104,4 @@ def _camera(view: View) -> CameraAnswer | None:
     names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
     values = vars(intrinsics_of(camera))
     matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-    return CameraAnswer(
-        width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names]
-    )
+    return CameraAnswer(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
