@@ -35,6 +35,8 @@ Covariance = tuple[tuple[float, float], tuple[float, float]]
 PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
 _JSON, _FILE = "application/json", "application/octet-stream"
 _JPEG_QUALITY = 95
+# First bytes of a file of features.
+_FEATURES = b"LLFT"
 # Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
 _IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
@@ -209,14 +211,18 @@ def query_request(
 
     Raises:
         TypeError: an option is unknown.
-        ValueError: a number is not finite.
+        ValueError: a number is not finite, or photographs and features are mixed.
     """
     known = dict(options or {})
     if unknown := known.keys() - (QueryOptions.__optional_keys__ | QueryOptions.__required_keys__):
         raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
     if isinstance(rooms := known.get("rooms"), str):
         known["rooms"] = [rooms]
-    media, content = _form("photo", [_picture(photograph) for photograph in photographs], {**values, **known})
+    contents = [picture_file(photograph) for photograph in photographs]
+    kinds = {"features" if content.startswith(_FEATURES) else "photo" for content in contents}
+    if len(kinds) > 1:
+        raise ValueError("photographs and features cannot be in one query; send either")
+    media, content = _form("".join(kinds) or "photo", contents, {**values, **known})
     return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content)
 
 
@@ -243,7 +249,7 @@ def geopose_request(
     now_ms = time.time_ns() // 1_000_000
     kinds = ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
     common = {"timestamp": now_ms, "privacy": {f"data{kind}": [] for kind in kinds}}
-    content = _picture(photograph)
+    content = picture_file(photograph)
     camera = {
         "sensorId": "camera",
         "sequenceNumber": 0,
@@ -309,7 +315,8 @@ def _form(
     return encoded.headers["content-type"], encoded.read()
 
 
-def _picture(photograph: Photograph) -> bytes:
+def picture_file(photograph: Photograph) -> bytes:
+    """Return the content of a file, or a PIL image as JPEG."""
     if isinstance(photograph, bytes):
         return photograph
     if isinstance(photograph, str | os.PathLike):

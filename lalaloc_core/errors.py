@@ -92,8 +92,8 @@ class ForeignFeaturesError(InvalidInputError):
 
     def __init__(self, given: str, name: str, expected: str) -> None:
         super().__init__(
-            f"the features are of the model with the SHA-256 {given}; this service has '{name}', {expected}: compute "
-            "them anew with its image encoder (GET /model/{file})"
+            f"the features are of the model with the SHA-256 {given}, not of '{name}', {expected}: compute them anew "
+            "with that model"
         )
 
 

@@ -153,6 +153,11 @@ class FeatureEncoder:
         return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + b"".join(arrays)
 
 
+def is_features(content: bytes) -> bool:
+    """Return whether a file begins as features do."""
+    return content.startswith(_MAGIC)
+
+
 def gives_features(manifest: Manifest) -> bool:
     """Return whether a model gives features of any photographs."""
     return manifest.view is not None or _encodes_spheres(manifest)
@@ -238,7 +243,7 @@ def _split(content: bytes) -> tuple[_Header, memoryview]:
     """Return the header, and the bytes of the arrays."""
     if len(content) > MAX_BYTES:
         raise InvalidFeaturesError(f"the file has {len(content)} bytes; the limit is {MAX_BYTES}")
-    if len(content) < _PREFIX.size or content[:4] != _MAGIC:
+    if len(content) < _PREFIX.size or not is_features(content):
         raise InvalidFeaturesError("the file does not begin as features do; make it with `lalaloc encode`")
     _, version, length = _PREFIX.unpack_from(content)
     if version != _VERSION:
@@ -320,9 +325,7 @@ def _view_of(header: _Header, manifest: Manifest) -> View:
         if is_wrong:
             raise InvalidFeaturesError(f"{name} of the header is out of range")
     if manifest.view is None if header.patches else not _encodes_spheres(manifest):
-        raise InvalidFeaturesError(
-            f"model '{manifest.name}' gives no features of {header.projection} photographs"
-        )
+        raise InvalidFeaturesError(f"model '{manifest.name}' gives no features of {header.projection} photographs")
     if not header.patches and header.projection != "equirectangular":
         raise InvalidFeaturesError(f"the projection is '{header.projection}', and there are no patches")
     try:

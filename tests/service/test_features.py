@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.features import MAX_BYTES, FeatureEncoder, read_features
-from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
-from lalaloc_core.photograph import open_view
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.photograph import View, open_view
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp, assert_problem, upload, wait_for
 from tests.service.test_oscp import oscp_request
@@ -41,10 +43,12 @@ class Device:
         self.bundle = Bundle.open(default_bundle())
         self._encoder = FeatureEncoder(self.bundle, threads=1)
 
-    def features(self, photograph: bytes) -> bytes:
+    def view(self, photograph: bytes) -> View:
         manifest = self.bundle.manifest
-        view = open_view(photograph, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
-        return self._encoder.features(view)
+        return open_view(photograph, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
+
+    def features(self, photograph: bytes) -> bytes:
+        return self._encoder.features(self.view(photograph))
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +95,18 @@ def test_features_get_the_answer_of_their_photograph(
     )
     assert by_features.status_code == 200, by_features.text
     assert same(by_features.json(), by_photograph.json())
+
+
+@pytest.mark.parametrize("height_m", [0.8, 1.3, 2.2])
+def test_features_hold_for_any_camera_height(device: Device, height_m: float) -> None:
+    view = device.view(KITCHEN)
+    encoder, height = PhotographEncoder(device.bundle, threads=1), CameraHeight(height_m)
+    expected = encoder.query(view, None, height)
+    found = encoder.query(read_features(device.features(KITCHEN), device.bundle), None, height)
+    np.testing.assert_allclose(found.latents, expected.latents, atol=1e-3)
+    assert found.profile is not None
+    assert expected.profile is not None
+    np.testing.assert_allclose(found.profile.log_m, expected.profile.log_m, atol=1e-4)
 
 
 def test_known_heading_finds_the_place_of_the_photograph(client: httpx.Client, home: str, device: Device) -> None:
@@ -211,9 +227,7 @@ def test_device_needs_the_served_files_only(client: httpx.Client, device: Device
     bundle = Bundle.open(tmp_path)
     assert bundle.sha256 == device.bundle.sha256
     assert (bundle.manifest.training, bundle.manifest.metrics, bundle.manifest.errors) == ({}, {}, None)
-    manifest = bundle.manifest
-    view = open_view(PHONE, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
-    assert FeatureEncoder(bundle, threads=1).features(view) == device.features(PHONE)
+    assert FeatureEncoder(bundle, threads=1).features(device.view(PHONE)) == device.features(PHONE)
 
 
 def test_service_can_refuse_photographs(start_app: StartApp, tmp_path: Path, device: Device) -> None:
