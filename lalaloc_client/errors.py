@@ -6,6 +6,7 @@ Tree of the classes::
     ├── ConnectionFailedError     the service did not answer, retries included
     ├── MalformedAnswerError      an answer has another form than the API's
     ├── FloorPlanFailedError      the service could not prepare the plan
+    ├── OnDeviceError             the features of a photograph cannot be computed on this device
     ├── NotReadyError             the plan was still preparing at the timeout (also a TimeoutError)
     └── ProblemError              the service answered with a problem (RFC 9457)
         ├── InvalidError          the request is wrong: 400, 413, 415, 422
@@ -48,6 +49,10 @@ class FloorPlanFailedError(ClientError):
     def __init__(self, floorplan_id: str, reason: str | None) -> None:
         self.reason = reason
         super().__init__(f"floor plan '{floorplan_id}' could not be prepared: {reason or 'no reason given'}")
+
+
+class OnDeviceError(ClientError):
+    """The features of a photograph cannot be computed on this device."""
 
 
 class NotReadyError(ClientError, TimeoutError):

@@ -36,6 +36,8 @@ PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/
 NDJSON = "application/x-ndjson"
 _JSON, _FILE, _PHOTO = "application/json", "application/octet-stream", "photo"
 _JPEG_QUALITY = 95
+# First bytes of a file of features.
+_FEATURES = b"LLFT"
 # Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
 _IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
@@ -211,15 +213,20 @@ def query_request(
 
     Raises:
         TypeError: an option is unknown.
-        ValueError: a number is not finite.
+        ValueError: a number is not finite, or photographs and features are mixed.
     """
     known = dict(options or {})
     if unknown := known.keys() - (QueryOptions.__optional_keys__ | QueryOptions.__required_keys__):
         raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
     if isinstance(rooms := known.get("rooms"), str):
         known["rooms"] = [rooms]
-    files = [(_name(photograph) if streamed else _PHOTO, _picture(photograph)) for photograph in photographs]
-    media, content = _form(_PHOTO, files, {**values, **known})
+    contents = [picture_file(photograph) for photograph in photographs]
+    kinds = {"features" if content.startswith(_FEATURES) else _PHOTO for content in contents}
+    if len(kinds) > 1:
+        raise ValueError("photographs and features cannot be in one query; send either")
+    kind = "".join(kinds) or _PHOTO
+    names = [_name(photograph) if streamed else kind for photograph in photographs]
+    media, content = _form(kind, list(zip(names, contents, strict=True)), {**values, **known})
     return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content, streamed=streamed)
 
 
@@ -246,7 +253,7 @@ def geopose_request(
     now_ms = time.time_ns() // 1_000_000
     kinds = ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
     common = {"timestamp": now_ms, "privacy": {f"data{kind}": [] for kind in kinds}}
-    content = _picture(photograph)
+    content = picture_file(photograph)
     camera = {
         "sensorId": "camera",
         "sequenceNumber": 0,
@@ -314,7 +321,8 @@ def _name(photograph: Photograph) -> str:
     return os.path.basename(photograph) if isinstance(photograph, str | os.PathLike) else _PHOTO
 
 
-def _picture(photograph: Photograph) -> bytes:
+def picture_file(photograph: Photograph) -> bytes:
+    """Return the content of a file, or a PIL image as JPEG."""
     if isinstance(photograph, bytes):
         return photograph
     if isinstance(photograph, str | os.PathLike):

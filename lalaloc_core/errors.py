@@ -6,6 +6,8 @@ LaLaLocError
 │   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
 │   ├── MissingExtraError        a format needs a package that is not installed; names the extra
 │   ├── InvalidPanoramaError     a picture is not a usable panorama or photograph, or a statement about it is invalid
+│   ├── InvalidFeaturesError     features of a photograph are damaged or out of range
+│   ├── ForeignFeaturesError     features of a photograph are another model's
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
 │   ├── InvalidHintError         a hint is invalid; names the hint
 │   ├── InvalidMotionError       a motion between two photographs is invalid
@@ -79,6 +81,20 @@ class MissingExtraError(InvalidInputError):
 
 class InvalidPanoramaError(InvalidInputError):
     """A picture is not a usable panorama or photograph, or a statement about it is invalid."""
+
+
+class InvalidFeaturesError(InvalidInputError):
+    """Features of a photograph are damaged, of another version, or out of range."""
+
+
+class ForeignFeaturesError(InvalidInputError):
+    """Features of a photograph were computed with another model."""
+
+    def __init__(self, given: str, name: str, expected: str) -> None:
+        super().__init__(
+            f"the features are of the model with the SHA-256 {given}, not of '{name}', {expected}: compute them anew "
+            "with that model"
+        )
 
 
 class InvalidPoseError(InvalidInputError):

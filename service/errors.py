@@ -47,6 +47,8 @@ LaLaLocError
     ├── DecoderNotReadyError        no decoder process is running
     ├── ConverterNotReadyError      no converter process is running
     ├── DeadlineExceededError       the request missed its deadline
+    ├── FeaturesRequiredError       a photograph, where the service takes features only
+    ├── UnknownModelFileError       no such file of the model for devices
     └── StoppingError               the service is shutting down
 """
 
@@ -456,6 +458,23 @@ class DeadlineExceededError(ServiceError):
 
     def __init__(self, limit_s: float, what: str = "the query was not answered") -> None:
         super().__init__(f"{what} within {limit_s:g} s")
+
+
+class FeaturesRequiredError(ServiceError):
+    """A photograph was sent to a service that takes features only."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "this service takes no photographs (LALALOC_REQUIRE_FEATURES): send the part features instead, which "
+            "`lalaloc encode` or the Python client with on_device=True compute from the photograph"
+        )
+
+
+class UnknownModelFileError(ServiceError):
+    """The model has no such file for devices."""
+
+    def __init__(self, name: str, model: str) -> None:
+        super().__init__(f"model '{model}' has no file '{name[:64]}' for devices")
 
 
 class StoppingError(ServiceError):

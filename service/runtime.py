@@ -72,6 +72,7 @@ class Runtime:
     """Components that the routes use.
 
     Attributes:
+        bundle: the model.
         uploads: threads that check, prepare and store plans.
         file_uploads: threads for uploads that wait for the converter.
         reads: store reads of queries.
@@ -81,6 +82,7 @@ class Runtime:
 
     settings: Settings
     telemetry: Telemetry
+    bundle: Bundle
     store: Store
     grids: GridProvider
     plan_lookup: PlanLookup
@@ -193,6 +195,7 @@ def start_runtime(
     return Runtime(
         settings=settings,
         telemetry=telemetry,
+        bundle=bundle,
         store=store,
         grids=grids,
         plan_lookup=PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S),

@@ -430,6 +430,11 @@ class PanoramaSettings(SettingGroup):
         description="Tolerance of the compass heading in a panorama's metadata: the search covers headings within it.",
     )
 
+    require_features: bool = Field(
+        default=False,
+        description="Refuse photographs: queries need features, which devices compute (docs/reference/features.md).",
+    )
+
     @property
     def panorama_limits(self) -> PanoramaLimits:
         """Limits of panoramas, for the core."""

@@ -4,8 +4,9 @@ from asyncio import Lock, Semaphore, sleep
 from asyncio import to_thread as run_blocking
 from collections.abc import Awaitable, Callable
 
-__all__ = ["FetchLimit", "Lock", "Semaphore", "run_blocking", "sleep", "try_acquire"]
+__all__ = ["Fetch", "FetchLimit", "Lock", "Semaphore", "run_blocking", "sleep", "try_acquire"]
 
+Fetch = Callable[[str], Awaitable[bytes]]
 FetchLimit = Callable[[], Awaitable[int]]
 
 

@@ -9,7 +9,7 @@ from typing import Any, Unpack
 from lalaloc_client.asynchronous.transport import AsyncTransport
 from lalaloc_client.errors import ConflictError, NotFoundError
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import Photograph, Request, ViewOptions, json_request, query_request, resource_path
+from lalaloc_client.requests import Photograph, Request, ViewOptions, json_request, resource_path
 from lalaloc_client.tracking import Motion, Session, SessionOptions
 
 _OUT_OF_ORDER = "urn:lalaloc:problem:photograph-out-of-order"
@@ -61,6 +61,7 @@ class AsyncTracker:
         *,
         heading_deg: float | None = None,
         heading_tolerance_deg: float | None = None,
+        on_device: bool = False,
         **options: Unpack[ViewOptions],
     ) -> Session:
         """Send the next photograph; return the session with its pose.
@@ -70,6 +71,7 @@ class AsyncTracker:
             motion: motion since the photograph before; None if it was not measured.
             heading_deg: azimuth of the photograph's centre, if it is known.
             heading_tolerance_deg: its largest error. Default: 0.
+            on_device: as for `localise`.
             options: the camera; see `ViewOptions`. An app that knows gravity gives `pitch_deg` and `roll_deg`.
         """
         number = self.session.photographs + 1
@@ -77,7 +79,9 @@ class AsyncTracker:
         path = f"{resource_path('sessions', self.session.id)}/photographs"
         try:
             moved = {} if motion is None else motion.to_dict()
-            content = await self._service.query(query_request, path, [photograph], {**values, **moved}, options)
+            content = await self._service.localise_query(
+                path, [photograph], {**values, **moved}, options, on_device=on_device
+            )
         except ConflictError as error:
             if error.type != _OUT_OF_ORDER:
                 raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from random import random
@@ -13,10 +13,20 @@ import httpx
 
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
-from lalaloc_client.errors import ConnectionFailedError, ProblemError, problem_of
+from lalaloc_client.asynchronous.device import AsyncDevice
+from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.on_device import split_options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import Request, http_options, text_values
+from lalaloc_client.requests import (
+    Photograph,
+    QueryOptions,
+    Request,
+    ViewOptions,
+    http_options,
+    query_request,
+    text_values,
+)
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
@@ -29,6 +39,7 @@ _DEFAULT_MAX_QUERIES = 3
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 # A stream without data for this long is dead: the service sends a heartbeat every 15 s.
 _STREAM_TIMEOUT_S = 30.0
+_FOREIGN_FEATURES = "urn:lalaloc:problem:foreign-features"
 
 
 class AsyncTransport:
@@ -60,6 +71,7 @@ class AsyncTransport:
             raise ValueError(f"max_queries is {max_queries}; it must be at least 1")
         self._http = httpx.AsyncClient(**http_options(base_url, api_key, timeout_s))
         self._retry = retry or RetryPolicy()
+        self._device = AsyncDevice(self._fetch)
         self._concurrency = AsyncConcurrencyLimit(max_queries, self._fetch_max_queries)
 
     async def close(self) -> None:
@@ -84,6 +96,32 @@ class AsyncTransport:
             # Reading and encoding pictures blocks.
             request = await run_blocking(make, *args, **kwargs)
             return await self.content(request)
+
+    async def localise_query(
+        self,
+        path: str,
+        photographs: Sequence[Photograph],
+        values: Mapping[str, object],
+        options: QueryOptions | ViewOptions,
+        *,
+        on_device: bool = False,
+    ) -> bytes:
+        """Send a query about photographs, or about their features if they stay `on_device`; return the answer."""
+        if not on_device:
+            return await self.query(query_request, path, photographs, values, options)
+        camera, others = split_options(options)
+        features = await self._device.features(photographs, camera)
+        try:
+            return await self.query(query_request, path, features, values, others)
+        except ConflictError as error:
+            if error.type != _FOREIGN_FEATURES:
+                raise
+        self._device.forget()
+        features = await self._device.features(photographs, camera)
+        return await self.query(query_request, path, features, values, others)
+
+    async def _fetch(self, path: str) -> bytes:
+        return await self.content(Request("GET", path, headers={"Accept": "*/*"}))
 
     async def _stored(self, kind: type[StoredT], request: Request, retry: RetryPolicy | None = None) -> StoredT:
         """Send a request and return the stored object in the answer, with its entity tag."""

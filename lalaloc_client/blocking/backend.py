@@ -5,11 +5,12 @@ from threading import Lock, Semaphore
 from time import sleep
 from typing import ParamSpec, TypeVar
 
-__all__ = ["FetchLimit", "Lock", "Semaphore", "run_blocking", "sleep", "try_acquire"]
+__all__ = ["Fetch", "FetchLimit", "Lock", "Semaphore", "run_blocking", "sleep", "try_acquire"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
+Fetch = Callable[[str], bytes]
 FetchLimit = Callable[[], int]
 
 

@@ -336,22 +336,38 @@ class Client(Transport):
     # Queries
 
     def localise(
-        self, floorplan_id: str, panorama: Photograph, *, posterior: bool = False, **options: Unpack[QueryOptions]
+        self,
+        floorplan_id: str,
+        panorama: Photograph,
+        *,
+        posterior: bool = False,
+        on_device: bool = False,
+        **options: Unpack[QueryOptions],
     ) -> Localisation:
         """Localise a photograph in a plan.
 
         Args:
             floorplan_id: id of the plan.
             panorama: the photograph: bytes or path of a JPEG, PNG, WebP or HEIC file, or a PIL image, which is sent as
-                JPEG without metadata. Models without an encoder of views need full 360° spheres.
+                JPEG without metadata. Models without an encoder of views need full 360° spheres. Or the bytes or path
+                of its features, a file that `lalaloc encode` writes.
             posterior: include the probability of every place of the plan in the answer.
+            on_device: compute the features of the photograph on this device and send these alone. Needs the extra
+                `onnx`; the first photograph loads the image encoder of the service, about 19 MB.
             **options: see `QueryOptions`.
         """
         values = {"floorplan_id": floorplan_id, "include": "posterior" if posterior else None}
-        return parse(Localisation, self.query(query_request, "/localise", [panorama], values, options))
+        content = self.localise_query("/localise", [panorama], values, options, on_device=on_device)
+        return parse(Localisation, content)
 
     def localise_in_venue(
-        self, venue_id: str, panorama: Photograph, *, level: float | None = None, **options: Unpack[QueryOptions]
+        self,
+        venue_id: str,
+        panorama: Photograph,
+        *,
+        level: float | None = None,
+        on_device: bool = False,
+        **options: Unpack[QueryOptions],
     ) -> Localisation:
         """Localise a photograph in the plans of a venue.
 
@@ -359,11 +375,13 @@ class Client(Transport):
             venue_id: id of the venue.
             panorama: as for `localise`.
             level: level of the camera; a hint unless `strict` is set.
+            on_device: as for `localise`.
             **options: see `QueryOptions`; `near` is a latitude and longitude, or, if the venue has an anchor, a point
                 in the common frame of its plans.
         """
         values = {"venue_id": venue_id, "level": level}
-        return parse(Localisation, self.query(query_request, "/localise", [panorama], values, options))
+        content = self.localise_query("/localise", [panorama], values, options, on_device=on_device)
+        return parse(Localisation, content)
 
     def localise_batch(
         self, floorplan_id: str, panoramas: Sequence[Photograph], **options: Unpack[QueryOptions]
@@ -409,6 +427,7 @@ class Client(Transport):
         camera_height_std_m: float | None = None,
         refine: SequenceRefine | None = None,
         top_k: int | None = None,
+        on_device: bool = False,
         **options: Unpack[ViewOptions],
     ) -> SequenceLocalisation:
         """Localise several photographs of one visit jointly.
@@ -430,6 +449,7 @@ class Client(Transport):
             camera_height_std_m: its standard deviation, as in `QueryOptions`.
             refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
             top_k: number of candidates per photograph. Default: set by the service.
+            on_device: as for `localise`.
             **options: camera of all photographs, see `ViewOptions`.
         """
         values = {
@@ -445,7 +465,7 @@ class Client(Transport):
             "refine": refine,
             "top_k": top_k,
         }
-        content = self.query(query_request, "/localise/sequence", panoramas, values, options)
+        content = self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
         return parse(SequenceLocalisation, content)
 
     def track(self, floorplan_id: str, **options: Unpack[SessionOptions]) -> Tracker:

@@ -10,7 +10,7 @@ from typing import Any, Unpack
 from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import ConflictError, NotFoundError
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import Photograph, Request, ViewOptions, json_request, query_request, resource_path
+from lalaloc_client.requests import Photograph, Request, ViewOptions, json_request, resource_path
 from lalaloc_client.tracking import Motion, Session, SessionOptions
 
 _OUT_OF_ORDER = "urn:lalaloc:problem:photograph-out-of-order"
@@ -62,6 +62,7 @@ class Tracker:
         *,
         heading_deg: float | None = None,
         heading_tolerance_deg: float | None = None,
+        on_device: bool = False,
         **options: Unpack[ViewOptions],
     ) -> Session:
         """Send the next photograph; return the session with its pose.
@@ -71,6 +72,7 @@ class Tracker:
             motion: motion since the photograph before; None if it was not measured.
             heading_deg: azimuth of the photograph's centre, if it is known.
             heading_tolerance_deg: its largest error. Default: 0.
+            on_device: as for `localise`.
             options: the camera; see `ViewOptions`. An app that knows gravity gives `pitch_deg` and `roll_deg`.
         """
         number = self.session.photographs + 1
@@ -78,7 +80,9 @@ class Tracker:
         path = f"{resource_path('sessions', self.session.id)}/photographs"
         try:
             moved = {} if motion is None else motion.to_dict()
-            content = self._service.query(query_request, path, [photograph], {**values, **moved}, options)
+            content = self._service.localise_query(
+                path, [photograph], {**values, **moved}, options, on_device=on_device
+            )
         except ConflictError as error:
             if error.type != _OUT_OF_ORDER:
                 raise

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from random import random
@@ -14,10 +14,20 @@ import httpx
 
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
-from lalaloc_client.errors import ConnectionFailedError, ProblemError, problem_of
+from lalaloc_client.blocking.device import Device
+from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.on_device import split_options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import Request, http_options, text_values
+from lalaloc_client.requests import (
+    Photograph,
+    QueryOptions,
+    Request,
+    ViewOptions,
+    http_options,
+    query_request,
+    text_values,
+)
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
@@ -30,6 +40,7 @@ _DEFAULT_MAX_QUERIES = 3
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 # A stream without data for this long is dead: the service sends a heartbeat every 15 s.
 _STREAM_TIMEOUT_S = 30.0
+_FOREIGN_FEATURES = "urn:lalaloc:problem:foreign-features"
 
 
 class Transport:
@@ -61,6 +72,7 @@ class Transport:
             raise ValueError(f"max_queries is {max_queries}; it must be at least 1")
         self._http = httpx.Client(**http_options(base_url, api_key, timeout_s))
         self._retry = retry or RetryPolicy()
+        self._device = Device(self._fetch)
         self._concurrency = ConcurrencyLimit(max_queries, self._fetch_max_queries)
 
     def close(self) -> None:
@@ -85,6 +97,32 @@ class Transport:
             # Reading and encoding pictures blocks.
             request = run_blocking(make, *args, **kwargs)
             return self.content(request)
+
+    def localise_query(
+        self,
+        path: str,
+        photographs: Sequence[Photograph],
+        values: Mapping[str, object],
+        options: QueryOptions | ViewOptions,
+        *,
+        on_device: bool = False,
+    ) -> bytes:
+        """Send a query about photographs, or about their features if they stay `on_device`; return the answer."""
+        if not on_device:
+            return self.query(query_request, path, photographs, values, options)
+        camera, others = split_options(options)
+        features = self._device.features(photographs, camera)
+        try:
+            return self.query(query_request, path, features, values, others)
+        except ConflictError as error:
+            if error.type != _FOREIGN_FEATURES:
+                raise
+        self._device.forget()
+        features = self._device.features(photographs, camera)
+        return self.query(query_request, path, features, values, others)
+
+    def _fetch(self, path: str) -> bytes:
+        return self.content(Request("GET", path, headers={"Accept": "*/*"}))
 
     def _stored(self, kind: type[StoredT], request: Request, retry: RetryPolicy | None = None) -> StoredT:
         """Send a request and return the stored object in the answer, with its entity tag."""

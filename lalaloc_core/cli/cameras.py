@@ -11,7 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPanoramaError
 
 if TYPE_CHECKING:
     from lalaloc_core.photograph import Assumed, Intrinsics, StatedView, View
@@ -115,5 +115,7 @@ def named(path: Path) -> Iterator[None]:
     """Name the photograph in errors about it."""
     try:
         yield
+    except (InvalidFeaturesError, ForeignFeaturesError) as error:
+        raise InvalidPanoramaError(f"'{path}': {error}") from error
     except InvalidPanoramaError as error:
         raise InvalidPanoramaError(f"'{path}': {error}; see docs/how-to/take-photographs.md") from error

@@ -47,7 +47,8 @@ def add_commands(commands: Any) -> None:
         type=Path,
         nargs="+",
         metavar="PHOTO",
-        help="full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md)",
+        help="full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md), or "
+        "their features from `lalaloc encode`",
     )
     localise.add_argument(
         "--heading",
@@ -80,7 +81,7 @@ def add_commands(commands: Any) -> None:
         choices=("both", "plan", "photograph"),
         default="both",
         help="content of --out: the plan with the posterior, the photograph with the predicted layout, or both "
-        "(default: %(default)s)",
+        "(default: %(default)s); of features only the plan",
     )
     add_file_options(localise)
     localise.add_argument("--json", action="store_true", help="print JSON: a list with one answer per photograph")
@@ -93,6 +94,7 @@ def add_commands(commands: Any) -> None:
 
 def _localise(arguments: argparse.Namespace) -> None:
     from lalaloc_core.draw.answer import draw_answer
+    from lalaloc_core.localise.features import is_features
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
         raise InvalidInputError("--heading-tolerance needs --heading, which is missing")
@@ -114,9 +116,11 @@ def _localise(arguments: argparse.Namespace) -> None:
         places.append((answer.photograph.stem, answer.drawn.camera))
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
-            shown = None if arguments.picture == "plan" else _pixels(answer.drawn, answer.content, stated)
+            # Features have no photograph to show.
+            picture = "plan" if is_features(answer.content) else arguments.picture
+            shown = None if picture == "plan" else _pixels(answer.drawn, answer.content, stated)
             title = answer.photograph.name if several else None
-            write_picture(draw_answer(answer.drawn, shown, arguments.picture, title=title), out)
+            write_picture(draw_answer(answer.drawn, shown, picture, title=title), out)
     write_files(arguments, plan, documents, places)
     if arguments.json:
         print_json(documents)
@@ -137,12 +141,13 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedView)
 
     from lalaloc_core.draw.answer import drawn_answer
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+    from lalaloc_core.localise.features import is_features, read_features
     from lalaloc_core.localise.information import advice_for, information_bits
     from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
     from lalaloc_core.localise.pipeline import localise
     from lalaloc_core.localise.retrieval import build_grid
     from lalaloc_core.localise.stated_camera import known_heading, stated_height
-    from lalaloc_core.photograph import open_view
+    from lalaloc_core.photograph import StatedView, open_view
 
     bundle = Bundle.open(arguments.bundle)
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
@@ -159,9 +164,14 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedView)
         try:
             content = content_of(path)
             with named(path):
-                view = open_view(
-                    content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
-                )
+                if is_features(content):
+                    if stated != StatedView():
+                        raise InvalidPanoramaError("the camera is stated to `lalaloc encode`; leave its options out")
+                    view = read_features(content, bundle)
+                else:
+                    view = open_view(
+                        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
+                    )
                 encoder.check(view)
         except InvalidPanoramaError as error:
             if len(arguments.photographs) == 1:

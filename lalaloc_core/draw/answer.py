@@ -125,7 +125,7 @@ def drawn_answer(
         confidence=None if confidence is None else confidence.position,
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
-        view=None if view is None or view.panorama is not None else view,
+        view=None if view is None or view.is_sphere else view,
     )
 
 

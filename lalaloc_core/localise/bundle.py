@@ -241,6 +241,12 @@ class Manifest:
         own = None if self.view is None or not view else self.view.confidence
         return self.confidence if own is None else own
 
+    @property
+    def sha256(self) -> str:
+        """Identity of the model: a digest over its files, which new metrics or names do not change."""
+        listing = "\n".join(f"{name} {entry.sha256}" for name, entry in sorted(self.files.items()))
+        return hashlib.sha256(listing.encode()).hexdigest()
+
     def to_json(self) -> str:
         """Return the manifest as indented JSON."""
         return json.dumps(dataclasses.asdict(self), indent=2, sort_keys=True) + "\n"
@@ -289,7 +295,7 @@ class Bundle:
         except OSError as error:
             raise BundleError(f"no model bundle at '{folder}': {error.strerror} ({MANIFEST_NAME})") from error
         manifest = Manifest.from_json(text)
-        return cls(folder, manifest, _digest_of(manifest))
+        return cls(folder, manifest, manifest.sha256)
 
     def check(self) -> None:
         """Check size and digest of every file.
@@ -347,10 +353,4 @@ def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
             files[path.name] = FileEntry(bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
     complete = dataclasses.replace(manifest, files=files)
     atomic_write(folder / MANIFEST_NAME, complete.to_json())
-    return Bundle(folder, complete, _digest_of(complete))
-
-
-def _digest_of(manifest: Manifest) -> str:
-    """Return the model's identity: a digest over its files, which new metrics or names do not change."""
-    listing = "\n".join(f"{name} {entry.sha256}" for name, entry in sorted(manifest.files.items()))
-    return hashlib.sha256(listing.encode()).hexdigest()
+    return Bundle(folder, complete, complete.sha256)

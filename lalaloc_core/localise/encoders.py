@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import onnxruntime
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
+from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
+from lalaloc_core.localise.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import Cohort
+from lalaloc_core.localise.image_network import PROFILE_OUTPUTS, SphereNetwork, array, session
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
@@ -32,10 +33,6 @@ from lalaloc_core.render.sweep import profiles_at
 _LAYOUT_BATCH = 256
 # Headings at which an architecture without a ring encodes the panorama, one pass each.
 _HEADINGS_WITHOUT_RING = 32
-PROFILE_OUTPUTS = ["log_profile", "log_scale"]
-STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
-# Outputs with a value for every azimuth column.
-_BY_COLUMN = ("log_profile", "log_scale", "opening_logits")
 
 
 class Encoders:
@@ -43,6 +40,7 @@ class Encoders:
 
     Attributes:
         cohort: poses of other homes; None if the bundle has none.
+        images: image encoder of spheres.
         predicts_profile: whether the image encoder predicts a wall profile.
         predicts_structure: whether it predicts openings, ceiling and room type.
     """
@@ -58,16 +56,9 @@ class Encoders:
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
         self._layout = session(bundle.read(LAYOUT_ONNX), threads)
-        # A bundle without an image encoder serves layout queries only.
-        image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self.manifest.files else None
-        self._image = None if image is None else session(image, threads)
-        inputs = [] if self._image is None else self._image.get_inputs()
-        self._image_takes_height = any(node.name == "camera_height_m" for node in inputs)
-        outputs = [] if self._image is None else self._image.get_outputs()
-        self.predicts_profile = {node.name for node in outputs}.issuperset(PROFILE_OUTPUTS)
-        self.predicts_structure = {node.name for node in outputs}.issuperset(STRUCTURE_OUTPUTS)
-        if self.predicts_structure:
-            _check_classes(self.manifest)
+        self.images = SphereNetwork(bundle, threads=threads)
+        self.predicts_profile = self.images.predicts_profile
+        self.predicts_structure = self.images.predicts_structure
         self._head = session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
 
     def layouts(
@@ -122,22 +113,36 @@ class Encoders:
         refined.
         """
         frame, frame_roll, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
-        sectors = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
-        all_shifts = np.arange(sectors)
-        max_shift = min(math.ceil(heading_tolerance / TWO_PI * sectors), (sectors - 1) // 2)
-        shifts = all_shifts if heading is None else np.arange(-max_shift, max_shift + 1)
-        heading_known = heading is not None and heading_tolerance == 0.0
         if self._head is None:
+            sectors = _HEADINGS_WITHOUT_RING
+            shifts = _shifts(heading, heading_tolerance, sectors)
             latents = self._latents_of_rolled_images(frame, camera_height.height_m, shifts, sectors)
             roll = frame_roll + shifts * (TWO_PI / sectors)
-            return Query(latents, roll, frame_heading, heading_known, camera_height)
+            known = heading is not None and heading_tolerance == 0.0
+            return Query(latents, roll, frame_heading, known, camera_height)
         # Rolling the ring rotates the camera, so the image is encoded once for all hypotheses.
-        outputs = self._outputs(frame, camera_height.height_m)
-        query = self._query_from_ring(outputs, shifts, frame_roll, camera_height)
-        searched = None
-        if heading is not None and self.predicts_profile:
-            searched = self._query_from_ring(outputs, all_shifts, frame_roll, camera_height)
-        return replace(query, frame_heading=frame_heading, heading_known=heading_known, searched=searched)
+        outputs = self.images.outputs(frame, camera_height.height_m)
+        turned = _Frame(heading, heading_tolerance, frame_roll, frame_heading)
+        return self._query_in_frame(outputs, turned, camera_height)
+
+    def query_of_outputs(
+        self,
+        outputs: Mapping[str, np.ndarray],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """Return the query of a panorama that was encoded without a heading, by the outputs of its image encoder.
+
+        `outputs` are for the given camera height. The other arguments are as for `query`. A heading is undone by whole
+        sectors instead of pixels.
+        """
+        sector = TWO_PI / self.manifest.ring_sectors
+        shift = 0 if heading is None else round(heading / sector)
+        frame_heading = 0.0 if heading is None else float(wrap_angle(heading - shift * sector))
+        turned = _Frame(heading, heading_tolerance, 0.0, frame_heading, shift)
+        return self._query_in_frame(outputs, turned, camera_height)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -165,19 +170,30 @@ class Encoders:
         """Encode an image once for each number of sectors to the right, for architectures without a ring."""
         width = image.shape[1]
         frames = (np.roll(image, int(shift) * width // sectors, axis=1) for shift in shifts)
-        return np.concatenate([self._run_image(frame[None], camera_height_m, ["latent"])[0] for frame in frames])
+        return np.concatenate([self.images.run(frame[None], camera_height_m, ["latent"])[0] for frame in frames])
+
+    def _query_in_frame(self, outputs: Mapping[str, np.ndarray], frame: _Frame, camera_height: CameraHeight) -> Query:
+        """Return the query of a panorama by the outputs of its image encoder."""
+        sectors = self.manifest.ring_sectors
+        shifts = frame.shift + _shifts(frame.heading, frame.tolerance, sectors)
+        query = self._query_from_ring(outputs, shifts, frame.roll, camera_height)
+        searched = None
+        if frame.heading is not None and self.predicts_profile:
+            searched = self._query_from_ring(outputs, np.arange(sectors), frame.roll, camera_height)
+        known = frame.heading is not None and frame.tolerance == 0.0
+        return replace(query, frame_heading=frame.rest, heading_known=known, searched=searched)
 
     def _query_from_ring(
         self,
-        outputs: dict[str, np.ndarray],
+        outputs: Mapping[str, np.ndarray],
         shifts: Int[np.ndarray, "k"],
         frame_roll: float,
         camera_height: CameraHeight,
     ) -> Query:
         """Return a query with one hypothesis for each shift, its heading unknown.
 
-        The ring and the predictions in `outputs` (see `_outputs`) are rolled to the right by `shifts` sectors; the
-        image was rolled by `frame_roll` (radians) before it was encoded.
+        The ring and the predictions in `outputs`, see `SphereNetwork.outputs`, are rolled to the right by `shifts`
+        sectors; the image was rolled by `frame_roll` (radians) before it was encoded.
         """
         assert self._head is not None
         sectors = outputs["ring"].shape[1]
@@ -186,22 +202,8 @@ class Encoders:
         predictions = self._predictions(outputs, shifts, sectors) if self.predicts_profile else {}
         return Query(latents, frame_roll + shifts * (TWO_PI / sectors), 0.0, False, camera_height, **predictions)
 
-    def _outputs(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
-        """Run the image encoder on a panorama; return its ring (c, s) and all other outputs by name.
-
-        All but the ring are averages over the panorama and its mirror image, which are more accurate.
-        """
-        if not self.predicts_profile:
-            return {"ring": self._run_image(image[None], camera_height_m, ["ring"])[0][0]}
-        names = [*PROFILE_OUTPUTS, *(STRUCTURE_OUTPUTS if self.predicts_structure else [])]
-        ring, *outputs = self._run_image(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
-        averaged = {}
-        for name, (value, mirrored) in zip(names, outputs, strict=True):
-            averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
-        return {"ring": ring[0], **averaged}
-
     def _predictions(
-        self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], sectors: int
+        self, outputs: Mapping[str, np.ndarray], shifts: Int[np.ndarray, "k"], sectors: int
     ) -> dict[str, Any]:
         """Return the predictions of a query, rolled to the right by numbers of sectors."""
         columns = shifts * (len(outputs["log_profile"]) // sectors)
@@ -216,18 +218,30 @@ class Encoders:
             predictions["room_type"] = PredictedRoomType(types, np.array(self.manifest.room_type_prior))
         return predictions
 
-    def _run_image(
-        self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]
-    ) -> list[np.ndarray]:
-        """Run the image encoder on a batch; return some outputs."""
-        if self._image is None:
-            raise BundleError(
-                f"model '{self.manifest.name}' has no image encoder ({IMAGE_ONNX}); it serves layout queries only"
-            )
-        inputs = {"image": np.ascontiguousarray(images)}
-        if self._image_takes_height:
-            inputs["camera_height_m"] = np.full(len(images), camera_height_m, dtype=np.float32)
-        return [array(value) for value in self._image.run(outputs, inputs)]
+
+class _Frame(NamedTuple):
+    """Frame of an encoded panorama.
+
+    Attributes:
+        heading, tolerance: azimuth of the centre and its largest error (radians); None if it is unknown.
+        roll: angle (radians) by which the image was rolled before it was encoded.
+        rest: part of the heading (radians) that rolling leaves.
+        shift: sectors by which the outputs are rolled to undo the heading.
+    """
+
+    heading: float | None
+    tolerance: float
+    roll: float
+    rest: float
+    shift: int = 0
+
+
+def _shifts(heading: float | None, tolerance: float, sectors: int) -> Int[np.ndarray, "k"]:
+    """Return the hypotheses of the heading, as numbers of sectors."""
+    if heading is None:
+        return np.arange(sectors)
+    largest = min(math.ceil(tolerance / TWO_PI * sectors), (sectors - 1) // 2)
+    return np.arange(-largest, largest + 1)
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
@@ -243,34 +257,7 @@ def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UI
     return frame, shift * pixel, float(wrap_angle(heading - shift * pixel))
 
 
-def _check_classes(manifest: Manifest) -> None:
-    """Check that the model was trained with the class codes of this version."""
-    for name, expected in (("opening_classes", OPENING_CLASSES), ("room_types", ROOM_TYPES)):
-        stated = getattr(manifest, name)
-        if stated != list(expected):
-            raise BundleError(f"model '{manifest.name}' has the {name} {stated}; this version needs {list(expected)}")
-    for name, classes in (("opening_prior", OPENING_CLASSES), ("room_type_prior", ROOM_TYPES)):
-        if len(getattr(manifest, name)) != len(classes):
-            raise BundleError(f"model '{manifest.name}': {name} needs one value for each of {list(classes)}")
-
-
 def log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]:
     """Return the logs of the probabilities of classes."""
     shifted = logits - logits.max(axis=-1, keepdims=True)
     return shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
-
-
-def array(value: object) -> np.ndarray:
-    """Return a network's output, which onnxruntime types as any object, as an array."""
-    assert isinstance(value, np.ndarray)
-    return value
-
-
-def session(model: bytes, threads: int) -> onnxruntime.InferenceSession:
-    """Create a session with a number of intra-op threads, 0 for one per core."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    # Spinning idle threads would take the cores of the LPO workers.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

@@ -12,8 +12,9 @@ from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.localise.bundle import Bundle, Manifest
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.features import at_height
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.view_encoder import LevelPatch, OnnxViewEncoder
+from lalaloc_core.localise.view_encoder import VIEW_OUTPUTS, LevelPatch, OnnxViewEncoder
 from lalaloc_core.photograph import PatchSize, View
 
 
@@ -52,21 +53,40 @@ class PhotographEncoder:
             camera_height: as in `Encoders.query`.
             heading_tolerance: as in `Encoders.query`.
             others: further photographs from the same place, none of them a sphere, each with its heading minus that of
-                `view` (radians).
+                `view` (radians); all of them encoded if `view` is.
 
         Raises:
             InvalidPanoramaError: the photograph is no sphere, and the bundle has no encoder of views.
         """
-        if view.panorama is not None:
+        if view.is_sphere:
             assert not others, "a sphere shows all that others could add"
+            if view.encoded is not None:
+                outputs = at_height(view.encoded, camera_height.height_m)
+                return self.networks.query_of_outputs(
+                    outputs, heading, camera_height, heading_tolerance=heading_tolerance
+                )
+            assert view.panorama is not None
             return self.networks.query(
                 view.panorama.pixels, heading, camera_height, heading_tolerance=heading_tolerance
             )
         self.check(view)
         assert self._views is not None
+        views = [(view, 0.0), *others]
+        if view.encoded is not None:
+            parts = [at_height(other.encoded, camera_height.height_m) for other, _ in views if other.encoded]
+            outputs = {name: np.concatenate([part[name] for part in parts]) for name in VIEW_OUTPUTS}
+            placed = [
+                (azimuth + turn, other.tilt_sd(azimuth))
+                for other, turn in views
+                if other.encoded
+                for azimuth in other.encoded.azimuths
+            ]
+            return self._views.query_of_outputs(
+                outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
+            )
         patches = [
             LevelPatch(patch.rgba, patch.azimuth_rad + turn, other.tilt_sd(patch.azimuth_rad))
-            for other, turn in ((view, 0.0), *others)
+            for other, turn in views
             for patch in other.patches
         ]
         return self._views.query(patches, heading, camera_height, heading_tolerance=heading_tolerance)
@@ -78,7 +98,7 @@ class PhotographEncoder:
             InvalidPanoramaError: the photograph is no sphere, and the bundle has no encoder of views.
         """
         manifest = self.networks.manifest
-        if view.panorama is None and manifest.view is None:
+        if not view.is_sphere and manifest.view is None:
             raise InvalidPanoramaError(
                 f"the photograph is {view.projection}, and model '{manifest.name}' reads full 360° spheres only; send "
                 "an equirectangular picture, twice as wide as high, or use a model with an encoder of views"

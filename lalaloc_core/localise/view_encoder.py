@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +14,8 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.bundle import VIEW_ONNX, Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import PROFILE_OUTPUTS, STRUCTURE_OUTPUTS, array, log_softmax, session
+from lalaloc_core.localise.encoders import log_softmax
+from lalaloc_core.localise.image_network import PROFILE_OUTPUTS, STRUCTURE_OUTPUTS, array, session
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
@@ -31,7 +32,7 @@ _TRAINED_TILT_SD = math.radians(0.7)
 _BATCH = 4
 # Smallest share of an azimuth column that must be seen to count.
 MIN_SEEN = 0.25
-_OUTPUTS = [*PROFILE_OUTPUTS, "log_share", "seen", *STRUCTURE_OUTPUTS]
+VIEW_OUTPUTS = [*PROFILE_OUTPUTS, "log_share", "seen", *STRUCTURE_OUTPUTS]
 
 
 class LevelPatch(NamedTuple):
@@ -79,8 +80,30 @@ class OnnxViewEncoder:
             camera_height: gives the picture its metric scale.
             heading_tolerance: as in `Encoders.query`.
         """
+        predicted = self.predicted([patch.image for patch in patches], camera_height.height_m)
+        placed = [(patch.azimuth, patch.tilt_sd) for patch in patches]
+        return self.query_of_outputs(predicted, placed, heading, camera_height, heading_tolerance=heading_tolerance)
+
+    def query_of_outputs(
+        self,
+        predicted: Mapping[str, np.ndarray],
+        placed: Sequence[tuple[float, float]],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """Return the query of a photograph by what the network predicted of its patches.
+
+        Args:
+            predicted: see `predicted`, for the given camera height.
+            placed: azimuth and standard deviation of the tilt of each patch, as in `LevelPatch`.
+            heading: as for `query`, like the other arguments.
+            camera_height: as for `query`.
+            heading_tolerance: as for `query`.
+        """
         columns = self._manifest.profile_columns
-        outputs = self._outputs(patches, camera_height.height_m)
+        outputs = self._on_circle(predicted, placed, camera_height.height_m)
         column = TWO_PI / columns
         frame = 0 if heading is None else round(heading / column)
         frame_heading = 0.0 if heading is None else float(wrap_angle(heading - frame * column))
@@ -92,12 +115,24 @@ class OnnxViewEncoder:
         known = heading is not None and heading_tolerance == 0.0
         return replace(query, frame_heading=frame_heading, heading_known=known, searched=searched)
 
-    def _outputs(self, patches: Sequence[LevelPatch], camera_height_m: float) -> dict[str, np.ndarray]:
-        """Run the encoder of views; return its predictions by azimuth column of the full circle."""
+    def predicted(self, images: Sequence[UInt8[np.ndarray, "h w 4"]], camera_height_m: float) -> dict[str, np.ndarray]:
+        """Run the encoder of views on level patches; return its outputs by patch."""
+        parts: list[list[np.ndarray]] = []
+        for first in range(0, len(images), _BATCH):
+            batch = images[first : first + _BATCH]
+            inputs = {"image": np.stack(batch), "camera_height_m": np.full(len(batch), camera_height_m, np.float32)}
+            parts.append([array(value) for value in self._session.run(VIEW_OUTPUTS, inputs)])
+        columns = zip(*parts, strict=True)
+        return {name: np.concatenate(values) for name, values in zip(VIEW_OUTPUTS, columns, strict=True)}
+
+    def _on_circle(
+        self, outputs: Mapping[str, np.ndarray], placed: Sequence[tuple[float, float]], camera_height_m: float
+    ) -> dict[str, np.ndarray]:
+        """Return the predictions of patches by azimuth column of the full circle."""
         columns, prior = self._manifest.profile_columns, np.array(self._view.opening_prior)
-        predicted = self._predicted(patches, camera_height_m)
-        tilt_sd = np.array([patch.tilt_sd for patch in patches])[:, None, None]
-        predicted["log_scale"] = _widened(predicted["log_profile"], predicted["log_scale"], tilt_sd, camera_height_m)
+        tilt_sd = np.array([sd for _, sd in placed])[:, None, None]
+        widened = _widened(outputs["log_profile"], outputs["log_scale"], tilt_sd, camera_height_m)
+        predicted = {**outputs, "log_scale": widened}
         modes = predicted["log_profile"].shape[2]
         circle = {
             "log_profile": np.zeros((columns, modes), np.float32),
@@ -108,8 +143,8 @@ class OnnxViewEncoder:
         width = predicted["seen"].shape[1]
         offset = np.arange(width) - width // 2
         distance = np.full(columns, np.inf)
-        for row, patch in enumerate(patches):
-            place = (columns // 2 + round(patch.azimuth / TWO_PI * columns) + offset) % columns
+        for row, (azimuth, _) in enumerate(placed):
+            place = (columns // 2 + round(azimuth / TWO_PI * columns) + offset) % columns
             nearer = (predicted["seen"][row] >= MIN_SEEN) & (np.abs(offset + 0.5) < distance[place])
             distance[place[nearer]] = np.abs(offset + 0.5)[nearer]
             for name, values in circle.items():
@@ -117,18 +152,6 @@ class OnnxViewEncoder:
         for name in STRUCTURE_OUTPUTS[1:]:
             circle[name] = predicted[name].mean(axis=0)
         return circle
-
-    def _predicted(self, patches: Sequence[LevelPatch], camera_height_m: float) -> dict[str, np.ndarray]:
-        """Return the network's outputs by patch."""
-        parts: list[list[np.ndarray]] = []
-        for first in range(0, len(patches), _BATCH):
-            batch = patches[first : first + _BATCH]
-            inputs = {
-                "image": np.stack([patch.image for patch in batch]),
-                "camera_height_m": np.full(len(batch), camera_height_m, np.float32),
-            }
-            parts.append([array(value) for value in self._session.run(_OUTPUTS, inputs)])
-        return {name: np.concatenate(values) for name, values in zip(_OUTPUTS, zip(*parts, strict=True), strict=True)}
 
     def _hypotheses(
         self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight

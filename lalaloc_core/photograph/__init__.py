@@ -7,6 +7,6 @@ of view from the segments of `lines.py`; `patches.py` samples through the models
 
 from lalaloc_core.photograph.patches import Patch, PatchSize
 from lalaloc_core.photograph.stated import Intrinsics, StatedView
-from lalaloc_core.photograph.view import Assumed, View, open_view
+from lalaloc_core.photograph.view import Assumed, Encoded, View, open_view
 
-__all__ = ["Assumed", "Intrinsics", "Patch", "PatchSize", "StatedView", "View", "open_view"]
+__all__ = ["Assumed", "Encoded", "Intrinsics", "Patch", "PatchSize", "StatedView", "View", "open_view"]

@@ -178,6 +178,16 @@ def camera_of_intrinsics(
     return camera
 
 
+def intrinsics_of(camera: Perspective | Fisheye) -> Intrinsics:
+    """Return the intrinsics of a camera, from which `camera_of_intrinsics` makes it again."""
+    matrix = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - _HALF_PIXEL, "cy": camera.cy - _HALF_PIXEL}
+    if isinstance(camera, Fisheye):
+        k1, k2, k3, k4 = camera.radial
+        return Intrinsics(**matrix, k1=k1, k2=k2, k3=k3, k4=k4)
+    (k1, k2, k3), (p1, p2) = camera.radial, camera.tangential
+    return Intrinsics(**matrix, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+
+
 def _check_distortion(camera: Camera) -> None:
     """Refuse a distortion that maps no ray to some border."""
     across, down = np.meshgrid(np.linspace(0.0, camera.width, 9), np.linspace(0.0, camera.height, 9))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -54,6 +55,19 @@ class Assumed:
     source: Source
 
 
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """Outputs of an image encoder, which replace the pixels of a photograph.
+
+    Attributes:
+        outputs: arrays by name, for a camera height of 1 m; see `localise.features`.
+        azimuths: azimuth (radians) of each patch relative to the photograph's centre; empty for a full sphere.
+    """
+
+    outputs: Mapping[str, np.ndarray]
+    azimuths: tuple[float, ...] = ()
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
     """A photograph as the encoders expect it, and what was assumed about it.
@@ -67,8 +81,10 @@ class View:
         azimuths: first and last azimuth (radians) that the photograph shows, relative to its centre, clockwise.
         patches: level patches that cover the photograph; empty for a full sphere.
         panorama: the level sphere; None for other photographs.
+        encoded: outputs of the image encoder, if they were sent instead of the pixels; see `localise.features`.
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
+        compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
         warnings: metadata that were ignored, and estimates to be checked.
     """
 
@@ -82,16 +98,18 @@ class View:
     panorama: Panorama | None = None
     camera: Camera | None = None
     axes: Float[np.ndarray, "3 3"] | None = None
+    encoded: Encoded | None = None
+    compass_heading: float | None = None
     warnings: tuple[str, ...] = ()
+
+    @property
+    def is_sphere(self) -> bool:
+        """Whether the photograph is a full sphere."""
+        return self.panorama is not None or (self.encoded is not None and not self.encoded.azimuths)
 
     def tilt_sd(self, azimuth: float) -> float:
         """Return the standard deviation (radians) of elevations along an azimuth, from those of pitch and roll."""
         return math.hypot(self.pitch.sd * math.cos(azimuth), self.roll.sd * math.sin(azimuth))
-
-    @property
-    def compass_heading(self) -> float | None:
-        """Azimuth of the centre, radians clockwise from true north; None if not in the metadata."""
-        return None if self.panorama is None else self.panorama.compass_heading
 
     def project(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
         """Return where the upright picture shows level rays (right, forward, up), and whether it does.
@@ -197,6 +215,7 @@ def _sphere_view(panorama: Panorama, lens: Lens, stated: StatedView, sphere: Pho
         roll=tilt(stated.roll_deg, sphere.roll),
         azimuths=(-half, half),
         panorama=panorama,
+        compass_heading=panorama.compass_heading,
         warnings=lens.warnings,
     )
 

@@ -102,10 +102,9 @@ class Parts:
     fields: dict[str, str]
     files: dict[str, UploadedFile]
 
-    def repeated(self, name: str) -> list[UploadedFile]:
-        """Return the repeated files of a name, in order."""
-        count = sum(key.startswith(f"{name}[") for key in self.files)
-        return [self.files[f"{name}[{index}]"] for index in range(count)]
+    def named(self, name: str) -> list[UploadedFile]:
+        """Return the files of a name, in order: the single one, or those that were repeated."""
+        return [file for key, file in self.files.items() if key.partition("[")[0] == name]
 
 
 Check = Callable[[Mapping[str, str]], list[tuple[str, str]]]
@@ -157,6 +156,7 @@ async def read_parts(
     check: Check = _no_fields,
     repeated: Mapping[str, Repeats] = MappingProxyType({}),
     aliases: Mapping[str, str] = MappingProxyType({}),
+    substitutes: Mapping[str, str] = MappingProxyType({}),
 ) -> Parts:
     """Read a multipart body.
 
@@ -168,6 +168,7 @@ async def read_parts(
         check: returns (field, message) for invalid values of fields.
         repeated: files that can be repeated.
         aliases: other names of files, and the names under which they are returned.
+        substitutes: other kinds of files, and the names of the files that they can be sent instead of.
 
     Raises:
         UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
@@ -204,7 +205,7 @@ async def read_parts(
         (aliases.get(name, name), value if isinstance(value, str) else uploaded[id(value)])
         for name, value in form.multi_items()
     ]
-    return _sort(items, limits, files, fields, check, repeated)
+    return _sort(items, limits, files, fields, check, repeated, substitutes)
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
@@ -237,10 +238,13 @@ def _sort(
     fields: set[str],
     check: Check,
     repeated: Mapping[str, Repeats],
+    substitutes: Mapping[str, str],
 ) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
-    files, counts = files | repeated.keys(), Counter[str]()
+    repeated = {**repeated, **{other: repeated[name] for other, name in substitutes.items() if name in repeated}}
+    needed, given = files | (repeated.keys() - substitutes.keys()), {name for name, _ in items}
+    files, counts = needed | substitutes.keys(), Counter[str]()
     for part, value in items:
         label, name = part[:50], part
         if part not in files | fields:
@@ -263,8 +267,13 @@ def _sort(
             found.files[name] = value
         else:
             faults.append((label, "must be a file (a part with a file name)"))
-    given = {name for name, _ in items}
-    faults.extend((name, "is missing") for name in sorted(files - given))
+    substituted = {name for other, name in substitutes.items() if other in given}
+    faults.extend((name, "is missing") for name in sorted(needed - given - substituted))
+    faults.extend(
+        (other, f"is given beside {name}; send one of the two")
+        for other, name in substitutes.items()
+        if {other, name} <= given
+    )
     for name, repeats in repeated.items():
         if name in given and not repeats.least <= counts[name] <= repeats.most:
             faults.append((name, repeats.fault(str(counts[name]))))

@@ -11,6 +11,7 @@ from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.lpo_pool import LpoPool
 from service.query.queries import (
+    Content,
     LocaliserBackend,
     OptimiserBackend,
     PanoramaQuery,
@@ -27,6 +28,7 @@ from service.query.venue_localiser import VenueLocaliser
 from service.query.venue_plans import VenuePlans
 
 __all__ = [
+    "Content",
     "Decoder",
     "Localiser",
     "LocaliserBackend",

@@ -89,12 +89,12 @@ class Decoder:
         return self._pool.state
 
     async def decode(
-        self, content: bytes | UploadedFile, stated: StatedView, deadline: float, client: str = ""
+        self, content: bytes | UploadedFile | View, stated: StatedView, deadline: float, client: str = ""
     ) -> View:
-        """Decode an uploaded photograph for the encoders.
+        """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
 
         Args:
-            content: the file.
+            content: the file, or what was read of its features.
             stated: the request's statements about it.
             deadline: time limit (`monotonic`).
             client: fairness group of the job.
@@ -106,6 +106,8 @@ class Decoder:
             DecoderNotReadyError: no worker is running, nor will be by the deadline.
             StoppingError: the service is shutting down.
         """
+        if isinstance(content, View):
+            return content
         result = await self._run_job(DecodeJob(content, stated), deadline, client)
         assert isinstance(result, View)
         return result

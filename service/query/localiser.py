@@ -186,7 +186,7 @@ class Localiser:
             known_heading(form.heading_of(index), plan.north, view, compass_deg) for index, view in enumerate(views)
         ]
         # A sphere shows all that other photographs from its spot could add.
-        one_query = form.motion == "turn" and not any(view.panorama is not None for view in views)
+        one_query = form.motion == "turn" and not any(view.is_sphere for view in views)
         turns = form.known_turns
         if one_query and turns is not None:
             grid, joint = await self._search_turn(record, query, views, known, turns, height)
@@ -301,13 +301,14 @@ class Localiser:
     ) -> bytes:
         context, photograph, view = query.context, None, outcome.view
         if request.picture != "plan":
+            assert not isinstance(query.content, View)
             # Decode again, because the encoder's input is too small for a picture.
             photograph = await self._decoder.picture(
                 query.content,
                 query.form.stated_view,
                 context.deadline,
                 context.client,
-                is_sphere=view.panorama is not None,
+                is_sphere=view.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
 

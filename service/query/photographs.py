@@ -16,10 +16,8 @@ from lalaloc_core.localise.poses import PoseGrid, Query
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.photograph import Assumed, View
 from lalaloc_core.photograph.cameras import Around, Fisheye
+from lalaloc_core.photograph.stated import intrinsics_of
 from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, ViewAnswer
-
-# OpenCV counts pixels from the centre of the first one.
-_HALF_PIXEL = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +101,7 @@ def _camera(view: View) -> CameraAnswer | None:
     camera = view.camera
     if camera is None or isinstance(camera, Around):
         return None
-    if isinstance(camera, Fisheye):
-        distortion = camera.radial
-    else:
-        (k1, k2, k3), (p1, p2) = camera.radial, camera.tangential
-        distortion = (k1, k2, p1, p2, k3)
-    return CameraAnswer(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx - _HALF_PIXEL,
-        cy=camera.cy - _HALF_PIXEL,
-        distortion=list(distortion),
-    )
+    names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
+    values = vars(intrinsics_of(camera))
+    matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
+    return CameraAnswer(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])

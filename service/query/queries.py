@@ -11,6 +11,7 @@ from lalaloc_core.draw.answer import Picture
 from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from lalaloc_core.photograph import View
 from service.pools import PoolState
 from service.schemas import (
     EarthPoint,
@@ -25,6 +26,9 @@ from service.schemas import (
 )
 from service.storage.records import PlanRecord, VenueRecord
 from service.uploaded_file import UploadedFile
+
+# Photograph of a query: a file, or a photograph that was encoded on its device (`localise.features`).
+Content = bytes | UploadedFile | View
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,12 +86,12 @@ class PanoramaQuery:
 
     Attributes:
         form: the validated form fields.
-        content: the uploaded picture file.
+        content: the uploaded picture file, or what was read of its features.
         context: client, deadline and clock.
     """
 
     form: LocaliseForm
-    content: bytes | UploadedFile
+    content: Content
     context: QueryContext
 
 
@@ -97,12 +101,12 @@ class SequenceQuery:
 
     Attributes:
         form: the validated form fields.
-        contents: the uploaded picture files, in the order in which they were taken.
+        contents: the uploaded picture files, or what was read of their features, in the order in which they were taken.
         context: client, deadline and clock.
     """
 
     form: SequenceForm
-    contents: Sequence[bytes | UploadedFile]
+    contents: Sequence[Content]
     context: QueryContext
 
 
@@ -115,7 +119,7 @@ class TrackQuery:
         document: the request that began the session.
         state: state after the photographs before; None for the first.
         form: the validated form fields.
-        content: the uploaded picture file.
+        content: the uploaded picture file, or what was read of its features.
         context: client, deadline and clock.
     """
 
@@ -123,7 +127,7 @@ class TrackQuery:
     document: SessionDocument
     state: bytes | None
     form: PhotographForm
-    content: bytes | UploadedFile
+    content: Content
     context: QueryContext
 
 

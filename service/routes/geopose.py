@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.localise.pipeline import StageClock
 from service.errors import (
+    FeaturesRequiredError,
     InvalidRequestError,
     NoPlanNearbyError,
     UnanchoredPlanError,
@@ -88,6 +89,8 @@ async def geopose(
         raise InvalidRequestError([("venue_id", "floorplan_id is given as well; give at most one of the two")])
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
     media_type(request, (JSON,))
+    if settings.panoramas.require_features:
+        raise FeaturesRequiredError
     clock, max_bytes = StageClock(), settings.panoramas.max_panorama_bytes
     add_log_fields(request, clock=clock)
     with clock.stage("upload"):

@@ -26,7 +26,15 @@ from service.http.uploads import GEOJSON, JSON, MULTIPART, media_type
 from service.query import PanoramaQuery, PictureRequest
 from service.query.geopose import geojson_feature
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
-from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.routes.query_request import (
+    FEATURES,
+    PHOTO,
+    QUERY_ERRORS,
+    body_schema,
+    check_idempotent_media,
+    photographs_of,
+    read_query,
+)
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import add_log_fields
@@ -79,7 +87,7 @@ async def localise(
         Query(
             description="Content of the picture: the `plan` with the posterior as a heat map, the answer, its "
             "covariance ellipse and the other candidates; the `photograph` with the layout drawn in; or `both` (the "
-            "default). Needs `Accept: image/png` or `Accept: image/svg+xml`."
+            "default, without a photograph: `plan`). Needs `Accept: image/png` or `Accept: image/svg+xml`."
         ),
     ] = None,
 ) -> Response:
@@ -104,9 +112,14 @@ async def localise(
         raise InvalidRequestError(
             [("venue_id", f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id")]
         )
+    (content,) = photographs_of(parts, form, runtime.bundle)
+    if parts.named(FEATURES):
+        if picture in ("both", "photograph"):
+            raise InvalidRequestError([("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")])
+        picture = None if picture is None and media in (JSON, GEOJSON) else "plan"
 
     async def respond() -> Response:
-        query = PanoramaQuery(form, parts.files[PHOTO], context)
+        query = PanoramaQuery(form, content, context)
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)

@@ -28,10 +28,18 @@ from service.http.admission_control import BATCH
 from service.http.lines import NDJSON, LinesResponse
 from service.http.problems import problem_document, problem_responses
 from service.http.uploads import MULTIPART, Repeats, media_type
-from service.query import PanoramaQuery, QueryContext
+from service.query import Content, PanoramaQuery, QueryContext
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.localise import kept_answer
-from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.routes.query_request import (
+    FEATURES,
+    PHOTO,
+    QUERY_ERRORS,
+    body_schema,
+    check_idempotent_media,
+    photographs_of,
+    read_query,
+)
 from service.runtime import Runtime
 from service.schemas import BatchLine, LocaliseAnswer, LocaliseForm
 from service.security import caller_of
@@ -93,7 +101,8 @@ async def localise_batch(request: Request, runtime: Running, tenant: Tenant, cli
         "max_sequence_bytes",
         repeated={PHOTO: Repeats(1, most, "max_batch_photographs")},
     )
-    photographs = parts.repeated(PHOTO)
+    files = parts.named(PHOTO) or parts.named(FEATURES)
+    photographs = list(zip(files, photographs_of(parts, form, runtime.bundle), strict=True))
     await runtime.access_control.count_photographs(caller_of(request.scope), len(photographs))
     localise = await _localiser_of(request, form, tenant, runtime)
     batch = _Batch(request, runtime, client, tenant, form, localise)
@@ -126,14 +135,14 @@ class _Batch:
         self._localise = localise
         self._common_error: Exception | None = None
 
-    async def lines(self, photographs: Sequence[UploadedFile]) -> AsyncGenerator[str]:
+    async def lines(self, photographs: Sequence[tuple[UploadedFile, Content]]) -> AsyncGenerator[str]:
         """Yield the line of every photograph, in order. While a line is not taken, no further photograph begins."""
         cores = self._runtime.settings.cores
         at_a_time = max(cores.workers + cores.compute_threads, 1)
         begun = deque[asyncio.Task[str]]()
         try:
-            for index, photograph in enumerate(photographs):
-                begun.append(asyncio.create_task(self._charged_line(index, photograph)))
+            for index, (file, photograph) in enumerate(photographs):
+                begun.append(asyncio.create_task(self._charged_line(index, file, photograph)))
                 if len(begun) >= at_a_time:
                     yield await begun[0]
                     begun.popleft()
@@ -145,14 +154,15 @@ class _Batch:
                 task.cancel()
             await asyncio.gather(*begun, return_exceptions=True)
 
-    async def _charged_line(self, index: int, photograph: UploadedFile) -> str:
+    async def _charged_line(self, index: int, file: UploadedFile, photograph: Content) -> str:
         # A task is not part of the request's own steps.
-        return await self._runtime.admission.cpu_accounts.charged_steps(self._client, self._line(index, photograph))
+        line = self._line(index, file, photograph)
+        return await self._runtime.admission.cpu_accounts.charged_steps(self._client, line)
 
-    async def _line(self, index: int, photograph: UploadedFile) -> str:
+    async def _line(self, index: int, file: UploadedFile, photograph: Content) -> str:
         answer = problem = retry_after_s = None
         try:
-            answer = await self._answer(photograph)
+            answer = await self._answer(file, photograph)
         except Exception as error:
             if not isinstance(error, LaLaLocError):
                 logging.getLogger(LOGGER_NAME).exception("unexpected error")
@@ -161,10 +171,10 @@ class _Batch:
             problem = problem_document(self._request, error)
             retry_after_s = error.retry_after_s if isinstance(error, ServiceError) else None
         finally:
-            photograph.close()
+            file.close()
         line = BatchLine(
             index=index,
-            name=None if photograph.name is None else photograph.name[:_MAX_NAME],
+            name=None if file.name is None else file.name[:_MAX_NAME],
             status=200 if problem is None else problem.status,
             answer=answer,
             problem=problem,
@@ -173,12 +183,12 @@ class _Batch:
         # In ASCII: names and details quote the request, which is not always encodable as UTF-8.
         return json.dumps(line.model_dump(mode="json", exclude_none=problem is not None))
 
-    async def _answer(self, photograph: UploadedFile) -> LocaliseAnswer:
+    async def _answer(self, file: UploadedFile, photograph: Content) -> LocaliseAnswer:
         """Localise one photograph; wait for a slot while the tenant's other queries have them all."""
         settings = self._runtime.settings
         limit = settings.panoramas.max_panorama_bytes
-        if len(photograph) > limit:
-            raise UploadTooLargeError("max_panorama_bytes", limit, len(photograph))
+        if len(file) > limit:
+            raise UploadTooLargeError("max_panorama_bytes", limit, len(file))
         context = QueryContext.starting(self._client, settings.requests.request_deadline_s)
         while True:
             if self._runtime.admission.stopping:

@@ -13,14 +13,20 @@ from service.http import IdempotentRequest
 from service.http.accept import preferred
 from service.http.problems import problem_responses
 from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, Repeats, media_type
-from service.query import SequenceQuery
+from service.query import Content, SequenceQuery
 from service.query.geopose import geojson_features
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query
-from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
+from service.routes.query_request import (
+    PHOTO,
+    QUERY_ERRORS,
+    body_schema,
+    check_idempotent_media,
+    photographs_of,
+    read_query,
+)
+from service.runtime import Runtime
 from service.schemas import SequenceAnswer, SequenceForm
-from service.settings import Settings
 from service.telemetry import add_log_fields
-from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
@@ -62,7 +68,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )
-    query = SequenceQuery(form, _photographs(parts, form, settings), context)
+    query = SequenceQuery(form, _photographs(parts, form, runtime), context)
 
     async def respond() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
@@ -77,17 +83,18 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     return await idempotent.run_async(parts, respond, runtime.reads)
 
 
-def _photographs(parts: Parts, form: SequenceForm, settings: Settings) -> list[UploadedFile]:
+def _photographs(parts: Parts, form: SequenceForm, runtime: Runtime) -> list[Content]:
     """Return the photographs in order.
 
     Raises:
         UploadTooLargeError: a photograph is larger than allowed.
+        InvalidFeaturesError, ForeignFeaturesError: see `photographs_of`.
         InvalidRequestError: fields that do not fit the number of photographs.
     """
-    contents = parts.repeated(PHOTO)
-    largest = max(len(content) for content in contents)
-    if largest > settings.panoramas.max_panorama_bytes:
-        raise UploadTooLargeError("max_panorama_bytes", settings.panoramas.max_panorama_bytes, largest)
+    limit = runtime.settings.panoramas.max_panorama_bytes
+    if (largest := max(map(len, parts.named(PHOTO)), default=0)) > limit:
+        raise UploadTooLargeError("max_panorama_bytes", limit, largest)
+    contents = photographs_of(parts, form, runtime.bundle)
     if faults := form.faults(len(contents)):
         raise InvalidRequestError(faults)
     return contents

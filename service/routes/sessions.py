@@ -36,7 +36,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body
 from service.query import TrackQuery
 from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, is_id, plan_for_query
-from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, read_query
+from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, photographs_of, read_query
 from service.runtime import Runtime
 from service.schemas import PhotographForm, SessionAnswer, SessionDocument, StoredPose
 from service.storage.records import PlanRecord
@@ -179,12 +179,13 @@ async def add_photograph(
     )
     # Checked before the session is claimed.
     _ = form.odometry
+    (content,) = photographs_of(parts, form, runtime.bundle)
     session = await runtime.reads.run(tenant, runtime.store.sessions.claim, tenant, session_id, form.number)
     try:
         record = await _plan_of(session, runtime)
         add_log_fields(request, plan=record.id, revision=record.revision_id)
         document = SessionDocument.model_validate_json(session.options)
-        query = TrackQuery(session.id, document, session.state, form, parts.files[PHOTO], context)
+        query = TrackQuery(session.id, document, session.state, form, content, context)
         outcome = await runtime.tracker.track(record, query)
         finish = partial(runtime.store.sessions.finish, ttl_s=runtime.settings.storage.session_ttl_s)
         after = await runtime.reads.run(tenant, finish, session, outcome.state, outcome.stored.model_dump_json())

@@ -56,6 +56,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/venues/{venue_id}/plans"): Permission.READ,
     ("GET", "/answers/{answer_id}"): Permission.READ,
     ("DELETE", "/answers/{answer_id}"): Permission.LOCALISE,
+    ("GET", "/model/{file}"): Permission.LOCALISE,
     ("POST", "/localise"): Permission.LOCALISE,
     ("POST", "/localise/batch"): Permission.LOCALISE,
     ("POST", "/localise/sequence"): Permission.LOCALISE,

@@ -51,5 +51,5 @@ def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> Encoders:
     """Encoders whose image encoder reads the wall profile from painted pixels."""
     encoders = Encoders(opened_bundle, threads=1)
     assert isinstance(optimiser.encoder, RingLayoutEncoder)
-    encoders._image = PaintedSession(optimiser.encoder)
+    encoders.images.session = PaintedSession(optimiser.encoder)
     return encoders

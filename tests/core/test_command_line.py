@@ -62,6 +62,36 @@ def test_localise_works_from_any_folder(tmp_path: Path) -> None:
         assert (picture.format, picture.width) == ("PNG", 1600)
 
 
+def test_features_replace_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    phone, features = str(EXAMPLES / "phone.jpg"), str(tmp_path / "phone.features")
+    assert main(["encode", phone, "-o", features]) == 0
+    assert main(["encode", KITCHEN, BEDROOM, "-o", features]) == 2
+    capsys.readouterr()
+    assert main(["localise", PLAN, phone, features, "--json", "--out", str(tmp_path / "answer.svg")]) == 0
+    by_photograph, by_features = json.loads(capsys.readouterr().out)
+    for name in ("x_m", "y_m"):
+        assert by_features["position"][name] == pytest.approx(by_photograph["position"][name], abs=0.01)
+    assert by_features["room"] == by_photograph["room"]
+    assert "data:image/jpeg" not in (tmp_path / "answer-1.svg").read_text()
+    assert main(["localise", PLAN, features, "--hfov", "60"]) == 2
+    assert "lalaloc encode" in capsys.readouterr().err
+    assert main(["localise", PLAN, str(EXAMPLES / "flat.json")]) == 2
+
+
+def test_features_reveal_the_shape_of_a_room(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    features = tmp_path / "kitchen.features"
+    assert main(["encode", KITCHEN, "-o", str(features)]) == 0
+    capsys.readouterr()
+    assert main(["features", str(features), "--out", str(tmp_path / "room.png")]) == 0
+    room = json.loads(capsys.readouterr().out)
+    assert max(room["room_types"], key=room["room_types"].get) == "kitchen"
+    assert room["ceiling_height_m"] == pytest.approx(2.6, abs=0.4)
+    assert {opening["kind"] for opening in room["openings"]} >= {"door", "window"}
+    assert len(room["walls"]) == 128
+    with Image.open(tmp_path / "room.png") as picture:
+        assert picture.format == "PNG"
+
+
 def test_track_follows_spheres_and_phone_photographs(tmp_path: Path) -> None:
     walk = tmp_path / "walk"
     walk.mkdir()

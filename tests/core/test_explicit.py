@@ -130,7 +130,7 @@ class TestPredictedProfile:
         predicted_profiles = []
         for view in (image, image[:, ::-1]):
             inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.array([CAMERA_M], np.float32)}
-            (predicted,) = present(encoders._image).run(["log_profile"], inputs)
+            (predicted,) = present(encoders.images.session).run(["log_profile"], inputs)
             predicted_profiles.append(np.asarray(predicted)[0])
         assert left_over == 0.0
         np.testing.assert_allclose(

@@ -309,7 +309,7 @@ def test_unsampled_trace_is_not_exported() -> None:
 
 def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with (
-        _collector() as (endpoint, received),
+        collector() as (endpoint, received),
         start_app(tmp_path, otlp_endpoint=endpoint) as client,
     ):
         plan_id = upload(client, FLAT)
@@ -324,7 +324,7 @@ def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: 
 
 
 @contextmanager
-def _collector() -> Iterator[tuple[str, list[Any]]]:
+def collector() -> Iterator[tuple[str, list[Any]]]:
     """Run a collector that keeps the spans it receives."""
     received: list[Any] = []
 

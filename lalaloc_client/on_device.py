@@ -1,0 +1,139 @@
+"""Features of photographs, computed on this device with the service's image encoder; needs the extra `onnx`."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from lalaloc_client.errors import OnDeviceError
+from lalaloc_client.requests import Photograph, QueryOptions, ViewOptions, picture_file
+
+if TYPE_CHECKING:
+    from lalaloc_core.localise.features import FeatureEncoder
+    from lalaloc_core.photograph import StatedView
+
+_CAMERA = frozenset(ViewOptions.__optional_keys__)
+
+
+class OnDeviceModel:
+    """Image encoder of a service's model, cached on disk by the model's digest.
+
+    The files lie in `lalaloc/models` of the user's cache folder (`XDG_CACHE_HOME`, or `~/.cache`).
+    """
+
+    def __init__(self, manifest: bytes) -> None:
+        """Read the manifest that the service sent.
+
+        Raises:
+            OnDeviceError: the extra is not installed, or the service sent no manifest of a model.
+        """
+        try:
+            from lalaloc_core.errors import BundleError
+            from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle, Manifest
+            from lalaloc_core.localise.features import DEVICE_FILES
+        except ImportError as error:
+            raise OnDeviceError(
+                f"on_device=True needs the package '{error.name}': pip install 'lalaloc[onnx]'"
+            ) from error
+        try:
+            parsed = Manifest.from_json(manifest.decode())
+        except (BundleError, UnicodeDecodeError) as error:
+            raise OnDeviceError(f"the service's model cannot be read: {error}") from error
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        self._bundle = Bundle(cache / "lalaloc" / "models" / parsed.sha256, parsed, parsed.sha256)
+        self._files = [name for name in DEVICE_FILES if name != MANIFEST_NAME and name in parsed.files]
+        self._encoder: FeatureEncoder | None = None
+
+    def missing(self) -> list[str]:
+        """Return the names of the files that are not in the cache, or damaged there."""
+        from lalaloc_core.errors import BundleError
+
+        missing = []
+        for name in self._files:
+            try:
+                self._bundle.read(name)
+            except BundleError:
+                missing.append(name)
+        return missing
+
+    def store(self, name: str, content: bytes) -> None:
+        """Write a file to the cache, whole or not at all.
+
+        Raises:
+            OnDeviceError: the content has another digest than the manifest states, or cannot be written.
+        """
+        expected = self._bundle.manifest.files[name].sha256
+        if (digest := hashlib.sha256(content).hexdigest()) != expected:
+            raise OnDeviceError(f"the service sent '{name}' with the SHA-256 {digest}; its manifest states {expected}")
+        folder = self._bundle.folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # Not of a fixed name, because several processes may write the same file.
+            part, path = tempfile.mkstemp(prefix=name, suffix=".part", dir=folder)
+            try:
+                with os.fdopen(part, "wb") as file:
+                    file.write(content)
+                Path(path).replace(folder / name)
+            except BaseException:
+                Path(path).unlink(missing_ok=True)
+                raise
+        except OSError as error:
+            raise OnDeviceError(f"'{folder / name}' cannot be written: {error.strerror}") from error
+
+    def load(self) -> None:
+        """Load the networks.
+
+        Raises:
+            OnDeviceError: a file is missing or altered, or the model gives no features.
+        """
+        from lalaloc_core.errors import BundleError
+        from lalaloc_core.localise.features import FeatureEncoder
+
+        try:
+            self._encoder = FeatureEncoder(self._bundle)
+        except BundleError as error:
+            raise OnDeviceError(str(error)) from error
+
+    def features(self, photograph: Photograph, options: Mapping[str, Any]) -> bytes:
+        """Return the features of a photograph, given options about its camera; `load` comes first.
+
+        Raises:
+            OnDeviceError: the photograph cannot be read, or the model gives no features of such photographs.
+        """
+        from lalaloc_core.errors import InvalidPanoramaError
+        from lalaloc_core.localise.features import is_features
+        from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
+        from lalaloc_core.photograph import open_view
+
+        assert self._encoder is not None
+        content = picture_file(photograph)
+        if is_features(content):
+            return content
+        manifest = self._bundle.manifest
+        try:
+            view = open_view(
+                content,
+                sphere_size=sphere_size(manifest),
+                patch_size=patch_size(manifest),
+                stated=_stated(options),
+            )
+            return self._encoder.features(view)
+        except InvalidPanoramaError as error:
+            raise OnDeviceError(str(error)) from error
+
+
+def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], QueryOptions]:
+    """Return the options about the camera, which features contain, and all others."""
+    camera = {name: value for name, value in options.items() if name in _CAMERA and value is not None}
+    return camera, cast("QueryOptions", {name: value for name, value in options.items() if name not in _CAMERA})
+
+
+def _stated(options: Mapping[str, Any]) -> StatedView:
+    from lalaloc_core.photograph import Intrinsics, StatedView
+
+    intrinsics = options.get("intrinsics")
+    return StatedView(**{**options, "intrinsics": None if intrinsics is None else Intrinsics(**intrinsics)})

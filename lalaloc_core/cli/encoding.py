@@ -1,0 +1,91 @@
+"""`lalaloc encode` and `lalaloc features`: features of photographs, and what they show of a room."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.cli.arguments import positive
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view
+from lalaloc_core.cli.plan_files import check_picture_name, write_picture
+from lalaloc_core.cli.printing import print_json
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.files import atomic_write
+from lalaloc_core.localise.bundle import Bundle, default_bundle
+
+_HEIGHT_M = 1.5
+
+
+def add_commands(commands: Any) -> None:
+    """Add these commands to the parser."""
+    encode = commands.add_parser("encode", help="compute the features of photographs, to send instead of them")
+    encode.add_argument(
+        "photographs", type=Path, nargs="+", metavar="PHOTO", help="photographs, as for `lalaloc localise`"
+    )
+    encode.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="file of the features of a single photograph (default: beside each photograph, with the suffix .features)",
+    )
+    add_camera_options(encode)
+    encode.set_defaults(run=_encode)
+    features = commands.add_parser("features", help="show what features reveal of a room")
+    features.add_argument("file", type=Path, metavar="FILE", help="a file that `lalaloc encode` wrote")
+    features.add_argument(
+        "--out", type=Path, metavar="PICTURE", help="drawing of the room as the features tell it, .png or .svg"
+    )
+    features.add_argument(
+        "--camera-height",
+        type=positive,
+        default=_HEIGHT_M,
+        metavar="M",
+        help="metres above the floor, which give lengths their scale (default: %(default)s)",
+    )
+    features.set_defaults(run=_features)
+    for parser in (encode, features):
+        parser.add_argument(
+            "--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)"
+        )
+
+
+def _encode(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.localise.features import FeatureEncoder
+    from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
+    from lalaloc_core.photograph import open_view
+
+    if arguments.out is not None and len(arguments.photographs) > 1:
+        raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
+    stated, bundle = stated_view(arguments), Bundle.open(arguments.bundle)
+    manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
+    for path in arguments.photographs:
+        content = content_of(path)
+        with named(path):
+            view = open_view(content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest))
+            features = encoder.features(view)
+        out = arguments.out or path.with_suffix(".features")
+        try:
+            atomic_write(out, features)
+        except OSError as error:
+            raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
+        print(f"{out}: {len(features)} bytes")
+
+
+def _features(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.draw.seen_room import draw_seen_room, seen_room
+    from lalaloc_core.localise.camera_height import CameraHeight
+    from lalaloc_core.localise.features import read_features
+    from lalaloc_core.localise.photograph_encoder import PhotographEncoder
+
+    if arguments.out is not None:
+        check_picture_name(arguments.out)
+    bundle, content = Bundle.open(arguments.bundle), content_of(arguments.file)
+    with named(arguments.file):
+        view = read_features(content, bundle)
+    query = PhotographEncoder(bundle, threads=1).query(view, None, CameraHeight(arguments.camera_height))
+    room = seen_room(query)
+    print_json({"projection": view.projection, **room.document()})
+    if arguments.out is not None:
+        write_picture(draw_seen_room(room), arguments.out)

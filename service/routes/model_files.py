@@ -1,0 +1,66 @@
+"""Image encoder of the model, for devices that encode photographs themselves."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from hashlib import sha256
+from pathlib import Path
+
+from fastapi import APIRouter, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from lalaloc_core.localise.bundle import MANIFEST_NAME
+from lalaloc_core.localise.features import DEVICE_FILES, device_manifest, gives_features
+from service.errors import UnknownModelFileError
+from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
+from service.http.problems import problem_responses
+from service.http.uploads import JSON
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running
+from service.runtime import Runtime
+
+router = APIRouter(prefix="/model", tags=["localisation"])
+_BINARY = "application/octet-stream"
+_CHUNK_BYTES = 2**20
+
+
+@router.get(
+    "/{file}",
+    summary="Get a file of the image encoder",
+    response_class=Response,
+    openapi_extra={"parameters": [IF_NONE_MATCH]},
+    responses={
+        200: {"content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
+        **NOT_MODIFIED,
+        **problem_responses(UnknownModelFileError),
+    },
+)
+async def get_model_file(file: str, request: Request, runtime: Running, client: Client) -> Response:
+    """Return a file with which a device computes features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`.
+
+    The manifest has sizes and digests of the files, and no more of the model than its image encoder needs.
+    """
+    bundle = runtime.bundle
+    manifest = bundle.manifest
+    if file == MANIFEST_NAME and gives_features(manifest):
+        content = device_manifest(manifest).to_json().encode()
+        etag = digest_etag(sha256(content).hexdigest())
+        return not_modified(request, etag) or tagged_answer([content], JSON, etag)
+    entry = manifest.files.get(file)
+    if file not in DEVICE_FILES or entry is None or not gives_features(manifest):
+        raise UnknownModelFileError(file, manifest.name)
+    etag = digest_etag(entry.sha256)
+    if (answer := not_modified(request, etag)) is not None:
+        return answer
+    chunks = _chunks(bundle.folder / file, request, runtime, client)
+    return tagged_stream(chunks, entry.bytes, _BINARY, etag)
+
+
+async def _chunks(path: Path, request: Request, runtime: Runtime, client: str) -> AsyncIterator[bytes]:
+    """Yield a file until the client has gone. Clients check the digest, so an altered file is noticed there."""
+    with path.open("rb") as opened:
+        while not await request.is_disconnected():
+            async with runtime.admission.reading.held(client):
+                chunk = await run_in_threadpool(opened.read, _CHUNK_BYTES)
+            if not chunk:
+                return
+            yield chunk

@@ -1,0 +1,115 @@
+"""Photographs that stay on the client's device."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from lalaloc_client import ConflictError, InvalidError, OnDeviceError, UnauthorisedError
+from lalaloc_core.localise.bundle import default_bundle
+from tests.client.conftest import FailingServer, MakeClient, Planned
+from tests.core.taken import EXAMPLES
+from tests.service.conftest import StartApp, upload
+
+KITCHEN, PHONE = EXAMPLES / "kitchen.jpg", EXAMPLES / "phone.jpg"
+
+
+@pytest.fixture(scope="module")
+def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Return an app that takes features only."""
+    folder, bundle = tmp_path_factory.mktemp("data"), default_bundle()
+    with start_app(folder, bundle=bundle, require_features=True, request_deadline_s=90.0) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def home(app: httpx.Client) -> str:
+    return upload(app, json.loads((EXAMPLES / "flat.json").read_text()))
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the cached model."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "lalaloc" / "models"
+
+
+@pytest.fixture
+def service(app: httpx.Client, make_client: MakeClient, cache: Path) -> Iterator[Any]:
+    with make_client(str(app.base_url)) as client:
+        yield client
+
+
+def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) -> None:
+    with pytest.raises(UnauthorisedError, match="features-required"):
+        service.localise(home, KITCHEN, refine="none")
+    answer = service.localise(home, KITCHEN, on_device=True, refine="none")
+    assert answer.room == "kitchen"
+    (folder,) = cache.iterdir()
+    assert {path.name for path in folder.iterdir()} == {"image_encoder.onnx", "view_encoder.onnx"}
+    found = service.localise_sequence(home, [KITCHEN, PHONE.read_bytes()], on_device=True, hfov_deg=None, refine="none")
+    assert len(found.poses) == 2
+    with pytest.raises(OnDeviceError, match="hfov_deg is 900"):
+        service.localise(home, PHONE, on_device=True, hfov_deg=900.0)
+
+
+def test_damaged_cache_is_loaded_again(service: Any, home: str, cache: Path) -> None:
+    service.localise(home, PHONE, on_device=True, refine="none")
+    (folder,) = cache.iterdir()
+    whole = (folder / "view_encoder.onnx").read_bytes()
+    (folder / "view_encoder.onnx").write_bytes(whole[:1000])
+    (folder / "image_encoder.onnx").unlink()
+    # A model in memory is not read again, so forget it.
+    (getattr(service, "_client", service))._device.forget()
+    service.localise(home, PHONE, on_device=True, refine="none")
+    assert (folder / "view_encoder.onnx").read_bytes() == whole
+    assert {path.name for path in folder.iterdir()} == {"image_encoder.onnx", "view_encoder.onnx"}
+
+
+def test_features_are_sent_as_such(service: Any, home: str, tmp_path: Path) -> None:
+    from lalaloc_core.cli import main
+
+    file = tmp_path / "phone.features"
+    assert main(["encode", str(PHONE), "-o", str(file)]) == 0
+    assert (
+        service.localise(home, file, refine="none").room
+        == service.localise(home, PHONE, on_device=True, refine="none").room
+    )
+    with pytest.raises(InvalidError, match="invalid-features"):
+        service.localise(home, file.read_bytes() + b"0", refine="none")
+    with pytest.raises(ValueError, match="cannot be in one query"):
+        service.localise_sequence(home, [file, PHONE])
+
+
+def test_altered_model_is_refused(
+    make_client: MakeClient, failing: FailingServer, app: httpx.Client, cache: Path
+) -> None:
+    manifest = app.get("/model/manifest.json").content
+    failing.plan = [Planned(200, manifest), Planned(200, b"not a network")]
+    with make_client(failing.url) as client:
+        with pytest.raises(OnDeviceError, match=r"image_encoder\.onnx' with the SHA-256"):
+            client.localise("0" * 32, PHONE, on_device=True)
+        failing.plan = [Planned(200, {"format_version": 2})]
+        with pytest.raises(OnDeviceError, match="cannot be read"):
+            client.localise("0" * 32, PHONE, on_device=True)
+    assert not [path for path in cache.rglob("*") if path.is_file()]
+
+
+def test_service_with_another_model_gets_its_features(
+    make_client: MakeClient, failing: FailingServer, app: httpx.Client, cache: Path
+) -> None:
+    files = {name: app.get(f"/model/{name}").content for name in ("image_encoder.onnx", "view_encoder.onnx")}
+    manifest = Planned(200, app.get("/model/manifest.json").content)
+    foreign = {"type": "urn:lalaloc:problem:foreign-features", "status": 409, "detail": "another model"}
+    answers = [Planned(409, foreign), manifest, Planned(409, foreign)]
+    failing.plan = [manifest, *(Planned(200, content) for content in files.values()), *answers]
+    with make_client(failing.url, max_queries=1) as client, pytest.raises(ConflictError, match="another model"):
+        client.localise("0" * 32, PHONE, on_device=True)
+    # The files are cached by digest, so the manifest alone was read again.
+    assert [request.path for request in failing.requests].count("/model/manifest.json") == 2
+    assert len(failing.requests) == 6
