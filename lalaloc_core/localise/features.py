@@ -308,11 +308,10 @@ def _view_of(header: _Header, manifest: Manifest) -> View:
     """Return the photograph of a header, without outputs."""
     half = manifest.profile_columns // 2
     first_deg, last_deg = header.seen_deg
-    angles = {name: getattr(header, name) for name in ("hfov", "pitch", "roll")}
     faults = {
         "hfov": not 0.0 < header.hfov.value_deg <= 360.0,
         "pitch and roll": max(abs(header.pitch.value_deg), abs(header.roll.value_deg)) > 180.0,
-        "std_deg": not all(0.0 <= angle.std_deg <= 180.0 for angle in angles.values()),
+        "std_deg": not all(0.0 <= angle.std_deg <= 180.0 for angle in (header.hfov, header.pitch, header.roll)),
         "seen_deg": not (-360.0 <= first_deg < last_deg <= 360.0 and last_deg - first_deg <= 360.0),
         "compass_deg": header.compass_deg is not None and abs(header.compass_deg) > 360.0,
         "patches": len(header.patches) > _MAX_PATCHES or any(abs(place) > half for place in header.patches),
@@ -332,18 +331,20 @@ def _view_of(header: _Header, manifest: Manifest) -> View:
         camera = None if header.camera is None else _camera_of(header.camera, header.projection)
     except InvalidPanoramaError as error:
         raise InvalidFeaturesError(f"camera of the header: {error}") from error
-    assumed = {
-        name: Assumed(value=math.radians(angle.value_deg), sd=math.radians(angle.std_deg), source=angle.source)
-        for name, angle in angles.items()
-    }
+
+    def assumed(angle: _Angle) -> Assumed:
+        return Assumed(value=math.radians(angle.value_deg), sd=math.radians(angle.std_deg), source=angle.source)
+
     return View(
         projection=header.projection,
         projection_source=header.projection_source,
+        hfov=assumed(header.hfov),
+        pitch=assumed(header.pitch),
+        roll=assumed(header.roll),
         azimuths=(math.radians(first_deg), math.radians(last_deg)),
         camera=camera,
         compass_heading=None if header.compass_deg is None else math.radians(header.compass_deg),
         warnings=tuple(header.warnings),
-        **assumed,
     )
 
 
