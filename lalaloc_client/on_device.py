@@ -7,10 +7,10 @@ import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from lalaloc_client.errors import OnDeviceError
-from lalaloc_client.requests import Photograph, ViewOptions, picture_file
+from lalaloc_client.requests import Photograph, QueryOptions, ViewOptions, picture_file
 
 if TYPE_CHECKING:
     from lalaloc_core.localise.features import FeatureEncoder
@@ -126,10 +126,10 @@ class OnDeviceModel:
             raise OnDeviceError(str(error)) from error
 
 
-def split_options(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], QueryOptions]:
     """Return the options about the camera, which features contain, and all others."""
     camera = {name: value for name, value in options.items() if name in _CAMERA and value is not None}
-    return camera, {name: value for name, value in options.items() if name not in _CAMERA}
+    return camera, cast("QueryOptions", {name: value for name, value in options.items() if name not in _CAMERA})
 
 
 def _stated(options: Mapping[str, Any]) -> StatedView:
