@@ -115,7 +115,7 @@ class FeatureEncoder:
         Raises:
             BundleError: a file is missing or altered, or the model gives no features.
         """
-        if not gives_features(bundle.manifest):
+        if not _gives_features(bundle.manifest):
             raise BundleError(
                 f"model '{bundle.manifest.name}' (architecture '{bundle.manifest.architecture}') gives no features; "
                 "send the photograph instead"
@@ -158,7 +158,7 @@ def is_features(content: bytes) -> bool:
     return content.startswith(_MAGIC)
 
 
-def gives_features(manifest: Manifest) -> bool:
+def _gives_features(manifest: Manifest) -> bool:
     """Return whether a model gives features of any photographs."""
     return manifest.view is not None or _encodes_spheres(manifest)
 
