@@ -424,7 +424,7 @@ LOADS = (
         plan=ROOMS_PLAN,
     ),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
-    Load(("GET /model/{file}",), "encoder of views", _get("/model/view_encoder.onnx"), refusals=frozenset({404})),
+    Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(
         ("GET /answers/{answer_id}", "DELETE /answers/{answer_id}"),
         f"{VERTICES_PLAN}, posterior",

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.localise.bundle import MANIFEST_NAME
-from lalaloc_core.localise.features import DEVICE_FILES, device_manifest, gives_features
+from lalaloc_core.localise.features import DEVICE_FILES, device_manifest
 from service.errors import UnknownModelFileError
 from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
@@ -41,12 +41,12 @@ async def get_model_file(file: str, request: Request, runtime: Running, client: 
     """
     bundle = runtime.bundle
     manifest = bundle.manifest
-    if file == MANIFEST_NAME and gives_features(manifest):
+    if file == MANIFEST_NAME:
         content = device_manifest(manifest).to_json().encode()
         etag = digest_etag(sha256(content).hexdigest())
         return not_modified(request, etag) or tagged_answer([content], JSON, etag)
     entry = manifest.files.get(file)
-    if file not in DEVICE_FILES or entry is None or not gives_features(manifest):
+    if file not in DEVICE_FILES or entry is None:
         raise UnknownModelFileError(file, manifest.name)
     etag = digest_etag(entry.sha256)
     if (answer := not_modified(request, etag)) is not None:

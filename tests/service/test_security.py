@@ -114,6 +114,7 @@ class Guarded:
         """Send a request that is valid except for its key."""
         plan_id = plan_id or self.plan_id
         body: dict[str, Any] = {}
+        path = path.replace("{file}", "manifest.json")
         if f"{{{VENUE}}}" in path:
             made = self.client.post("/venues", json={}, headers=bearer(self.key)).json()
             path = path.replace(f"{{{VENUE}}}", made["id"])
