@@ -124,7 +124,8 @@ class SequenceForm(CameraFields, ViewFields):
     camera_heights_m: list[Annotated[float, Finite, Field(ge=MIN_CAMERA_HEIGHT_M)] | None] | None = Field(
         None,
         description="Camera heights of all photographs as a JSON array, null for the common one (`camera_height_m`, "
-        "else the plan's). The photographs share one relative error; `camera_height_std_m` is that of the common height.",
+        "else the plan's). The photographs share one relative error; `camera_height_std_m` is that of the common "
+        "height.",
     )
     refine: Literal["none", "lpo"] = Field(
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
