@@ -330,6 +330,7 @@ class SequencePose:
     geopose: GeoPose | None = None
     view: View | None = None
     probability_elsewhere: float | None = None
+    camera_height_m: float | None = None
 
 
 @dataclass(frozen=True)

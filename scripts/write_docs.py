@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
 # Purpose and first file of the folders without a package docstring.
 _OTHER_FOLDERS = {
+    "clients/typescript": ("Client for browsers and Node in TypeScript, which the web pages use.", "src/index.ts"),
     "web": ("Web pages in TypeScript; `make web` builds `service/web/` from them.", "src/app.ts"),
     "models/default": ("The shipped model and its card.", "README.md"),
     "docker": ("Image, compose files, nginx, Kubernetes manifests, Grafana dashboard.", "compose.yaml"),

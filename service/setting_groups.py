@@ -410,7 +410,12 @@ class PanoramaSettings(SettingGroup):
     """Limits of panoramas and queries."""
 
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Size of a panorama file.")
-    max_sequence_panoramas: int = Field(default=10, ge=2, le=20, description="Panoramas per sequence query.")
+    max_sequence_panoramas: int = Field(
+        default=100,
+        ge=2,
+        le=100,
+        description="Photographs of a sequence query; more than 10 have more time, in proportion.",
+    )
     max_sequence_bytes: Count = Field(
         default=100 * 2**20, description="Size of all photographs of a sequence query or a batch."
     )

@@ -40,6 +40,9 @@ _DEFAULT_BUNDLE = default_bundle().resolve()
 # Uploads in addition to the queries in progress, unless LALALOC_MAX_PENDING_REQUESTS is set.
 _DEFAULT_UPLOADS = 38
 
+# Photographs of a sequence within the time limits of one query.
+_PHOTOGRAPHS_PER_LIMIT = 10
+
 # Settings of earlier versions. A variable that sets one is ignored with a warning.
 _REMOVED = frozenset(
     {
@@ -155,9 +158,19 @@ class Settings(BaseModel):
         return self.requests.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
 
     @property
+    def sequence_deadline_s(self) -> float:
+        """Timeout for the longest sequence query after its upload."""
+        return self.requests.request_deadline_s * work_factor(self.panoramas.max_sequence_panoramas)
+
+    @property
     def database_url(self) -> str:
         """The SQLAlchemy URL in use."""
         return self.database.url or f"sqlite:///{(self.data_dir / 'lalaloc.sqlite3').resolve()}"
+
+
+def work_factor(photographs: int) -> float:
+    """Return the time limits of a query of several photographs, in units of those of one query."""
+    return max(photographs / _PHOTOGRAPHS_PER_LIMIT, 1.0)
 
 
 def settings_table() -> str:

@@ -425,6 +425,7 @@ class Client(Transport):
         heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
         camera_height_std_m: float | None = None,
+        camera_heights_m: Sequence[float | None] | None = None,
         refine: SequenceRefine | None = None,
         top_k: int | None = None,
         on_device: bool = False,
@@ -447,6 +448,7 @@ class Client(Transport):
             heading_tolerance_deg: maximum error of the headings. Default: 0.
             camera_height_m: camera height, common to all photographs, as in `QueryOptions`.
             camera_height_std_m: its standard deviation, as in `QueryOptions`.
+            camera_heights_m: height of each photograph, None for the common one; all share one relative error.
             refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
             top_k: number of candidates per photograph. Default: set by the service.
             on_device: as for `localise`.
@@ -462,6 +464,7 @@ class Client(Transport):
             "heading_tolerance_deg": heading_tolerance_deg,
             "camera_height_m": camera_height_m,
             "camera_height_std_m": camera_height_std_m,
+            "camera_heights_m": camera_heights_m,
             "refine": refine,
             "top_k": top_k,
         }

@@ -25,6 +25,8 @@ _VIEWS_PER_CAMERA = 2
 _PER_UNOPENED_HOME = 4
 # Homes of the cohort.
 _COHORT_HOMES = 60
+# Decimals of printed scores; a run's folder has all.
+_DECIMALS = 4
 # Columns of the printed table.
 _SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_within_2deg")
 
@@ -201,7 +203,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         run_evaluation(folder, info, workers=arguments.workers)
         report = score_run(folder)
     if arguments.json:
-        print_json(report)
+        print_json(report, _DECIMALS)
     else:
         _print_scores(report)
 
@@ -212,7 +214,7 @@ def _score(arguments: argparse.Namespace) -> None:
 
     reports = {str(path): score_run(RunFolder(path)) for path in arguments.runs}
     if arguments.json:
-        print_json(reports)
+        print_json(reports, _DECIMALS)
         return
     for path, report in reports.items():
         print(path)

@@ -13,7 +13,7 @@ from lalaloc_core.cli.answer_files import add_file_options, check_file_options, 
 from lalaloc_core.cli.arguments import heading, positive, tolerance
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.errors import InvalidInputError, InvalidPanoramaError
 from lalaloc_core.localise.bundle import Bundle, default_bundle
@@ -123,7 +123,7 @@ def _localise(arguments: argparse.Namespace) -> None:
             write_picture(draw_answer(answer.drawn, shown, picture, title=title), out)
     write_files(arguments, plan, documents, places)
     if arguments.json:
-        print_json(documents)
+        print_json(documents, JSON_DECIMALS)
     else:
         print_table(_HEAD, rows)
     if len(rows) < len(documents):

@@ -6,10 +6,22 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+# Decimals of printed poses: micrometres, and mm² of covariances.
+JSON_DECIMALS = 6
 
-def print_json(value: Any) -> None:
-    """Print indented JSON."""
-    print(json.dumps(value, indent=2))
+
+def print_json(value: Any, decimals: int | None = None) -> None:
+    """Print indented JSON, its numbers rounded to some decimals; None: as they are."""
+    print(json.dumps(value if decimals is None else _rounded(value, decimals), indent=2))
+
+
+def _rounded(value: Any, decimals: int) -> Any:
+    if isinstance(value, float):
+        # Adding 0.0 turns -0.0 into 0.0.
+        return round(value, decimals) + 0.0
+    if isinstance(value, dict):
+        return {name: _rounded(item, decimals) for name, item in value.items()}
+    return [_rounded(item, decimals) for item in value] if isinstance(value, list | tuple) else value
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

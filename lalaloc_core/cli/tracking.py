@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.arguments import heading, positive
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.bundle import Bundle, default_bundle
 
@@ -86,7 +86,7 @@ def _track(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         write_picture(_picture(plan, [answer.tracked for answer in found]), arguments.out)
     if arguments.json:
-        print_json([_document(answer, plan) for answer in found])
+        print_json([_document(answer, plan) for answer in found], JSON_DECIMALS)
     else:
         print_table(_HEAD, [_row(answer, plan) for answer in found])
 

@@ -42,6 +42,10 @@ class CameraHeight:
         if not self.std_m >= 0.0:
             raise InvalidPoseError(f"the camera height's deviation is {self.std_m:g} m; it must not be negative")
 
+    def at(self, height_m: float) -> CameraHeight:
+        """Return another stated height (m) with the same relative error; not for an unknown height."""
+        return CameraHeight(height_m, self.std_m * height_m / self.height_m)
+
     @property
     def is_exact(self) -> bool:
         """True if the height is exact."""
@@ -55,7 +59,8 @@ class CameraHeight:
     @property
     def log_std(self) -> float:
         """Standard deviation of δ; infinite if the height is unknown."""
-        return self.std_m / self.height_m
+        # Rounded, so that heights with the same relative error have the same offsets.
+        return round(self.std_m / self.height_m, 12)
 
     @cached_property
     def bounds(self) -> tuple[float, float]:

@@ -137,9 +137,9 @@ def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | 
 
 
 def run_steps(
-    steps: Generator[JobT, ResultT | None, FoundT], refiner: Callable[[JobT], ResultT | None] | None
+    steps: Generator[JobT | None, ResultT | None, FoundT], refiner: Callable[[JobT], ResultT | None] | None
 ) -> FoundT:
-    """Run a whole search in this process.
+    """Run a whole search in this process, without its pauses (None).
 
     `refiner` runs a job; it returns None if it has no result (in time). Searches without jobs need none.
     """
@@ -149,6 +149,9 @@ def run_steps(
             job = steps.send(result)
         except StopIteration as done:
             return done.value
+        if job is None:
+            result = None
+            continue
         assert refiner is not None
         result = refiner(job)
 

@@ -212,7 +212,7 @@ class AdmissionLimits:
             total_bytes=settings.uploads.total_bytes,
             # Time for the upload, the query or conversion, and sending the answer to a slow client.
             deadline_s=settings.uploads.deadline_s
-            + max(settings.requests.request_deadline_s, settings.plans.import_deadline_s)
+            + max(settings.sequence_deadline_s, settings.plans.import_deadline_s)
             + settings.requests.request_deadline_s,
         )
 

@@ -10,11 +10,12 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
+from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps, next_step
-from lalaloc_core.localise.poses import PoseGrid, RefinementJob
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps, next_step
+from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
 from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import SequenceJob
 from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
@@ -28,9 +29,9 @@ from service.query.answers import compose_answer, compose_sequence_answer, locat
 from service.query.decoding import Decoder
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
-from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_hints
+from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
-from service.settings import Settings
+from service.settings import Settings, work_factor
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
 from service.tenancy.fair_share import FairSemaphore, with_headroom
@@ -174,7 +175,12 @@ class Localiser:
 
     async def _localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
         form, context, clock = query.form, query.context, query.context.clock
-        height, plan = stated_height(form, record), record.plan
+        heights, plan = stated_heights(form, record, len(query.contents)), record.plan
+        if form.camera_heights_m is not None and not self._encoder.networks.predicts_profile:
+            raise InvalidPoseError(
+                "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
+                "give camera_height_m"
+            )
         compass_deg = self._settings.panoramas.compass_tolerance_deg
         # Decode one photograph at a time, so that a query occupies one decoder.
         with clock.stage("decode"):
@@ -189,12 +195,12 @@ class Localiser:
         one_query = form.motion == "turn" and not any(view.is_sphere for view in views)
         turns = form.known_turns
         if one_query and turns is not None:
-            grid, joint = await self._search_turn(record, query, views, known, turns, height)
+            grid, joint = await self._search_turn(record, query, views, known, turns, heights[0])
             found = localised_turn(joint, turns)
         else:
-            grid, found = await self._search_sequence(record, query, views, known, height)
+            grid, found = await self._search_sequence(record, query, views, known, heights)
             if one_query:
-                grid, joint = await self._search_turn(record, query, views, known, found_turns(found), height)
+                grid, joint = await self._search_turn(record, query, views, known, found_turns(found), heights[0])
                 found = judged_turn(found, joint)
         timings_ms = self.observe(context, found.stage)
         answers = [
@@ -219,13 +225,17 @@ class Localiser:
         query: SequenceQuery,
         views: Sequence[View],
         known: Sequence[KnownHeading],
-        height: CameraHeight,
+        heights: Sequence[CameraHeight],
     ) -> tuple[PoseGrid, SequenceLocalisation]:
         """Search the places of photographs that are linked by motions; return the pose grid, too."""
         form, context, clock = query.form, query.context, query.context.clock
-        photographs = [Photograph(view) for view in views]
-        encoded = await self.compute(context, partial(encode, self._encoder, photographs, known, height, clock))
-        grid = await self.grid(record, height, context)
+        encoded: list[Query] = []
+        # One at a time, so that queries of others come in between.
+        with clock.stage("encode"):
+            for view, heading, height in zip(views, known, heights, strict=True):
+                one = partial(encode, self._encoder, [Photograph(view)], [heading], height, StageClock())
+                encoded += await self.compute(context, one)
+        grid = await self.grid(record, heights[0], context)
         steps = localise_sequence_steps(
             record.plan,
             grid,
@@ -337,14 +347,20 @@ class Localiser:
             async with asyncio.timeout(max(context.left_s, 0.0)):
                 return await self._threads.run(context.client, work)
         except TimeoutError as error:
-            raise DeadlineExceededError(self._settings.requests.request_deadline_s) from error
+            raise DeadlineExceededError(context.limit_s) from error
 
-    async def run_search(self, steps: Generator[RefinementJob | SequenceJob, Any, T], context: QueryContext) -> T:
-        """Run a search on the compute threads; it holds none while LPO refines poses."""
+    async def run_search(
+        self, steps: Generator[RefinementJob | SequenceJob | None, Any, T], context: QueryContext
+    ) -> T:
+        """Run a search on the compute threads; it holds none in its pauses (None) and while LPO refines poses."""
         step = await self.compute(context, partial(next_step, steps, None))
-        while isinstance(step, RefinementJob | SequenceJob):
-            timeout_s = min(self._settings.lpo.deadline_s, context.left_s - _RESERVED_S)
-            result = await self._optimiser.refine(step, timeout_s, context.client)
+        while step is None or isinstance(step, RefinementJob | SequenceJob):
+            result = None
+            if step is not None:
+                photographs = step.heading.shape[1] if isinstance(step, SequenceJob) else 1
+                limit_s = self._settings.lpo.deadline_s * work_factor(photographs)
+                timeout_s = min(limit_s, context.left_s - _RESERVED_S)
+                result = await self._optimiser.refine(step, timeout_s, context.client)
             step = await self.compute(context, partial(next_step, steps, result))
         return step
 

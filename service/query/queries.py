@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Protocol, Self
 
@@ -24,6 +24,7 @@ from service.schemas import (
     SessionDocument,
     StoredPose,
 )
+from service.settings import work_factor
 from service.storage.records import PlanRecord, VenueRecord
 from service.uploaded_file import UploadedFile
 
@@ -61,6 +62,15 @@ class QueryContext:
         """
         begin = monotonic() - spent_s
         return cls(client=client, begin=begin, deadline=begin + limit_s, clock=clock or StageClock())
+
+    @property
+    def limit_s(self) -> float:
+        """Time limit (s) from the end of the upload."""
+        return self.deadline - self.begin
+
+    def for_photographs(self, count: int) -> Self:
+        """Return the context with the deadline of a query of several photographs."""
+        return replace(self, deadline=self.begin + self.limit_s * work_factor(count))
 
     @property
     def spent_s(self) -> float:

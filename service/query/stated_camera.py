@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.errors import InvalidHintError
+from lalaloc_core.errors import InvalidHintError, InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import stated_camera
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -14,7 +14,7 @@ from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.photograph import View
 from service.grids import check_height_m
-from service.schemas import LocaliseForm, PhotographForm, SessionDocument, StatedHeading
+from service.schemas import LocaliseForm, PhotographForm, SequenceForm, SessionDocument, StatedHeading
 from service.schemas.query_fields import CameraFields, EarthPoint, HintFields, PlanPoint
 from service.storage.records import PlanRecord
 
@@ -47,6 +47,28 @@ def stated_height(form: CameraFields, record: PlanRecord) -> CameraHeight:
     if form.camera_height_m is not None:
         check_height_m(record, form.camera_height_m)
     return stated_camera.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
+
+
+def stated_heights(form: SequenceForm, record: PlanRecord, photographs: int) -> list[CameraHeight]:
+    """Return the camera height of each photograph of a sequence, all with the same relative error.
+
+    Raises:
+        InvalidPoseError: a requested height is impossible in the plan, or the common height is needed and unknown.
+    """
+    common = stated_height(form, record)
+    if form.camera_heights_m is None:
+        return photographs * [common]
+    if common.is_unknown:
+        known_m = [height_m for height_m in form.camera_heights_m if height_m is not None]
+        if len(known_m) < photographs:
+            raise InvalidPoseError(
+                "camera_heights_m has null, and the plan states no camera height: give all heights, or camera_height_m"
+            )
+        common = stated_camera.stated_height(record.plan, known_m[0], form.camera_height_std_m)
+    for height_m in form.camera_heights_m:
+        if height_m is not None:
+            check_height_m(record, height_m)
+    return [common if height_m is None else common.at(height_m) for height_m in form.camera_heights_m]
 
 
 def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:

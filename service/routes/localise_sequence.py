@@ -68,7 +68,8 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )
-    query = SequenceQuery(form, _photographs(parts, form, runtime), context)
+    photographs = _photographs(parts, form, runtime)
+    query = SequenceQuery(form, photographs, context.for_photographs(len(photographs)))
 
     async def respond() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)

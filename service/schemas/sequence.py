@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
@@ -120,11 +121,17 @@ class SequenceForm(CameraFields, ViewFields):
     heading_tolerance_deg: Annotated[float, Finite] = Field(
         0.0, ge=0, le=45, description="Tolerance of `headings_deg`. Needs `headings_deg`."
     )
+    camera_heights_m: list[Annotated[float, Finite, Field(ge=MIN_CAMERA_HEIGHT_M)] | None] | None = Field(
+        None,
+        description="Camera heights of all photographs as a JSON array, null for the common one (`camera_height_m`, "
+        "else the plan's). The photographs share one relative error; `camera_height_std_m` is that of the common "
+        "height.",
+    )
     refine: Literal["none", "lpo"] = Field(
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
     )
 
-    @field_validator("motions", "headings_deg", "relative_heading_deg", mode="before")
+    @field_validator("motions", "headings_deg", "relative_heading_deg", "camera_heights_m", mode="before")
     @classmethod
     def _parse_array(cls, value: object) -> object:
         if not isinstance(value, str):
@@ -151,6 +158,13 @@ class SequenceForm(CameraFields, ViewFields):
             raise ValueError("needs headings_deg")
         return value
 
+    @field_validator("camera_heights_m")
+    @classmethod
+    def _check_heights(cls, value: object, given: ValidationInfo) -> object:
+        if value is not None and given.data.get("motion") == "turn":
+            raise ValueError("does not go with motion=turn; send camera_height_m")
+        return value
+
     @field_validator("relative_heading_deg")
     @classmethod
     def _check_relative(cls, value: object, given: ValidationInfo) -> object:
@@ -170,6 +184,7 @@ class SequenceForm(CameraFields, ViewFields):
         wanted = {
             "motions": (self.motions, photographs - 1),
             "headings_deg": (self.headings_deg, photographs),
+            "camera_heights_m": (self.camera_heights_m, photographs),
             "relative_heading_deg": (self.relative_heading_deg, photographs),
         }
         return [
@@ -223,6 +238,7 @@ class SequencePoseAnswer(ResponseModel):
     warnings: list[str]
     covariance_m2: Covariance | None
     heading_std_deg: Degrees | None
+    camera_height_m: Metres = Field(description="Best-fitting height of the camera of this photograph.")
     cost: Score
     latent_distance: Score
     geopose: GeoPose | None = None
@@ -246,6 +262,6 @@ class SequenceAnswer(ResponseModel):
         description="Motions in the request that were ignored, because the photographs contradict them."
     )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
-    camera_height_m: Metres = Field(description="Camera height that fits all photographs best.")
+    camera_height_m: Metres = Field(description="Camera height of the first photograph that fits all photographs best.")
     timings_ms: TimingsAnswer
     model: ModelAnswer

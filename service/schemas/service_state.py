@@ -33,7 +33,7 @@ class LimitsAnswer(ResponseModel):
     max_venue_plans: int = Field(description="Floor plans of a venue.")
     max_venue_bytes: int = Field(description="Size of a venue document.")
     max_panorama_bytes: int = Field(description="Size of a panorama file.")
-    max_sequence_panoramas: int = Field(description="Panoramas per sequence query.")
+    max_sequence_panoramas: int = Field(description="Photographs of a sequence query; more than 10 have more time.")
     max_sequence_bytes: int = Field(description="Size of all photographs of a sequence query or a batch.")
     max_batch_photographs: int = Field(description="Photographs of a batch.")
     max_pixels: int = Field(description="Pixels of a panorama.")

@@ -52,7 +52,7 @@ def test_readme_example_works_in_node(start_app: StartApp, tmp_path: Path) -> No
         (tmp_path / "package.json").write_text('{"type": "module"}')
         (tmp_path / "run.js").write_text(_RUN.replace("ADDRESS", address))
         strict = ["--strict", "--target", "ES2022", "--module", "nodenext", "--lib", "ES2022,DOM,DOM.Iterable"]
-        tsc(*strict, "--types", "", "example.ts", cwd=tmp_path)
+        tsc(*strict, "example.ts", cwd=tmp_path)
         files = [str(ROOT / "examples" / name) for name in ("flat.json", "study.jpg")]
         done = subprocess.run(
             ["node", "run.js", *files], cwd=tmp_path, stdout=subprocess.PIPE, text=True, timeout=300, check=True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -155,8 +156,10 @@ class TestCommandLine:
     ) -> None:
         arguments = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
         assert main(["evaluate", *arguments, "--out", str(tmp_path / "run"), "--json"]) == 0
-        printed = json.loads(capsys.readouterr().out)
+        output = capsys.readouterr().out
+        printed = json.loads(output)
         assert printed["n"] == 4
+        assert re.search(r"\.\d{5}", output) is None
         assert 0.0 <= printed["final"]["within_1m"]["value"] <= 1.0
         info = RunFolder(tmp_path / "run").read_info()
         RunFolder(tmp_path / "run").write_info(dataclasses.replace(info, bundle="gone", data="gone"))
@@ -166,6 +169,7 @@ class TestCommandLine:
         assert main(["score", str(tmp_path / "run")]) == 0
         table = capsys.readouterr().out
         assert "4 queries" in table
+        assert "too few queries for an interval: 4; give at least 20" in table
         (row,) = [line for line in table.splitlines() if line.startswith("answer ")]
         assert f"{printed['final']['median_cm']['value']:.1f}" in row
 

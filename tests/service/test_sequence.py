@@ -21,7 +21,7 @@ MOTION = {"distance_m": 1.5, "distance_std_m": 0.1, "turn_deg": 30, "turn_std_de
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), max_sequence_panoramas=4, max_sequence_bytes=200_000) as started:
+    with start_app(tmp_path_factory.mktemp("data"), max_sequence_panoramas=30, max_sequence_bytes=300_000) as started:
         yield started
 
 
@@ -114,13 +114,41 @@ def test_given_headings_are_followed(client: httpx.Client, plan_id: str, picture
             assert "which the panorama contradicts" in pose["warnings"][0]
 
 
+def test_each_photograph_can_have_a_camera_height(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    common = answer_to(client, plan_id, pictures, camera_height_m=1.2, refine="none")
+    for heights_m in ([1.2, 1.2, 1.2], [1.2, None, 1.2]):
+        each = answer_to(client, plan_id, pictures, camera_height_m=1.2, camera_heights_m=heights_m, refine="none")
+        assert each["poses"] == common["poses"]
+    exact = {"camera_height_m": 1.2, "camera_height_std_m": 0, "refine": "none"}
+    poses = answer_to(client, plan_id, pictures, camera_heights_m=[None, 1.6, 0.9], **exact)["poses"]
+    assert [pose["camera_height_m"] for pose in poses] == [1.2, 1.6, 0.9]
+    alone = localise(client, plan_id, pictures[1], **(exact | {"camera_height_m": 1.6})).json()
+    assert poses[1]["cost"] == pytest.approx(alone["cost"], abs=1e-3)
+    refused = ask(client, plan_id, pictures, camera_heights_m=[None, 2.45, 0.9])
+    assert "camera_height_m is 2.45" in assert_problem(refused, 422, "invalid-pose")["detail"]
+    plan = upload(client, {name: value for name, value in FLAT.items() if name != "camera_height_m"})
+    refused = assert_problem(ask(client, plan, pictures, camera_heights_m=[None, 1.6, 0.9]), 422, "invalid-pose")
+    assert "give all heights" in refused["detail"]
+    assert len(answer_to(client, plan, pictures, camera_heights_m=[1.2, 1.6, 0.9])["poses"]) == 3
+
+
+def test_long_sequence_is_localised(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    motions = 27 * [MOTION | {"distance_m": 0.0, "direction_deg": 10.0, "direction_std_deg": 20.0}] + 2 * [None]
+    answer = answer_to(client, plan_id, 10 * pictures, motions=motions, refine="none")
+    assert len(answer["poses"]) == 30
+
+
 @pytest.mark.parametrize(
     ("count", "fields", "field", "message"),
     [
-        (1, {}, "photo", "is given 1 times, 2 to 4 are needed"),
-        (5, {}, "photo", "is given 5 times, 2 to 4 are needed"),
+        (1, {}, "photo", "is given 1 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PANORAMAS)"),
+        (31, {}, "photo", "is given 31 times, 2 to 30 are needed"),
+        (40, {}, "photo", "is given more than 30 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PANORAMAS)"),
         (3, {"motions": [MOTION]}, "motions", "has 1 items, 3 photographs need 2"),
         (2, {"headings_deg": [1.0]}, "headings_deg", "has 1 items, 2 photographs need 2"),
+        (2, {"camera_heights_m": [1.5]}, "camera_heights_m", "has 1 items, 2 photographs need 2"),
+        (2, {"camera_heights_m": [1.5, -1]}, "camera_heights_m.1", "must be at least"),
+        (2, {"camera_heights_m": [1.5, None], "motion": "turn"}, "camera_heights_m", "send camera_height_m"),
         (2, {"motions": "{}"}, "motions", "not a JSON array"),
         (2, {"motions": "[" * 2000}, "motions", "not a JSON array"),
         (2, {"motions": [MOTION | {"distance_m": -1}]}, "motions.0.distance_m", "must be at least 0"),
@@ -147,10 +175,10 @@ def test_invalid_panorama_is_rejected(client: httpx.Client, plan_id: str, panora
 
 
 def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    problem = assert_problem(ask(client, plan_id, [panorama, bytes(210_000)]), 413, "upload-too-large")
+    problem = assert_problem(ask(client, plan_id, [panorama, bytes(370_000)]), 413, "upload-too-large")
     assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
-    assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (4, 200_000)
+    assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (30, 300_000)
 
 
 def test_stated_motion_is_parsed() -> None:

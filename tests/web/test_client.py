@@ -81,7 +81,7 @@ def test_overload_is_retried_a_bounded_number_of_times(desktop: Visit) -> None:
 
 def test_request_ends_at_its_timeout_and_when_it_is_aborted(desktop: Visit) -> None:
     page, held = desktop.open(), list[Route]()
-    page.route("**/limits", held.append)
+    page.route("**/limits", lambda route: held.append(route))
     ended = run(
         page,
         """

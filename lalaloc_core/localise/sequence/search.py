@@ -36,8 +36,8 @@ SequenceRefine = Literal["none", "lpo"]
 # Runs joint refinement; None if it has no result (in time).
 SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
 # Maximum numbers of a picture's places, the best by every n-th azimuth, with n = `_STRIDE`, and of its states: places
-# under each hypothesis.
-_MAX_PLACES, _MAX_STATES, _STRIDE = 2048, 131_072, 4
+# under each hypothesis. Pictures beyond `_FULL_PICTURES` share the states of so many.
+_MAX_PLACES, _MAX_STATES, _STRIDE, _FULL_PICTURES = 2048, 131_072, 4, 10
 # Number of refined paths, and of modes of each picture through which paths are searched.
 _PATHS, _MODES = 8, 8
 # Half squared residual, of four standard deviations, beyond which the answer contradicts a motion.
@@ -72,7 +72,8 @@ class SequenceLocalisation:
         return min(fits) * min(self.path_probability, 1.0) if len(fits) == len(alone) else None
 
 
-SequenceSteps = Generator[SequenceJob, SequenceResult | None, SequenceLocalisation]
+# Yields None where the search can pause.
+SequenceSteps = Generator[SequenceJob | None, SequenceResult | None, SequenceLocalisation]
 
 
 def localise_sequence(
@@ -88,8 +89,9 @@ def localise_sequence(
 ) -> SequenceLocalisation:
     """Localise several encoded panoramas of one visit in a plan.
 
-    The queries are in the order in which they were taken, all with the same stated camera height, and `motions` are
-    between neighbours. `refiner` refines paths; None ends at the grid. `top_k` limits the candidates of each picture.
+    The queries are in the order in which they were taken, their stated camera heights have the same relative error, and
+    `motions` are between neighbours. `refiner` refines paths; None ends at the grid. `top_k` limits the candidates of
+    each picture.
 
     Raises:
         InvalidMotionError: the number of motions is not one less than that of the pictures.
@@ -117,9 +119,12 @@ def localise_sequence_steps(
     config, clock = config or LocaliseConfig(), clock or StageClock()
     height = queries[0].camera_height
     with clock.stage("retrieve"):
-        pictures = [
-            _picture(plan, grid, query, encoders.manifest.evidence_for(view=query.is_view), config) for query in queries
-        ]
+        max_states = _MAX_STATES * _FULL_PICTURES // max(len(queries), _FULL_PICTURES)
+        pictures: list[Observation] = []
+        for query in queries:
+            weights = encoders.manifest.evidence_for(view=query.is_view)
+            pictures.append(_picture(plan, grid, query, weights, config, max_states))
+            yield None
         transitions = [
             transition(motion, first.states, second.states, grid.step_m)
             for motion, (first, second) in zip(motions, itertools.pairwise(pictures), strict=True)
@@ -164,7 +169,9 @@ def localise_sequence_steps(
         for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
     ]
     missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
-    return SequenceLocalisation(localisations, float(found.path[0]), stage, missed, clock.timings_ms)
+    # Paths that differ by less than counts as right are right as well, so Boole's inequality can say more.
+    wrong = sum(1.0 - picture.position for picture in found.pictures)
+    return SequenceLocalisation(localisations, max(float(found.path[0]), 1.0 - wrong), stage, missed, clock.timings_ms)
 
 
 def _localisation(
@@ -226,16 +233,21 @@ def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
 
 
 def _picture(
-    plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: LocaliseConfig
+    plan: FloorPlan,
+    grid: PoseGrid,
+    query: Query,
+    weights: MatchingWeights,
+    config: LocaliseConfig,
+    max_states: int,
 ) -> Observation:
-    """Compare a picture with the grid at every height."""
+    """Compare a picture with the grid at every height; keep the best states."""
     matching = config.matching
     doubted = contradicted(plan, grid, query, weights, matching)
     query = query.searched if doubted and query.searched is not None else query
     index = np.arange(len(grid.poses))
     if matching.compares_profiles(query):
         layouts, reach_m = grid.layouts(plan), matching.grid_reach * grid.step_m
-        most = min(_MAX_PLACES, _MAX_STATES // len(query.roll))
+        most = max(min(_MAX_PLACES, max_states // len(query.roll)), 1)
         if len(index) > most:
             coarse, _ = MatchingCost(plan, query, reach_m, weights, matching, stride=_STRIDE).costs(layouts)
             index = np.sort(np.argpartition(coarse.min(axis=0), most)[:most])
