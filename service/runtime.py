@@ -182,6 +182,7 @@ def start_runtime(
     renditions = RenditionCache(
         store.plans,
         converter,
+        bundle,
         step_m=settings.grids.grid_step_m,
         limit_bytes=settings.storage.plan_cache_bytes,
         max_pending=_MAX_PENDING_RENDITIONS,

@@ -17,7 +17,7 @@ from lalaloc_core.importers import ImportOptions
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
-from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition
+from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionJob
 from service.telemetry import Telemetry
 from service.workers.convert import (
     ConversionJob,
@@ -26,7 +26,6 @@ from service.workers.convert import (
     Imported,
     ImportJob,
     ParseJob,
-    RenditionJob,
     run_converter,
 )
 

@@ -24,7 +24,6 @@ from service.query.stated_camera import heading_warnings
 from service.schemas import (
     CandidateAnswer,
     LocaliseAnswer,
-    ModelAnswer,
     Position,
     PosteriorAnswer,
     SequenceAnswer,
@@ -148,11 +147,6 @@ def _candidate(place: Place, query: Query, probability: float | None) -> Candida
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
         geopose=geopose_at(place.anchor, (candidate.x_m, candidate.y_m), heading_deg, camera_height_m),
     )
-
-
-def model_answer(bundle: Bundle) -> ModelAnswer:
-    """Return name, version and digest of a bundle."""
-    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
 def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:
