@@ -100,6 +100,10 @@ class Draw(NamedTuple):
     mistaken: dict[int, float]
 
 
+# Outcomes of photographs at each place.
+Outcomes = dict[Condition, list[list[Draw]]]
+
+
 def errors_of(manifest: Manifest) -> Errors:
     """Return the measured errors of a model.
 
@@ -133,7 +137,7 @@ def localisability(plan: FloorPlan, manifest: Manifest, *, seed: int = 0) -> Loc
     places = _spread(plan, max(_MIN_PLACES, round(_PLACES * share)), rng)
     search = Searches(plan, manifest, errors, step_m=step_m)
     draws = max(1, round(_DRAWS * share))
-    outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
+    outcomes: Outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
     undrawn = search.draws(places, HARDEST, draws, rng, openings=False) if search.has_openings else None
     return _summary(plan, step_m, places, outcomes, undrawn)
 
@@ -247,12 +251,14 @@ def _summary(
     plan: FloorPlan,
     step_m: float,
     places: PoseSet,
-    outcomes: dict[Condition, list[list[Draw]]],
+    outcomes: Outcomes,
     undrawn: list[list[Draw]] | None,
 ) -> Localisability:
-    found = {name: _shares(rows, "found") for name, rows in outcomes.items()}
-    rooms = {name: _by_room(plan, places, share) for name, share in found.items()}
-    means = {name: _mean(plan, values) for name, values in rooms.items()}
+    found: dict[Condition, Float[np.ndarray, "p"]] = {name: _shares(rows, "found") for name, rows in outcomes.items()}
+    rooms: dict[Condition, Float[np.ndarray, "r"]] = {
+        name: _by_room(plan, places, share) for name, share in found.items()
+    }
+    means: dict[Condition, float] = {name: _mean(plan, values) for name, values in rooms.items()}
 
     def mean(rows: list[list[Draw]], field: str) -> float:
         return _mean(plan, _by_room(plan, places, _shares(rows, field)))
@@ -291,7 +297,7 @@ def _mean(plan: FloorPlan, rooms: Float[np.ndarray, "r"]) -> float:
     return float(np.average(rooms[known], weights=plan.areas_m2[known]))
 
 
-def _confused(room: Int[np.ndarray, "p"], outcomes: dict[Condition, list[list[Draw]]]) -> tuple[ConfusedRooms, ...]:
+def _confused(room: Int[np.ndarray, "p"], outcomes: Outcomes) -> tuple[ConfusedRooms, ...]:
     """Return the pairs of rooms that are confused most, each under the condition that confuses it most."""
     worst: dict[tuple[int, int], ConfusedRooms] = {}
     for condition, rows in outcomes.items():
