@@ -22,9 +22,9 @@ from service.conversion.converter import Converter
 from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError, UnmeasuredModelError
 from service.renditions import make_rendition
 from service.storage.plans import Plans
-from service.stored_plan import SLOW, Rendition, RenditionJob, RenditionKind
+from service.stored_plan import PREDICTIONS, SLOW, Rendition, RenditionJob, RenditionKind
 from service.telemetry import LOGGER_NAME
-from service.tenancy.fair_share import Shares
+from service.tenancy.fair_share import FairSemaphore, Shares
 from service.threads import Threads
 
 # Characters of a document up to which its files are made in this process: about 30 rooms.
@@ -60,7 +60,16 @@ class RenditionCache:
     """Files of stored plans, for one event loop. Jobs that no request waits for are cancelled before they begin."""
 
     def __init__(
-        self, plans: Plans, converter: Converter, bundle: Bundle, *, step_m: float, limit_bytes: int, max_pending: int
+        self,
+        plans: Plans,
+        converter: Converter,
+        bundle: Bundle,
+        *,
+        step_m: float,
+        limit_bytes: int,
+        max_pending: int,
+        turns: FairSemaphore,
+        permits: FairSemaphore,
     ) -> None:
         """Start the threads.
 
@@ -71,6 +80,8 @@ class RenditionCache:
             step_m: grid step of descriptions.
             limit_bytes: size of the cache; 0 keeps no files.
             max_pending: largest number of files being made or waiting, shared between clients.
+            turns: permits to predict localisability.
+            permits: permits to compute, of which a prediction holds one.
         """
         self._plans = plans
         self._converter = converter
@@ -80,6 +91,7 @@ class RenditionCache:
         self._cache: BoundedCache[_Key, Rendition] = BoundedCache(limit_bytes, lambda made: len(made.content))
         self._pending: dict[_Key, _PendingJob] = {}
         self._shares = Shares(max_pending)
+        self._turns, self._permits = turns, permits
 
     def put(self, revision_id: str, kind: RenditionKind, made: Rendition) -> None:
         """Keep a file that was made elsewhere."""
@@ -123,22 +135,32 @@ class RenditionCache:
 
     async def _make(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition:
         try:
-            report = b""
-            if key[1] == "localisability":
-                self._check_model()
-            elif key[1] in CONDITIONS:
-                report = (await self.get(plan_id, key[0], "localisability", client)).content
-            begun = await self._threads.run(client, self._begin, job, plan_id, key, client, report)
-            if isinstance(begun, Rendition):
-                made = begun
+            if key[1] in PREDICTIONS:
+                made = await self._predicted(job, plan_id, key, client)
             else:
-                job.in_worker = begun
-                made = await self._converter.rendition(begun)
+                made = await self._made(job, plan_id, key, client)
         except DamagedDataError as error:
             logging.getLogger(LOGGER_NAME).error(str(error), extra={"fields": {"floorplan": plan_id}})
             raise
         self._cache.put(key, made)
         return made
+
+    async def _predicted(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition:
+        self._check_model()
+        report = b""
+        if key[1] in CONDITIONS:
+            report = (await self.get(plan_id, key[0], "localisability", client)).content
+        # The turn comes first: a permit must not be held by a prediction that waits.
+        async with self._turns.held(client), self._permits.held(client):
+            return await self._made(job, plan_id, key, client, report)
+
+    async def _made(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes = b"") -> Rendition:
+        begun = await self._threads.run(client, self._begin, job, plan_id, key, client, report)
+        if isinstance(begun, Rendition):
+            return begun
+        job.in_worker = begun
+        wait = self._converter.prediction if key[1] in PREDICTIONS else self._converter.rendition
+        return await wait(begun)
 
     def _check_model(self) -> None:
         try:

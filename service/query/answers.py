@@ -24,6 +24,7 @@ from service.query.stated_camera import heading_warnings
 from service.schemas import (
     CandidateAnswer,
     LocaliseAnswer,
+    ModelAnswer,
     Position,
     PosteriorAnswer,
     SequenceAnswer,
@@ -126,7 +127,7 @@ def compose_answer(
         geopose=best.geopose,
         view=view(found, confidence),
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
-        model=model_answer(bundle),
+        model=ModelAnswer.of(bundle),
     )
 
 

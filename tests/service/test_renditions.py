@@ -27,6 +27,8 @@ from service.storage import Store
 from service.storage.records import Original
 from service.stored_plan import Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload
 from tests.strategies import plan_of, spiral
@@ -65,7 +67,8 @@ def store(tmp_path: Path) -> Iterator[Store]:
 def cache(store: Store) -> Iterator[RenditionCache]:
     converter = Converter(Settings(import_workers=1), Telemetry())
     bundle = Bundle.open(default_bundle())
-    cache = RenditionCache(store.plans, converter, bundle, step_m=0.5, limit_bytes=100_000, max_pending=4)
+    permits = {name: FairSemaphore(1, CpuAccounts()) for name in ("turns", "permits")}
+    cache = RenditionCache(store.plans, converter, bundle, step_m=0.5, limit_bytes=100_000, max_pending=4, **permits)
     yield cache
     converter.close()
     cache.close()

@@ -1,6 +1,6 @@
 /** Client of the service's API; every request of the pages adds the API key here. */
 
-import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, SequenceAnswer, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
+import type { Answer, Fault, Layout, Localisability, Plan, PlanDocument, PlanList, Problem, SequenceAnswer, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
 
 const KEY = "lalaloc-key";
 
@@ -98,6 +98,11 @@ export const api = {
 
   async layout(id: string, revision?: string): Promise<Layout> {
     return json(`${path(id)}/layout${revisionQuery(revision)}`);
+  },
+
+  /** Predict which photographs of a plan will be found. */
+  async localisability(id: string): Promise<Localisability> {
+    return json(`${path(id)}/localisability`);
   },
 
   /** Upload a plan as a file; `fields` are import options. */
