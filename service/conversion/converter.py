@@ -3,8 +3,8 @@
 Large libraries, some of them in C++, read drawings, models and scans. A file that kills its worker is tried once more;
 a file that takes too long is not. The workers start with the first file that is not in the native format.
 
-Localisability is predicted and drawn by a worker of its own, started with the first prediction. It is not niced, as its jobs hold
-permits to compute like queries.
+Localisability is predicted and drawn by a worker of its own, started with the first prediction. It is not niced, as its
+jobs hold permits to compute like queries.
 """
 
 from __future__ import annotations

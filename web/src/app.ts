@@ -36,7 +36,7 @@ class Page {
   private readonly svg = byId("plan") as unknown as SVGSVGElement;
   private readonly base = s("g");
   private readonly heat = s("g");
-  private readonly localisability = new LocalisabilityLayer();
+  private readonly localisability = new LocalisabilityLayer(async () => this.plan ?? this.storeExample(new AbortController().signal));
   private readonly names = s("g");
   private readonly overlay = s("g");
   private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));

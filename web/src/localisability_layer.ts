@@ -28,7 +28,8 @@ export class LocalisabilityLayer {
   private plan: Plan | null = null;
   private found: Localisability | null = null;
 
-  constructor() {
+  /** `store` returns the plan that is shown, stored if it is an example. */
+  constructor(private readonly store: () => Promise<Plan>) {
     byId("map-actions").prepend(this.open);
     show(this.panel,
       h("div", { class: "fields" }, h("label", { for: this.photograph.id }, "Probability of finding"), this.photograph,
@@ -47,7 +48,7 @@ export class LocalisabilityLayer {
     }
     this.plan = plan;
     // The service predicts the current revision only.
-    this.open.disabled = plan === null || plan.status === "superseded";
+    this.open.disabled = plan?.status === "superseded";
   }
 
   close(): void {
@@ -61,11 +62,12 @@ export class LocalisabilityLayer {
       this.close();
       return;
     }
-    const { plan } = this;
-    if (plan === null || this.open.hasAttribute("aria-busy")) return;
+    if (this.open.hasAttribute("aria-busy")) return;
     clearError(byId("plan-error"));
     this.open.setAttribute("aria-busy", "true");
+    let { plan } = this;
     try {
+      plan = await this.store();
       const found = this.found ?? (await api.localisability(plan.id));
       // The user may have chosen another plan in the meantime.
       if (this.plan?.revision !== found.revision) return;
@@ -74,7 +76,7 @@ export class LocalisabilityLayer {
       this.open.setAttribute("aria-pressed", "true");
       this.draw();
     } catch (error) {
-      if (this.plan === plan) showError(byId("plan-error"), error);
+      if (this.plan?.revision === plan?.revision) showError(byId("plan-error"), error);
     } finally {
       this.open.removeAttribute("aria-busy");
     }

@@ -34,7 +34,7 @@ export async function savePicture(photo: Photo, fields: Record<string, HTMLEleme
 async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
   const { width, height } = map.getBoundingClientRect(), scale = PIXELS / Math.max(width, height);
   const picture = new Image();
-  picture.src = URL.createObjectURL(new Blob([standalone(map, width, height)], { type: "image/svg+xml" }));
+  picture.src = URL.createObjectURL(new Blob([standalone(map, scale)], { type: "image/svg+xml" }));
   try {
     await picture.decode();
   } catch {
@@ -54,15 +54,20 @@ async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
   download(content, `${name.replace(/[^\p{L}\p{N} _-]/gu, "").trim() || "plan"}.png`);
 }
 
-/** Return the map as SVG that needs no style sheet. */
-function standalone(map: SVGSVGElement, width: number, height: number): string {
+/** Return the map as SVG that needs no style sheet, larger than on the screen by `scale`. */
+function standalone(map: SVGSVGElement, scale: number): string {
+  const { width, height } = map.getBoundingClientRect();
   const copy = map.cloneNode(true) as SVGSVGElement;
   const shown = map.querySelectorAll("*"), copied = copy.querySelectorAll<SVGElement>("*");
   shown.forEach((element, index) => {
     const computed = getComputedStyle(element), style = copied[index]!.style;
     for (const property of STYLES) style.setProperty(property, computed.getPropertyValue(property));
+    // Strokes in pixels of the screen.
+    if (computed.vectorEffect !== "non-scaling-stroke") return;
+    style.strokeWidth = `${scale * parseFloat(computed.strokeWidth)}px`;
+    style.strokeDasharray = computed.strokeDasharray.replace(/[\d.]+/g, (length) => String(scale * Number(length)));
   });
-  copy.setAttribute("width", String(width));
-  copy.setAttribute("height", String(height));
+  copy.setAttribute("width", String(scale * width));
+  copy.setAttribute("height", String(scale * height));
   return new XMLSerializer().serializeToString(copy);
 }
