@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from lalaloc_core.conditions import CONDITIONS, Condition
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ExportFormat
-from lalaloc_core.localise.conditions import CONDITIONS, Condition
 
 if TYPE_CHECKING:
     from lalaloc_core.localise.bundle import Bundle

@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.conditions import CONDITIONS, HARDEST, PHOTOGRAPHS, Condition, parts_of
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import Manifest
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.conditions import CONDITIONS, HARDEST, PHOTOGRAPHS, Condition, parts_of
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.conditions import (
+from lalaloc_core.conditions import (
     CONDITIONS,
     HARDEST,
     Condition,
@@ -15,6 +14,7 @@ from lalaloc_core.localise.conditions import (
     condition_of,
     parts_of,
 )
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.localisability import STEP_M, Localisability
 
 _TITLES: dict[Photograph, str] = {

@@ -215,7 +215,7 @@ class Converter:
         return pool
 
     def _count(self, name: str) -> float:
-        return 0 if self._pool is None else getattr(self._pool, name)
+        return sum(getattr(pool, name) for pool in (self._pool, self._predicting) if pool is not None)
 
     def _raise_lost(self, error: JobLostError) -> NoReturn:
         settings = self._settings

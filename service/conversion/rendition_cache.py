@@ -13,9 +13,9 @@ from contextvars import Context
 from dataclasses import dataclass
 from functools import partial
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.conditions import CONDITIONS
 from lalaloc_core.localise.localisability import errors_of
 from service.bounded_cache import BoundedCache
 from service.conversion.converter import Converter
@@ -174,7 +174,8 @@ class RenditionCache:
         stored = None if job.abandoned else self._plans.stored(revision_id)
         if stored is None:
             raise UnknownFloorPlanError(plan_id)
-        rendition = RenditionJob(stored, kind, self._step_m, self._bundle, report)
+        bundle = self._bundle if kind in PREDICTIONS else None
+        rendition = RenditionJob(stored, kind, self._step_m, bundle, report)
         if len(stored.document.document) <= _SMALL and kind not in SLOW:
             return make_rendition(rendition)
         begun = self._converter.begin_rendition(rendition, client)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
+from lalaloc_core.conditions import Condition
 from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.conditions import Condition
 from lalaloc_core.localise.localisability import localisability
 from lalaloc_core.localise.localisability_report import report_of
 from service.schemas import LocalisabilityAnswer, ModelAnswer

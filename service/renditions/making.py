@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import cast
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.draw.plan import bounds_with, draw_rooms
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ExportFormat, export_plan
-from lalaloc_core.localise.conditions import CONDITIONS
 from service.errors import DamagedDataError
 from service.renditions.description import describe
 from service.renditions.layout import plan_layout

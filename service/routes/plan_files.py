@@ -9,10 +9,10 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.conditions import HeadingState, Photograph, condition_of
 from lalaloc_core.draw.plan import HEAT_PLACE, Bounds, Marker, svg_around
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
-from lalaloc_core.localise.conditions import HeadingState, Photograph, condition_of
 from service.errors import (
     ConverterNotReadyError,
     InvalidRequestError,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from lalaloc_core.localise.conditions import Condition
+from lalaloc_core.conditions import Condition
 from service.schemas.fields import Metres, ResponseModel, Score, Share
 from service.schemas.localise_answer import ModelAnswer
 

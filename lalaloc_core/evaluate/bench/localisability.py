@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.evaluate.bench.prediction_errors import outcomes_of, predicted_shares
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.conditions import CONDITIONS
 from lalaloc_core.localise.localisability import errors_of
 
 # Each spot is localised six times.

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.special import ndtri
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
@@ -24,7 +25,6 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.bundle import Bundle, Manifest, write_manifest
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.conditions import CONDITIONS
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.localisability import Errors, Searches
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
