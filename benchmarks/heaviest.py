@@ -352,6 +352,12 @@ LOADS = (
         _get("/floorplans/{floorplan_id}/mesh.glb"),
         plan=ROOMS_PLAN,
     ),
+    *(
+        Load(
+            (f"GET /floorplans/{{floorplan_id}}/{name}",), plan, _get(f"/floorplans/{{floorplan_id}}/{name}"), plan=plan
+        )
+        for name, plan in (("localisability", ROOMS_PLAN), ("localisability.svg", VERTICES_PLAN))
+    ),
     Load(
         ("GET /floorplans/{floorplan_id}/layout",),
         ROOMS_PLAN,

@@ -248,6 +248,66 @@ class RoomLayout:
     openings: tuple[OpeningPiece, ...]
 
 
+# Probability that a photograph is found, by its kind: `sphere`, `phone` or `three_phone`, and `_known_heading` or
+# `_unknown_heading`.
+Probabilities = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RatedRoom:
+    """Room with the probability that photographs taken in it are found; None if it was not predicted."""
+
+    id: str
+    name: str
+    probability: Probabilities | None
+
+
+@dataclass(frozen=True)
+class RatedPlace:
+    """Place with the probability that photographs taken there are found; `room` is the id of its room."""
+
+    x_m: float
+    y_m: float
+    room: str
+    probability: Probabilities
+
+
+@dataclass(frozen=True)
+class ConfusedRooms:
+    """Ids of two rooms, and the share of photographs of either that are answered in the other."""
+
+    rooms: tuple[str, str]
+    condition: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Localisability:
+    """Prediction of the photographs of a plan that will be found.
+
+    Attributes:
+        spacing_m: distance of the poses that are compared; an answer within 1 m, or within this distance if it is
+            longer, counts as found.
+        probability: mean over the plan's area.
+        rooms: all rooms.
+        places: places spread over the plan.
+        confused: pairs of rooms, the most confused first.
+        gains: increase of the probability of phone photographs with unknown heading by remedy: `heading`,
+            `three_photographs`, `sphere`, `room_hint`, and `doors`, which is that of the openings of the plan.
+        advice: sentences about confused rooms and what helps most.
+    """
+
+    floorplan_id: str
+    revision: str
+    spacing_m: float
+    probability: Probabilities
+    rooms: tuple[RatedRoom, ...]
+    places: tuple[RatedPlace, ...]
+    confused: tuple[ConfusedRooms, ...]
+    gains: Mapping[str, float | None]
+    advice: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Layout:
     """Walls and openings of a plan's revision, room by room."""

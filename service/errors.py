@@ -14,6 +14,7 @@ LaLaLocError
     ├── PhotographOutOfOrderError   the photograph is not the next one of the session
     ├── TooManySessionsError        the tenant's quota of sessions is used up
     ├── UnanchoredPlanError         the floor plan has no anchor
+    ├── UnmeasuredModelError        the model's errors were not measured
     ├── NoPlanNearbyError           no anchored floor plan near the given place
     ├── UploadTooLargeError         the body exceeds its size limit
     ├── SpoolFullError              no disk space for the body
@@ -164,6 +165,10 @@ class UnanchoredPlanError(ServiceError):
     def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
         nor = "" if venue_id is None else f", nor has venue '{venue_id}'"
         super().__init__(f"floor plan '{plan_id}' has no anchor{nor}; add one for answers in latitude and longitude")
+
+
+class UnmeasuredModelError(ServiceError):
+    """The model has no measured errors, which predictions need."""
 
 
 class NoPlanNearbyError(ServiceError):

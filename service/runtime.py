@@ -184,9 +184,13 @@ def start_runtime(
     renditions = RenditionCache(
         store.plans,
         converter,
+        bundle,
         step_m=settings.grids.grid_step_m,
         limit_bytes=settings.storage.plan_cache_bytes,
         max_pending=_MAX_PENDING_RENDITIONS,
+        # There is one worker.
+        turns=FairSemaphore(1, telemetry.cpu_accounts),
+        permits=components.permits,
     )
     _log_start(bundle, grids, telemetry)
     if not store.plans.any_stored():

@@ -8,15 +8,25 @@ import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
+from lalaloc_core.conditions import CONDITIONS, Condition
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ExportFormat
 
+if TYPE_CHECKING:
+    from lalaloc_core.localise.bundle import Bundle
+
 # Files made from a plan: description (a part of the answer to GET), walls, rooms as SVG without and with the areas that
-# became no room, mesh, exports.
-RenditionKind = Literal["description", "layout", "drawing", "preview", "mesh"] | ExportFormat
+# became no room, mesh, exports; which photographs are found, and the map of that for each kind of them.
+RenditionKind = (
+    Literal["description", "layout", "drawing", "preview", "mesh", "localisability"] | ExportFormat | Condition
+)
+# Files that depend on the model.
+PREDICTIONS: frozenset[RenditionKind] = frozenset({"localisability", *CONDITIONS})
+# Made by worker processes even of small plans: the cells of maps are many, and predictions search the plan.
+SLOW: frozenset[RenditionKind] = frozenset({"ros", *PREDICTIONS})
 # Characters or bytes of a document beyond which worker processes parse it.
 LARGE = 256 * 1024
 # Rooms, openings or faces per piece of a packed plan: less than a millisecond of the interpreter.
@@ -115,6 +125,25 @@ class StoredPlan(PlanHead):
     """Stored plan as the database holds it, with its document."""
 
     document: PlanDocument
+
+
+@dataclass(frozen=True)
+class RenditionJob:
+    """Stored plan from which a file is made.
+
+    Attributes:
+        stored: the plan.
+        kind: kind of the file.
+        step_m: grid step, for the estimated size of the pose grid.
+        bundle: model of the service, for localisability.
+        report: the localisability, for its maps.
+    """
+
+    stored: StoredPlan
+    kind: RenditionKind
+    step_m: float
+    bundle: Bundle | None = None
+    report: bytes = b""
 
 
 @dataclass(frozen=True)

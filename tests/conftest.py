@@ -53,12 +53,12 @@ def _tiny_bundle(folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the tiny bundle with an encoder of views, whose weights are random."""
+    """Return the tiny bundle with an encoder of views, whose weights are random, and the measured errors of another."""
     import dataclasses
 
     from lalaloc_core.learn.export.bundle_export import add_view_encoder
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.localise.bundle import Bundle, default_bundle, write_manifest
     from lalaloc_core.nets.view_encoder import ViewEncoder
 
     origin = Bundle.open(tiny_bundle)
@@ -68,4 +68,10 @@ def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
     config = PRESETS["tiny"]
     torch.manual_seed(0)
     encoder = ViewEncoder(config.view, config.ring)
-    return add_view_encoder(dataclasses.replace(origin, folder=folder), config, encoder, {}).folder
+    bundle = add_view_encoder(dataclasses.replace(origin, folder=folder), config, encoder, {})
+    measured = Bundle.open(default_bundle()).manifest
+    assert bundle.manifest.view is not None
+    assert measured.view is not None
+    view = dataclasses.replace(bundle.manifest.view, errors=measured.view.errors)
+    priors = {"opening_prior": measured.opening_prior, "errors": measured.errors}
+    return write_manifest(folder, dataclasses.replace(bundle.manifest, view=view, **priors)).folder

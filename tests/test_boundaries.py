@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {
     "lalaloc_core.errors": 0,
     "lalaloc_core.conventions": 0,
+    "lalaloc_core.conditions": 0,
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.files": 0,
     "lalaloc_core.configuration": 1,

@@ -28,6 +28,7 @@ from lalaloc_client.model import (
     FloorPlanPage,
     FloorPlanSummary,
     Layout,
+    Localisability,
     PlanEvent,
     Venue,
     VenueAnchor,
@@ -172,6 +173,22 @@ class AsyncClient(AsyncTransport):
         """Return floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""
         path = f"{resource_path('floorplans', floorplan_id)}/mesh.glb"
         return await self.content(Request("GET", path, headers={"Accept": "model/gltf-binary"}))
+
+    async def localisability(self, floorplan_id: str) -> Localisability:
+        """Return which photographs of a plan will be found, predicted from the plan and the model's measured errors."""
+        path = f"{resource_path('floorplans', floorplan_id)}/localisability"
+        return parse(Localisability, await self.content(Request("GET", path)))
+
+    async def localisability_map(
+        self,
+        floorplan_id: str,
+        photograph: Literal["sphere", "phone", "three_phone"] = "phone",
+        heading: Literal["known", "unknown"] = "unknown",
+    ) -> str:
+        """Return an SVG drawing of the probability by place that a photograph is found."""
+        path = f"{resource_path('floorplans', floorplan_id)}/localisability.svg"
+        params = {"photograph": photograph, "heading": heading}
+        return (await self.content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
 
     async def events(self, floorplan_id: str) -> AsyncIterator[PlanEvent]:
         """Yield the progress of a plan until it is ready, failed or deleted.

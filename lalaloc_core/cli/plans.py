@@ -150,9 +150,10 @@ def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dic
     if arguments.picture is not None:
         check_picture_name(arguments.picture, "--picture")
     found = localisability(plan, Bundle.open(arguments.bundle).manifest)
+    report = report_of(plan, found)
     if arguments.picture is not None:
-        write_picture(localisability_svg(plan, found), arguments.picture, "--picture")
-    return report_of(plan, found), summary_of(plan, found)
+        write_picture(localisability_svg(plan, report), arguments.picture, "--picture")
+    return report, summary_of(plan, found)
 
 
 def _draw(arguments: argparse.Namespace) -> None:

@@ -3,7 +3,10 @@
 For each of some places the predictions of a model are drawn (`prediction_errors.py`) from the layout that the plan
 shows there, and searched for with the matching cost and the coarse pass of real queries. The share of draws whose
 answer is within 1 m is the probability. Ceilings and room types, which weigh little, are left out, and so is pose
-refinement; `PredictionErrors.spread` is fitted to make up for both.
+refinement; `PredictionErrors.spread` is fitted to make up for both. Poses that fit equally well share the answer.
+
+The pose grids of large plans are coarser, so that the work is bounded. An answer on a grid of step s is then right
+within s.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.conditions import CONDITIONS, HARDEST, PHOTOGRAPHS, Condition, parts_of
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
@@ -24,23 +28,21 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M
+from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, GridCosts
 from lalaloc_core.localise.prediction_errors import PredictionErrors
 from lalaloc_core.localise.retrieval import grid_costs
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid, random_poses
 
-# Photographs, with the number of views of 80° that each consists of; 0 for spheres.
-PHOTOGRAPHS = {"sphere": 0, "phone": 1, "three_phone": 3}
-CONDITIONS = tuple(f"{name}_{heading}_heading" for heading in ("known", "unknown") for name in PHOTOGRAPHS)
-# The condition that needs help most, which remedies are measured on.
-HARDEST = "phone_unknown_heading"
 FIELD = math.radians(80.0)
-# Grid poses beyond which plans are refused; places and draws at each; places of the largest plans.
-MAX_POSES = 40_000
+# Grid poses beyond which the grid is coarser; places and draws at each; places of the largest plans.
+_MAX_POSES = 40_000
 _PLACES, _MIN_PLACES, _DRAWS = 40, 12, 2
 # Number of grid poses up to which all places are compared.
 _FULL_POSES = 2_500
-_STEP_M = 0.5
+# Grid step (m); those of larger plans are multiples of 0.1 m.
+STEP_M, _STEPS_PER_M = 0.5, 10
+# Poses whose likelihoods differ by less than this factor fit equally well: copies of a room differ by rounding.
+_EQUAL = math.log(1.01)
 # Pairs of rooms that are listed, and the smallest share of confused photographs.
 _PAIRS, _MIN_CONFUSED = 10, 0.05
 
@@ -56,15 +58,16 @@ class ConfusedRooms(NamedTuple):
     """Two rooms, by their numbers, and the share of photographs of either that are answered in the other."""
 
     rooms: tuple[int, int]
-    condition: str
+    condition: Condition
     share: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisability:
-    """Probabilities that photographs are found within 1 m.
+    """Probabilities that photographs are found within 1 m, or within the spacing if that is more.
 
     Attributes:
+        spacing_m: step of the pose grid.
         places: the places.
         found: (p,) probability at each place by condition, see `CONDITIONS`.
         rooms: (r,) means of the rooms' places by condition; NaN for rooms without a place.
@@ -74,20 +77,31 @@ class Localisability:
             "room_hint", and "doors", which is that of the openings that the plan shows; None if it shows none.
     """
 
+    spacing_m: float
     places: PoseSet
-    found: dict[str, Float[np.ndarray, "p"]]
-    rooms: dict[str, Float[np.ndarray, "r"]]
-    plan: dict[str, float]
+    found: dict[Condition, Float[np.ndarray, "p"]]
+    rooms: dict[Condition, Float[np.ndarray, "r"]]
+    plan: dict[Condition, float]
     confused: tuple[ConfusedRooms, ...]
     gains: dict[str, float | None]
 
 
 class Draw(NamedTuple):
-    """Outcome of a drawn photograph: whether it was found, also with a hint of its room, and the room of its answer."""
+    """Outcome of a drawn photograph.
 
-    found: bool
-    found_in_room: bool
-    room: int
+    Attributes:
+        found: probability that the answer is right.
+        found_in_room: the same with a hint of the room.
+        mistaken: probability of an answer in each of the other rooms.
+    """
+
+    found: float
+    found_in_room: float
+    mistaken: dict[int, float]
+
+
+# Outcomes of photographs at each place.
+Outcomes = dict[Condition, list[list[Draw]]]
 
 
 def errors_of(manifest: Manifest) -> Errors:
@@ -104,25 +118,28 @@ def errors_of(manifest: Manifest) -> Errors:
     return Errors(manifest.errors, view.errors)
 
 
+def spacing_m(plan: FloorPlan) -> float:
+    """Return the step of a plan's pose grid: wider than usual if it would have too many poses."""
+    # Every room has a pose, whatever the step.
+    left = max(_MAX_POSES - len(plan.rooms), _MAX_POSES // 2)
+    return max(STEP_M, math.ceil(_STEPS_PER_M * math.sqrt(plan.area_m2 / left)) / _STEPS_PER_M)
+
+
 def localisability(plan: FloorPlan, manifest: Manifest, *, seed: int = 0) -> Localisability:
     """Return the probabilities at places spread over a plan; the work is bounded for plans of any size.
 
     Raises:
-        InvalidInputError: the plan has too many grid poses, or the model no measured errors.
+        InvalidInputError: the model has no measured errors.
     """
-    errors = errors_of(manifest)
-    if (poses := grid_size(plan, _STEP_M)) > MAX_POSES:
-        raise InvalidInputError(
-            f"the plan has about {poses} grid poses, {_STEP_M:g} m apart; the limit is {MAX_POSES}: split the plan"
-        )
+    errors, step_m = errors_of(manifest), spacing_m(plan)
     rng = np.random.default_rng(seed)
-    share = min(1.0, _FULL_POSES / poses)
+    share = min(1.0, _FULL_POSES / grid_size(plan, step_m))
     places = _spread(plan, max(_MIN_PLACES, round(_PLACES * share)), rng)
-    search = Searches(plan, manifest, errors, step_m=_STEP_M)
+    search = Searches(plan, manifest, errors, step_m=step_m)
     draws = max(1, round(_DRAWS * share))
-    outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
+    outcomes: Outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
     undrawn = search.draws(places, HARDEST, draws, rng, openings=False) if search.has_openings else None
-    return _summary(plan, places, outcomes, undrawn)
+    return _summary(plan, step_m, places, outcomes, undrawn)
 
 
 class Searches:
@@ -137,7 +154,7 @@ class Searches:
         self.has_openings = layouts.kind is not None
 
     def draws(
-        self, places: PoseSet, condition: str, count: int, rng: np.random.Generator, *, openings: bool = True
+        self, places: PoseSet, condition: Condition, count: int, rng: np.random.Generator, *, openings: bool = True
     ) -> list[list[Draw]]:
         """Return outcomes of `count` photographs at each place; `openings` compares those of the plan."""
         config = MatchingConfig(use_openings=openings, use_see_through=openings)
@@ -147,18 +164,29 @@ class Searches:
         for _ in range(count):
             for number, query in enumerate(self._queries(places, condition, rng)):
                 costs = grid_costs(self._plan, self._grid, query, weights, config)
-                pose, cost = costs.pose[: costs.compared], costs.total[: costs.compared]
-                near = np.hypot(*(costs.poses.position_m[pose] - places.position_m[number]).T) < RIGHT_WITHIN_M
-                room = costs.poses.room_index[pose]
-                best = int(cost.argmin())
-                own = np.flatnonzero(room == places.room_index[number])
-                in_room = bool(len(own) and near[own[cost[own].argmin()]])
-                outcomes[number].append(Draw(bool(near[best]), in_room, int(room[best])))
+                place = places.position_m[number], int(places.room_index[number])
+                outcomes[number].append(self._outcome(costs, *place, _EQUAL / weights.temperature))
         return outcomes
 
-    def _queries(self, places: PoseSet, condition: str, rng: np.random.Generator) -> Iterator[Query]:
+    def _outcome(self, costs: GridCosts, position_m: Float[np.ndarray, "2"], room: int, equal: float) -> Draw:
+        """Return the outcome of a photograph from a place; costs that differ by less than `equal` are a tie."""
+        poses, pose, cost = costs.poses, costs.pose[: costs.compared], costs.total[: costs.compared]
+        reach_m = max(RIGHT_WITHIN_M, self._grid.step_m)
+
+        def best(rows: Int[np.ndarray, "k"]) -> tuple[Int[np.ndarray, "b"], Bool[np.ndarray, "b"]]:
+            """Return the tied best poses of some pairs, each once, and which of them are right."""
+            tied = np.unique(pose[rows[cost[rows] <= cost[rows].min() + equal]])
+            return tied, np.hypot(*(poses.position_m[tied] - position_m).T) < reach_m
+
+        tied, right = best(np.arange(len(pose)))
+        others, count = np.unique(poses.room_index[tied[~right]], return_counts=True)
+        mistaken = {int(index): n / len(tied) for index, n in zip(others, count, strict=True) if index != room}
+        own = np.flatnonzero(poses.room_index[pose] == room)
+        return Draw(float(right.mean()), float(best(own)[1].mean()) if len(own) else 0.0, mistaken)
+
+    def _queries(self, places: PoseSet, condition: Condition, rng: np.random.Generator) -> Iterator[Query]:
         """Yield a drawn photograph of each place."""
-        name, known = condition.removesuffix("_heading").rsplit("_", 1)
+        name, known = parts_of(condition)
         views, manifest = PHOTOGRAPHS[name], self._manifest
         errors = self._errors.view if views else self._errors.sphere
         columns = manifest.profile_columns
@@ -220,11 +248,17 @@ def _spread(plan: FloorPlan, count: int, rng: np.random.Generator) -> PoseSet:
 
 
 def _summary(
-    plan: FloorPlan, places: PoseSet, outcomes: dict[str, list[list[Draw]]], undrawn: list[list[Draw]] | None
+    plan: FloorPlan,
+    step_m: float,
+    places: PoseSet,
+    outcomes: Outcomes,
+    undrawn: list[list[Draw]] | None,
 ) -> Localisability:
-    found = {name: _shares(rows, "found") for name, rows in outcomes.items()}
-    rooms = {name: _by_room(plan, places, share) for name, share in found.items()}
-    means = {name: _mean(plan, values) for name, values in rooms.items()}
+    found: dict[Condition, Float[np.ndarray, "p"]] = {name: _shares(rows, "found") for name, rows in outcomes.items()}
+    rooms: dict[Condition, Float[np.ndarray, "r"]] = {
+        name: _by_room(plan, places, share) for name, share in found.items()
+    }
+    means: dict[Condition, float] = {name: _mean(plan, values) for name, values in rooms.items()}
 
     def mean(rows: list[list[Draw]], field: str) -> float:
         return _mean(plan, _by_room(plan, places, _shares(rows, field)))
@@ -238,6 +272,7 @@ def _summary(
         "doors": None if undrawn is None else hardest - mean(undrawn, "found"),
     }
     return Localisability(
+        spacing_m=step_m,
         places=places,
         found=found,
         rooms=rooms,
@@ -262,16 +297,16 @@ def _mean(plan: FloorPlan, rooms: Float[np.ndarray, "r"]) -> float:
     return float(np.average(rooms[known], weights=plan.areas_m2[known]))
 
 
-def _confused(room: Int[np.ndarray, "p"], outcomes: dict[str, list[list[Draw]]]) -> tuple[ConfusedRooms, ...]:
+def _confused(room: Int[np.ndarray, "p"], outcomes: Outcomes) -> tuple[ConfusedRooms, ...]:
     """Return the pairs of rooms that are confused most, each under the condition that confuses it most."""
     worst: dict[tuple[int, int], ConfusedRooms] = {}
     for condition, rows in outcomes.items():
-        taken, wrong = np.bincount(room, [len(row) for row in rows]), dict[tuple[int, int], int]()
+        taken, wrong = np.bincount(room, [len(row) for row in rows]), dict[tuple[int, int], float]()
         for own, row in zip(room.tolist(), rows, strict=True):
             for draw in row:
-                if not draw.found and draw.room != own:
-                    pair = min(own, draw.room), max(own, draw.room)
-                    wrong[pair] = wrong.get(pair, 0) + 1
+                for found_in, probability in draw.mistaken.items():
+                    pair = min(own, found_in), max(own, found_in)
+                    wrong[pair] = wrong.get(pair, 0.0) + probability
         for pair, count in wrong.items():
             share = count / sum(taken[index] for index in pair if index < len(taken))
             if share >= _MIN_CONFUSED and (pair not in worst or share > worst[pair].share):

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+from lalaloc_core.conditions import (
+    CONDITIONS,
+    HARDEST,
+    Condition,
+    HeadingState,
+    Photograph,
+    condition_of,
+    parts_of,
+)
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.localisability import CONDITIONS, HARDEST, Localisability
+from lalaloc_core.localise.localisability import STEP_M, Localisability
 
-_PHOTOGRAPHS = {"sphere": "a sphere", "phone": "a phone photograph (80°)", "three_phone": "three of one spot"}
+_TITLES: dict[Photograph, str] = {
+    "sphere": "a sphere",
+    "phone": "a phone photograph (80°)",
+    "three_phone": "three of one spot",
+}
 _REMEDIES = {
     "heading": "state the heading",
     "three_photographs": "take three photographs of one spot, a third of a turn apart",
@@ -17,6 +31,7 @@ _REMEDIES = {
 }
 # Smallest gain that is advised.
 _WORTH = 0.02
+_PAIRS = 3
 
 
 def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
@@ -39,22 +54,36 @@ def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
     ]
     gains = {name: None if gain is None else round(gain, 3) for name, gain in found.gains.items()}
     return {
+        "spacing_m": round(found.spacing_m, 3),
         "probability": {name: round(found.plan[name], 3) for name in CONDITIONS},
         "rooms": rooms,
         "places": places,
         "confused": confused,
         "measured_on": HARDEST,
         "gains": gains,
+        "advice": _advice_of(plan, found),
     }
 
 
 def summary_of(plan: FloorPlan, found: Localisability) -> list[str]:
     """Return the report in words, one line each."""
     lines = ["Predicted share of photographs found within 1 m, heading unknown (stated):"]
-    for name, title in _PHOTOGRAPHS.items():
-        unknown, known = (found.plan[f"{name}_{heading}_heading"] for heading in ("unknown", "known"))
-        lines.append(f"- {title}: {_percent(unknown)} ({_percent(known)})")
-    for pair in found.confused[:3]:
+    headings: tuple[HeadingState, HeadingState] = ("unknown", "known")
+    for name, title in _TITLES.items():
+        unknown, known = (_percent(found.plan[condition_of(name, heading)]) for heading in headings)
+        lines.append(f"- {title}: {unknown} ({known})")
+    return lines + _advice_of(plan, found)
+
+
+def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
+    """Return sentences about confused rooms and what helps most."""
+    lines = []
+    if found.spacing_m > STEP_M:
+        lines.append(
+            f"The plan is large: its poses are compared {found.spacing_m:g} m apart, not {STEP_M:g} m, and answers "
+            f"within {max(found.spacing_m, 1.0):g} m count as found"
+        )
+    for pair in found.confused[:_PAIRS]:
         first, second = (f"'{plan.rooms[index].name}'" for index in pair.rooms)
         lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({_words(pair.condition)})")
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
@@ -69,7 +98,7 @@ def summary_of(plan: FloorPlan, found: Localisability) -> list[str]:
     return lines
 
 
-def _rows(values: dict[str, Any]) -> list[dict[str, float] | None]:
+def _rows(values: Mapping[Condition, Any]) -> list[dict[str, float] | None]:
     """Return the values by condition of each place or room; None where they are unknown."""
     columns = zip(*(values[name].tolist() for name in CONDITIONS), strict=True)
     return [
@@ -80,9 +109,9 @@ def _rows(values: dict[str, Any]) -> list[dict[str, float] | None]:
     ]
 
 
-def _words(condition: str) -> str:
-    name, heading = condition.removesuffix("_heading").rsplit("_", 1)
-    return f"{_PHOTOGRAPHS[name]}, heading {heading}"
+def _words(condition: Condition) -> str:
+    photograph, heading = parts_of(condition)
+    return f"{_TITLES[photograph]}, heading {heading}"
 
 
 def _percent(share: float) -> str:

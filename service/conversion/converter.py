@@ -2,6 +2,9 @@
 
 Large libraries, some of them in C++, read drawings, models and scans. A file that kills its worker is tried once more;
 a file that takes too long is not. The workers start with the first file that is not in the native format.
+
+Localisability is predicted and drawn by a worker of its own, started with the first prediction. It is not niced, as its
+jobs hold permits to compute like queries.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from lalaloc_core.importers import ImportOptions
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
-from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition
+from service.stored_plan import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob
 from service.telemetry import Telemetry
 from service.workers.convert import (
     ConversionJob,
@@ -26,7 +29,6 @@ from service.workers.convert import (
     Imported,
     ImportJob,
     ParseJob,
-    RenditionJob,
     run_converter,
 )
 
@@ -40,6 +42,8 @@ _STALL_MARGIN_S = 10.0
 _NICE = 10
 # Time (s) that a stored plan waits for a worker that parses it.
 _PARSE_S = 10.0
+# Time limit (s) of a prediction, which takes seconds on an idle core.
+_PREDICTION_S = 300.0
 
 
 class Converter:
@@ -49,6 +53,7 @@ class Converter:
         self._settings = settings
         self._telemetry = telemetry
         self._pool: _Pool | None = None
+        self._predicting: _Pool | None = None
         self._lock = threading.Lock()
         self._closed = False
         telemetry.gauge(
@@ -133,9 +138,27 @@ class Converter:
             OverloadedError, ConverterNotReadyError, StoppingError: see `read`.
         """
         try:
+            if job.kind in PREDICTIONS:
+                return self._running_pool(predicts=True).submit(job, _PREDICTION_S, client)
             return self._running_pool().submit(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
             self._raise_lost(error)
+
+    async def prediction(self, begun: Future[ConversionResult]) -> Rendition:
+        """Wait for a prediction, or a map of it, of `begin_rendition`.
+
+        Raises:
+            DamagedDataError: the stored plan is damaged.
+            DeadlineExceededError: the prediction did not finish.
+            ConverterNotReadyError, StoppingError: see `read`.
+        """
+        try:
+            result = await asyncio.wrap_future(begun)
+        except JobLostError as error:
+            if error.reason not in ("not-ready", "closing"):
+                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
+            self._raise_lost(error)
+        return _made(result)
 
     async def rendition(self, begun: Future[ConversionResult]) -> Rendition:
         """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
@@ -152,45 +175,47 @@ class Converter:
             self._raise_lost(JobLostError("deadline"))
         except JobLostError as error:
             self._raise_lost(error)
-        if isinstance(result, ConversionRefusal):
-            raise result.error()
-        assert isinstance(result, Rendition)
-        return result
+        return _made(result)
 
     def close(self) -> None:
         """Stop all workers and wait for them."""
         with self._lock:
             self._closed = True
-        if self._pool is not None:
-            self._pool.close()
+        for pool in (self._pool, self._predicting):
+            if pool is not None:
+                pool.close()
 
-    def _running_pool(self) -> _Pool:
-        """Return the pool; the first call starts it."""
+    def _running_pool(self, *, predicts: bool = False) -> _Pool:
+        """Return the pool of imports or predictions; the first call starts it."""
         with self._lock:
             if self._closed:
                 raise JobLostError("closing")
+            settings = self._settings
+            if predicts:
+                if self._predicting is None:
+                    self._predicting = self._started("prediction", workers=1, stall_s=_PREDICTION_S)
+                return self._predicting
             if self._pool is None:
-                settings = self._settings
-                spec = WorkerSpec(
-                    "import",
-                    run_converter,
-                    (settings.plans.import_limits, settings.imports.memory_bytes),
-                    stall_s=settings.plans.max_import_s + _STALL_MARGIN_S,
-                    nice=_NICE,
-                )
-                self._pool = WorkerPool(
-                    spec,
-                    workers=settings.imports.workers,
-                    queue_limit=_QUEUE,
-                    keep_spare=True,
-                    accounts=self._telemetry.cpu_accounts,
-                    on_restart=lambda _reason: self._telemetry.note_restart("import"),
-                )
-                self._pool.start()
+                stall_s = settings.plans.max_import_s + _STALL_MARGIN_S
+                self._pool = self._started("import", workers=settings.imports.workers, stall_s=stall_s, nice=_NICE)
             return self._pool
 
+    def _started(self, name: str, *, workers: int, stall_s: float, nice: int = 0) -> _Pool:
+        settings = self._settings
+        arguments = (settings.plans.import_limits, settings.imports.memory_bytes)
+        pool: _Pool = WorkerPool(
+            WorkerSpec(name, run_converter, arguments, stall_s=stall_s, nice=nice),
+            workers=workers,
+            queue_limit=_QUEUE,
+            keep_spare=name == "import",
+            accounts=self._telemetry.cpu_accounts,
+            on_restart=lambda _reason: self._telemetry.note_restart(name),
+        )
+        pool.start()
+        return pool
+
     def _count(self, name: str) -> float:
-        return 0 if self._pool is None else getattr(self._pool, name)
+        return sum(getattr(pool, name) for pool in (self._pool, self._predicting) if pool is not None)
 
     def _raise_lost(self, error: JobLostError) -> NoReturn:
         settings = self._settings
@@ -220,3 +245,11 @@ class Converter:
                 raise DeadlineExceededError(
                     settings.plans.import_deadline_s, "the plan file was not read or written"
                 ) from error
+
+
+def _made(result: ConversionResult) -> Rendition:
+    """Return the file; raise the error of a refusal."""
+    if isinstance(result, ConversionRefusal):
+        raise result.error()
+    assert isinstance(result, Rendition)
+    return result

@@ -13,16 +13,19 @@ from contextvars import Context
 from dataclasses import dataclass
 from functools import partial
 
+from lalaloc_core.conditions import CONDITIONS
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.localisability import errors_of
 from service.bounded_cache import BoundedCache
 from service.conversion.converter import Converter
-from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError
+from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError, UnmeasuredModelError
 from service.renditions import make_rendition
 from service.storage.plans import Plans
-from service.stored_plan import Rendition, RenditionKind
+from service.stored_plan import PREDICTIONS, SLOW, Rendition, RenditionJob, RenditionKind
 from service.telemetry import LOGGER_NAME
-from service.tenancy.fair_share import Shares
+from service.tenancy.fair_share import FairSemaphore, Shares
 from service.threads import Threads
-from service.workers.convert import RenditionJob
 
 # Characters of a document up to which its files are made in this process: about 30 rooms.
 _SMALL = 8192
@@ -57,24 +60,38 @@ class RenditionCache:
     """Files of stored plans, for one event loop. Jobs that no request waits for are cancelled before they begin."""
 
     def __init__(
-        self, plans: Plans, converter: Converter, *, step_m: float, limit_bytes: int, max_pending: int
+        self,
+        plans: Plans,
+        converter: Converter,
+        bundle: Bundle,
+        *,
+        step_m: float,
+        limit_bytes: int,
+        max_pending: int,
+        turns: FairSemaphore,
+        permits: FairSemaphore,
     ) -> None:
         """Start the threads.
 
         Args:
             plans: stored plans.
             converter: worker processes.
+            bundle: model, for localisability.
             step_m: grid step of descriptions.
             limit_bytes: size of the cache; 0 keeps no files.
             max_pending: largest number of files being made or waiting, shared between clients.
+            turns: permits to predict localisability.
+            permits: permits to compute, of which a prediction holds one.
         """
         self._plans = plans
         self._converter = converter
+        self._bundle = bundle
         self._step_m = step_m
         self._threads = Threads("lalaloc-renditions", _THREADS)
         self._cache: BoundedCache[_Key, Rendition] = BoundedCache(limit_bytes, lambda made: len(made.content))
         self._pending: dict[_Key, _PendingJob] = {}
         self._shares = Shares(max_pending)
+        self._turns, self._permits = turns, permits
 
     def put(self, revision_id: str, kind: RenditionKind, made: Rendition) -> None:
         """Keep a file that was made elsewhere."""
@@ -88,6 +105,7 @@ class RenditionCache:
             DamagedDataError: the stored document is damaged.
             OverloadedError: too many files are being made, in all or for the client.
             InvalidFloorPlanError, MissingExtraError: see `make_rendition`.
+            UnmeasuredModelError: localisability of a model without measured errors.
             DeadlineExceededError, ConverterNotReadyError, StoppingError: see `Converter.read`.
             StoreUnavailableError: the database is away.
         """
@@ -117,28 +135,50 @@ class RenditionCache:
 
     async def _make(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition:
         try:
-            begun = await self._threads.run(client, self._begin, job, plan_id, key, client)
-            if isinstance(begun, Rendition):
-                made = begun
+            if key[1] in PREDICTIONS:
+                made = await self._predicted(job, plan_id, key, client)
             else:
-                job.in_worker = begun
-                made = await self._converter.rendition(begun)
+                made = await self._made(job, plan_id, key, client)
         except DamagedDataError as error:
             logging.getLogger(LOGGER_NAME).error(str(error), extra={"fields": {"floorplan": plan_id}})
             raise
         self._cache.put(key, made)
         return made
 
-    def _begin(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition | Future:
+    async def _predicted(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition:
+        self._check_model()
+        report = b""
+        if key[1] in CONDITIONS:
+            report = (await self.get(plan_id, key[0], "localisability", client)).content
+        # The turn comes first: a permit must not be held by a prediction that waits.
+        async with self._turns.held(client), self._permits.held(client):
+            return await self._made(job, plan_id, key, client, report)
+
+    async def _made(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes = b"") -> Rendition:
+        begun = await self._threads.run(client, self._begin, job, plan_id, key, client, report)
+        if isinstance(begun, Rendition):
+            return begun
+        job.in_worker = begun
+        wait = self._converter.prediction if key[1] in PREDICTIONS else self._converter.rendition
+        return await wait(begun)
+
+    def _check_model(self) -> None:
+        try:
+            errors_of(self._bundle.manifest)
+        except InvalidInputError as error:
+            raise UnmeasuredModelError(str(error)) from error
+
+    def _begin(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes) -> Rendition | Future:
         """Read a plan; return the file of a small one, and the job of a worker for others."""
         revision_id, kind = key
         stored = None if job.abandoned else self._plans.stored(revision_id)
         if stored is None:
             raise UnknownFloorPlanError(plan_id)
-        # The cells of a map are many even if the plan is small.
-        if len(stored.document.document) <= _SMALL and kind != "ros":
-            return make_rendition(stored, kind, self._step_m)
-        begun = self._converter.begin_rendition(RenditionJob(stored, kind, self._step_m), client)
+        bundle = self._bundle if kind in PREDICTIONS else None
+        rendition = RenditionJob(stored, kind, self._step_m, bundle, report)
+        if len(stored.document.document) <= _SMALL and kind not in SLOW:
+            return make_rendition(rendition)
+        begun = self._converter.begin_rendition(rendition, client)
         if job.abandoned:
             begun.cancel()
         return begun

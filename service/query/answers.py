@@ -127,7 +127,7 @@ def compose_answer(
         geopose=best.geopose,
         view=view(found, confidence),
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
-        model=model_answer(bundle),
+        model=ModelAnswer.of(bundle),
     )
 
 
@@ -148,11 +148,6 @@ def _candidate(place: Place, query: Query, probability: float | None) -> Candida
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
         geopose=geopose_at(place.anchor, (candidate.x_m, candidate.y_m), heading_deg, camera_height_m),
     )
-
-
-def model_answer(bundle: Bundle) -> ModelAnswer:
-    """Return name, version and digest of a bundle."""
-    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
 def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:

@@ -25,7 +25,7 @@ from lalaloc_core.photograph import View
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
-from service.query.answers import compose_answer, compose_sequence_answer, locate_in, model_answer, posterior_answer
+from service.query.answers import compose_answer, compose_sequence_answer, locate_in, posterior_answer
 from service.query.decoding import Decoder
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
@@ -92,7 +92,7 @@ class Localiser:
     @property
     def model(self) -> ModelAnswer:
         """Name, version and digest of the model."""
-        return model_answer(self._bundle)
+        return ModelAnswer.of(self._bundle)
 
     async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
         """Localise a photograph in a stored plan.

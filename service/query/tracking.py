@@ -23,7 +23,6 @@ from lalaloc_core.photograph import View
 from service.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.http.admission_control import Slots
-from service.query.answers import model_answer
 from service.query.decoding import Decoder
 from service.query.geopose import geopose_at
 from service.query.localiser import Localiser
@@ -31,6 +30,7 @@ from service.query.photographs import Photograph, encode, read_view
 from service.query.queries import TrackOutcome, TrackQuery
 from service.query.stated_camera import known_heading, stated_height, stated_hints
 from service.schemas import (
+    ModelAnswer,
     PathPoint,
     PhotographForm,
     Position,
@@ -167,7 +167,7 @@ class SessionTracker:
             geopose=geopose_at(plan.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
             view=read_view(Photograph(view)),
             timings_ms=TimingsAnswer(**totals),
-            model=model_answer(self._bundle),
+            model=ModelAnswer.of(self._bundle),
         )
         return StoredPose(mode=pose.mode, pose=answer, path=[_point(row, plan) for row in found.state.path])
 

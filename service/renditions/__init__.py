@@ -1,4 +1,4 @@
-"""Files made from a stored plan: description, layout, drawing, mesh, exports.
+"""Files made from a stored plan: description, layout, drawing, mesh, exports, localisability.
 
 Begin with `making.py`. The functions are pure; `service.conversion.rendition_cache` runs them once per revision, for
 large plans in a worker process.

@@ -1,4 +1,4 @@
-"""Downloads of a stored plan: original file, export, drawing, mesh."""
+"""Downloads of a stored plan: original file, export, drawing, mesh, localisability."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.conditions import HeadingState, Photograph, condition_of
 from lalaloc_core.draw.plan import HEAT_PLACE, Bounds, Marker, svg_around
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
@@ -18,24 +19,32 @@ from service.errors import (
     StoreUnavailableError,
     UnanchoredPlanError,
     UnknownFloorPlanError,
+    UnmeasuredModelError,
 )
 from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary
 from service.runtime import Runtime
+from service.schemas import LocalisabilityAnswer
 from service.storage.records import PlanSummary
-from service.stored_plan import RenditionKind
+from service.stored_plan import PREDICTIONS, RenditionKind
 from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 _HEAT = HEAT_PLACE.encode()
 _SVG, _GLB = "image/svg+xml", "model/gltf-binary"
+# Defence in depth: drawings have no scripts. Maps are embedded pictures.
+_INERT = "default-src 'none'; img-src data:"
 # Tolerance for a covariance whose three numbers were rounded.
 _ROUNDED = 1e-3
 _PROBLEMS = problem_responses(UnknownFloorPlanError, InvalidRequestError, StoreUnavailableError)
 _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
+# Predictions are made by conversion workers.
+_PREDICTED = problem_responses(
+    UnknownFloorPlanError, InvalidRequestError, UnmeasuredModelError, StoreUnavailableError, ConverterNotReadyError
+)
 
 
 @router.get(
@@ -150,8 +159,7 @@ async def get_preview(
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
     plan = await _look(request, tenant, floorplan_id, runtime)
-    # Defence in depth: the drawing has no scripts.
-    policy = {"Content-Security-Policy": "default-src 'none'"}
+    policy = {"Content-Security-Policy": _INERT}
     etag = revision_etag(plan.revision_id, "preview", marker)
     if (answer := not_modified(request, etag, policy)) is not None:
         return answer
@@ -179,6 +187,50 @@ async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant
     """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
     plan = await _look(request, tenant, floorplan_id, runtime)
     return await _rendition(request, plan, "mesh", _GLB, runtime, client)
+
+
+@router.get(
+    "/{floorplan_id}/localisability",
+    summary="Predict which photographs will be found",
+    response_model=LocalisabilityAnswer,
+    openapi_extra=_CONDITIONAL,
+    responses={**NOT_MODIFIED, **_PREDICTED},
+)
+async def get_localisability(
+    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
+) -> Response:
+    """Predict which photographs will be found, from the plan and the model's measured errors alone.
+
+    For places spread over the plan: the probability that the answer to a photograph taken there is right, for a
+    sphere, a phone photograph and three of them, with known and unknown heading. Also which rooms are confused, and
+    what helps most. The first request for a revision takes seconds; the result is kept.
+    """
+    plan = await _look(request, tenant, floorplan_id, runtime)
+    return await _rendition(request, plan, "localisability", JSON, runtime, client)
+
+
+@router.get(
+    "/{floorplan_id}/localisability.svg",
+    summary="Get a map of the photographs that will be found",
+    response_class=Response,
+    openapi_extra=_CONDITIONAL,
+    responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PREDICTED},
+)
+async def get_localisability_map(
+    floorplan_id: str,
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    client: Client,
+    photograph: Annotated[
+        Photograph, Query(description="A sphere, a phone photograph of 80°, or three of these from one spot.")
+    ] = "phone",
+    heading: Annotated[HeadingState, Query(description="Whether the heading is known.")] = "unknown",
+) -> Response:
+    """Return a drawing of the plan with the probability by place that a photograph is found; darker is higher."""
+    plan = await _look(request, tenant, floorplan_id, runtime)
+    condition = condition_of(photograph, heading)
+    return await _rendition(request, plan, condition, _SVG, runtime, client, {"Content-Security-Policy": _INERT})
 
 
 async def _chunks(
@@ -215,7 +267,8 @@ async def _rendition(
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """Answer with a file made from a plan, or with 304 before it is made."""
-    etag = revision_etag(plan.revision_id, kind)
+    # Predictions depend on the model.
+    etag = revision_etag(plan.revision_id, kind, *([runtime.localiser.model.sha256] if kind in PREDICTIONS else []))
     if (answer := not_modified(request, etag, headers)) is not None:
         return answer
     made = await runtime.renditions.get(plan.id, plan.revision_id, kind, client)

@@ -9,6 +9,7 @@ stored_plans     stored floor plans, their events and walls
 query_fields     form fields that queries share
 localise_query   form of a query
 localise_answer  its answer
+localisability   photographs of a plan that will be found
 sequence         queries with several panoramas
 sessions         sessions of tracked cameras
 oscp             queries of AR clients
@@ -20,6 +21,7 @@ Begin with `localise_answer.py`.
 """
 
 from service.schemas.fields import ResponseModel
+from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.localise_answer import (
     BatchLine,
     CandidateAnswer,
@@ -116,6 +118,7 @@ __all__ = [
     "LevelAnswer",
     "LevelsForm",
     "LimitsAnswer",
+    "LocalisabilityAnswer",
     "LocaliseAnswer",
     "LocaliseForm",
     "ModelAnswer",

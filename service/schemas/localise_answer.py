@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field
 
+from lalaloc_core.localise.bundle import Bundle
 from service.schemas.fields import (
     Degrees,
     HeadingDeg,
@@ -125,6 +126,11 @@ class ModelAnswer(ResponseModel):
     name: str
     version: str
     sha256: str = Field(description="Digest over the model's files.")
+
+    @classmethod
+    def of(cls, bundle: Bundle) -> Self:
+        """Return name, version and digest of a bundle."""
+        return cls(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
 class LocaliseAnswer(ResponseModel):

@@ -47,6 +47,8 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/floorplans/{floorplan_id}/export"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/localisability"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/localisability.svg"): Permission.READ,
     ("GET", "/venues"): Permission.READ,
     ("POST", "/venues"): Permission.WRITE,
     ("GET", "/venues/{venue_id}"): Permission.READ,

@@ -85,7 +85,7 @@ class Telemetry:
         )
         self.pool_restarts = self.counter("lalaloc_pool_restarts", "Replaced worker processes, by pool.", ["pool"])
         # Exported as 0 from the start, so that the first restart shows as an increase.
-        for pool in ("lpo", "decode", "import"):
+        for pool in ("lpo", "decode", "import", "prediction"):
             self.pool_restarts.labels(pool)
         self.stored_bytes = self._gauge(
             "lalaloc_stored_bytes", "Stored bytes of a tenant, by kind.", ("tenant", "kind")

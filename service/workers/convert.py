@@ -25,7 +25,7 @@ from lalaloc_core.importers import (
     import_plans,
 )
 from service.errors import DamagedDataError
-from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionKind, StoredPlan
+from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionJob
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs
 
 # A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the
@@ -57,15 +57,6 @@ class ParseJob:
     """Stored plan that the service is about to use."""
 
     document: PlanDocument
-
-
-@dataclass(frozen=True)
-class RenditionJob:
-    """Stored plan from which a file is made."""
-
-    stored: StoredPlan
-    kind: RenditionKind
-    step_m: float
 
 
 @dataclass(frozen=True)
@@ -166,7 +157,10 @@ def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionRes
                 case ImportJob():
                     return _import(job, limits)
                 case RenditionJob():
-                    return _render(job)
+                    # Imported late: its libraries take memory that imports do not need.
+                    from service.renditions import make_rendition
+
+                    return make_rendition(job)
                 case ParseJob():
                     return _parse(job)
         except (InvalidFloorPlanError, MissingExtraError, DamagedDataError) as error:
@@ -192,7 +186,7 @@ def _imported(imported: ImportedPlan, job: ImportJob, limits: ImportLimits) -> I
     document, report = PlanDocument.from_plan(plan), report_of(imported)
     description = None
     if len(document.document) > LARGE:
-        # Imported late: its libraries take memory that imports do not need.
+        # Imported late for the same reason.
         from service.renditions import describe_content
 
         description = describe_content(plan, report, job.step_m)
@@ -205,10 +199,3 @@ def _parse(job: ParseJob) -> PackedPlan:
     if plan is None:
         raise DamagedDataError("the stored document of a floor plan is damaged")
     return PackedPlan.of(plan)
-
-
-def _render(job: RenditionJob) -> Rendition:
-    # Imported late for the same reason.
-    from service.renditions import make_rendition
-
-    return make_rendition(job.stored, job.kind, job.step_m)

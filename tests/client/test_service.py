@@ -21,9 +21,11 @@ from tests.service.conftest import FLAT, StartApp
 
 
 @pytest.fixture(scope="module")
-def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def app(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
     """Return an app for all tests of this file."""
-    with start_app(tmp_path_factory.mktemp("data")) as started:
+    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
         yield started
 
 
@@ -75,6 +77,16 @@ def test_files_of_a_plan_are_downloaded(service: Any, tmp_path: Path) -> None:
     assert 'class="camera" transform="translate(1.2500 -2.0000)"' in marked
     assert "rotate(90.000)" in marked
     assert "<ellipse" in marked
+
+
+def test_localisability_is_read_and_drawn(service: Any) -> None:
+    plan = service.upload_floorplan(FLAT)
+    found = service.localisability(plan.id)
+    assert (found.floorplan_id, found.revision, found.spacing_m) == (plan.id, plan.revision, 0.5)
+    assert [room.id for room in found.rooms] == [room.id for room in plan.rooms]
+    assert 0.0 <= found.places[0].probability["phone_unknown_heading"] <= 1.0
+    drawing = service.localisability_map(plan.id, "three_phone", "known")
+    assert "three phone photographs of one spot are found" in drawing
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from lalaloc_core.draw.plan import Marker, draw_rooms, plan_svg
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from service.conversion import Converter, RenditionCache, rendition_cache
 from service.errors import OverloadedError
 from service.renditions.layout import plan_layout
@@ -24,10 +25,12 @@ from service.renditions.mesh import plan_glb
 from service.settings import Settings
 from service.storage import Store
 from service.storage.records import Original
-from service.stored_plan import Rendition, RenditionKind, StoredPlan
+from service.stored_plan import Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
+from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.fair_share import FairSemaphore
 from tests.growth import assert_no_worse_than_linear
-from tests.service.conftest import FLAT, StartApp, tiled_plan, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload
 from tests.strategies import plan_of, spiral
 
 READS = ["", "/layout", "/preview.svg", "/mesh.glb", "/original", "/export", "/export?format=dxf"]
@@ -40,10 +43,10 @@ class _BlockedMaker:
         self.made: list[RenditionKind] = []
         self.release = threading.Event()
 
-    def __call__(self, stored: StoredPlan, kind: RenditionKind, step_m: float) -> Rendition:
+    def __call__(self, job: RenditionJob) -> Rendition:
         assert self.release.wait(30.0)
-        self.made.append(kind)
-        return Rendition(f"{stored.revision_id} {kind}".encode(), (0.0, 0.0, 1.0, 1.0))
+        self.made.append(job.kind)
+        return Rendition(f"{job.stored.revision_id} {job.kind}".encode(), (0.0, 0.0, 1.0, 1.0))
 
 
 @pytest.fixture
@@ -63,7 +66,9 @@ def store(tmp_path: Path) -> Iterator[Store]:
 @pytest.fixture
 def cache(store: Store) -> Iterator[RenditionCache]:
     converter = Converter(Settings(import_workers=1), Telemetry())
-    cache = RenditionCache(store.plans, converter, step_m=0.5, limit_bytes=100_000, max_pending=4)
+    bundle = Bundle.open(default_bundle())
+    permits = {name: FairSemaphore(1, CpuAccounts()) for name in ("turns", "permits")}
+    cache = RenditionCache(store.plans, converter, bundle, step_m=0.5, limit_bytes=100_000, max_pending=4, **permits)
     yield cache
     converter.close()
     cache.close()
@@ -211,6 +216,41 @@ def test_large_plans_are_converted_by_workers(start_app: StartApp, tmp_path: Pat
     assert bodies["/preview.svg"].content == plan_svg(plan).encode()
     assert json.loads(bodies["/layout"].content)["rooms"] == json.loads(plan_layout(plan, "p", "r"))["rooms"]
     assert [room["area_m2"] for room in bodies[""].json()["rooms"]] == [16.0] * 144
+
+
+@pytest.mark.one_replica
+def test_localisability_is_predicted_once_per_revision_and_model(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin, begun = Converter.begin_rendition, list[str]()
+
+    def watched(self: Converter, job: RenditionJob, client: str) -> Any:
+        begun.append(job.kind)
+        return begin(self, job, client)
+
+    monkeypatch.setattr(Converter, "begin_rendition", watched)
+    with start_app(tmp_path, bundle=tiny_view_bundle) as client:
+        url = f"/floorplans/{upload(client)}/localisability"
+        drawn = client.get(f"{url}.svg")
+        assert drawn.headers["content-type"] == "image/svg+xml"
+        assert "phone photograph is found within 1 m, heading unknown" in drawn.text
+        sphere = client.get(f"{url}.svg", params={"photograph": "sphere", "heading": "known"})
+        assert "a sphere is found within 1 m, heading known" in sphere.text
+        first = client.get(url)
+        answer = first.json()
+        assert answer["spacing_m"] == 0.5
+        assert [room["name"] for room in answer["rooms"]] == [room["name"] for room in FLAT["rooms"]]
+        assert {place["room"] for place in answer["places"]} == {room["id"] for room in answer["rooms"]}
+        assert set(answer["gains"]) == {"heading", "three_photographs", "sphere", "room_hint", "doors"}
+        assert answer["advice"] != []
+        again = client.get(url, headers={"If-None-Match": first.headers["etag"]})
+        assert (again.status_code, client.get(url).content) == (304, first.content)
+        assert_problem(client.get(f"{url}.svg?photograph=drone"), 422, "invalid-request")
+    assert begun == ["localisability", "phone_unknown_heading", "sphere_known_heading"]
+    with start_app(tmp_path) as client:
+        # Another model, without measured errors.
+        refused = client.get(url, headers={"If-None-Match": first.headers["etag"]})
+        assert_problem(refused, 501, "model-unmeasured")
 
 
 def test_marked_drawing_is_that_of_the_core(client: httpx.Client) -> None:

@@ -88,7 +88,9 @@ def counter() -> Iterator[Counter]:
 
 
 @pytest.fixture(scope="module")
-def client(counter: Counter, start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def client(
+    counter: Counter, start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
     unlimited = {"rate_per_minute": 0, "rate_burst": 0, "keep_answers_s": 3600.0}
     # No regular work meanwhile, and the coarsest pose grids.
     quiet = {"sweep_s": 3600.0, "grid_step_m": 5.0}
@@ -96,7 +98,7 @@ def client(counter: Counter, start_app: StartApp, tmp_path_factory: pytest.TempP
         # Worker processes, which are not counted, read large plans and make their files.
         for module, name in ((rendition_cache, "_SMALL"), (converter, "LARGE"), (files, "LARGE")):
             patch.setattr(module, name, 10**9)
-        with start_app(tmp_path_factory.mktemp("data"), **unlimited, **quiet) as started:
+        with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle, **unlimited, **quiet) as started:
             yield started
 
 

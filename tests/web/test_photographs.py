@@ -9,8 +9,8 @@ from pathlib import Path
 
 import httpx
 import pytest
-from PIL import ExifTags
-from playwright.sync_api import expect
+from PIL import ExifTags, Image
+from playwright.sync_api import Page, expect
 
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import jpeg, sphere, take
@@ -53,6 +53,50 @@ def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_pa
     assert on > 100
     page.locator("#photo-strip button").first.click()
     expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
+
+
+def _colours(page: Page, place: str) -> list[list[int]]:
+    """Return the colour in the middle of each picture in a part of the map."""
+    return page.evaluate(
+        """async (place) => { const colours = [];
+        for (const image of document.querySelectorAll(place + ' image')) {
+            const shown = new Image(); shown.src = image.getAttribute('href'); await shown.decode();
+            const canvas = document.createElement('canvas');
+            [canvas.width, canvas.height] = [shown.width, shown.height];
+            const context = canvas.getContext('2d'); context.drawImage(shown, 0, 0);
+            colours.push([...context.getImageData(shown.width >> 1, shown.height >> 1, 1, 1).data]);
+        }
+        return colours; }""",
+        place,
+    )
+
+
+def test_layer_shows_where_photographs_will_be_found(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    opener = page.get_by_role("button", name="Will it work here?")
+    opener.click()
+    panel = page.get_by_role("region", name="Will it work here?")
+    expect(panel).to_be_visible(timeout=100_000)
+    expect(opener).to_have_attribute("aria-pressed", "true")
+    expect(panel).to_contain_text("heading")
+    expect(panel.locator(".share")).to_contain_text("within 1 m")
+    phone = _colours(page, "#plan .localisability")
+    assert len(phone) == 7
+    panel.get_by_label("Probability of finding").select_option("a 360° photograph")
+    panel.get_by_label("heading known").check()
+    assert _colours(page, "#plan .localisability") != phone
+    with page.expect_download() as saving:
+        page.get_by_role("button", name="Save map").click()
+    assert saving.value.suggested_filename == "Example flat.png"
+    saving.value.save_as(tmp_path / "map.png")
+    with Image.open(tmp_path / "map.png") as picture:
+        assert max(picture.size) == 2400
+        # Walls, floors of other shades, and names.
+        assert len(picture.convert("RGB").resize((60, 60)).getcolors(3600) or []) > 50
+    # The answer takes its place.
+    desktop.find()
+    expect(panel).to_be_hidden()
+    assert _colours(page, "#plan .localisability") == []
 
 
 def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:

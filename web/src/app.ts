@@ -4,7 +4,7 @@ import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
 import { companions, ellipse, otherPlaces } from "./answer_overlay";
 import { api } from "./api";
-import { byId, download, s, show } from "./dom";
+import { byId, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { heatMap } from "./heat";
@@ -12,9 +12,11 @@ import { connectGuide, hideGuide } from "./guide";
 import { HintForm } from "./hints";
 import { connectKeyDialog } from "./key_dialog";
 import { layoutLines, roomAt } from "./layout";
+import { LocalisabilityLayer } from "./localisability_layer";
 import { clearError, InputError, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
+import { connectSaveMap, savePicture } from "./pictures";
 import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
 import { showWarnings } from "./plan_warnings";
 import { Plans } from "./plans";
@@ -34,6 +36,7 @@ class Page {
   private readonly svg = byId("plan") as unknown as SVGSVGElement;
   private readonly base = s("g");
   private readonly heat = s("g");
+  private readonly localisability = new LocalisabilityLayer(async () => this.plan ?? this.storeExample(new AbortController().signal));
   private readonly names = s("g");
   private readonly overlay = s("g");
   private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));
@@ -70,12 +73,13 @@ class Page {
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.names, this.hints.element, this.overlay, ...this.editor.layers);
+    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.localisability.element, this.names, this.hints.element, this.overlay, ...this.editor.layers);
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.localise());
     connectGuide();
     showCursor(this.svg);
+    connectSaveMap(this.svg, () => this.document?.name ?? "");
     byId("find-all").addEventListener("click", () => void this.localiseAll());
     addEventListener("hashchange", () => void this.open());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
@@ -165,6 +169,7 @@ class Page {
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
     if (plan?.status === "failed") showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
     showWarnings(plan);
+    this.localisability.setPlan(plan);
     if (isSame) return;
     this.layout = null;
     this.photos.compass.setNorth(plan?.plan.north_deg ?? null);
@@ -267,11 +272,13 @@ class Page {
     this.selected = 0;
     this.moved = null;
     this.panorama.setView(photo === null ? null : answer?.view ?? null);
-    showAnswer(answer, photo, { select: (index) => this.select(index), save: (answered) => this.savePicture(answered) });
+    showAnswer(answer, photo, { select: (index) => this.select(index), save: (answered) => savePicture(answered, this.fields) });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
     this.drawAnswer();
+    if (answer === null) return;
+    this.localisability.close();
     // The answer of a venue can lie in another plan than the one shown.
-    if (answer !== null) this.select(0);
+    this.select(0);
   }
 
   /** Draw the parts of the answer that lie in the plan shown. */
@@ -362,15 +369,6 @@ class Page {
       if (!signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {
       if (!signal.aborted) this.cancelQuery();
-    }
-  }
-
-  private async savePicture(photo: Photo): Promise<void> {
-    clearError(byId("photo-error"), this.fields);
-    try {
-      download(await api.picture(photo.asked.fields, photo.file), `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
-    } catch (error) {
-      showError(byId("photo-error"), error, this.fields);
     }
   }
 

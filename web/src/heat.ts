@@ -1,4 +1,4 @@
-/** Posterior as a heat map, as in lalaloc_core/draw/heat.py: each place is blurred within its room. */
+/** Heat maps of rooms, and the posterior as one, as in lalaloc_core/draw/heat.py: each place is blurred within its room. */
 
 import { s } from "./dom";
 import { inside } from "./layout";
@@ -14,27 +14,48 @@ const DEVIATION = 0.4, RADIUS = 5;
 // Shade from which colours cover the plan, and opacity from there on.
 const OPAQUE_SHADE = 0.3, MAX_OPACITY = 0.92;
 
-/** Part of the map in one room: probability density per cell, top row first. */
-interface Field {
+/** Cells over a room, top row first; `box` is that of the drawing. */
+export interface Cells {
   room: RoomDocument;
   box: Box;
   columns: number;
   rows: number;
-  density: Float64Array;
 }
+
+/** Cells with a value each. */
+type Field = Cells & { values: Float64Array };
 
 /** Draw a picture for each room with any probability, clipped to its floor. */
 export function heatMap(posterior: Posterior, plan: PlanDocument): SVGGElement {
-  const whole = boxOf(plan);
-  const cell = Math.max(Math.max(whole.width, whole.height) / CELLS, MIN_CELL_M);
+  const cell = cellSize(plan);
   const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell)).filter((field) => field !== null);
-  const best = fields.reduce((most, { density }) => density.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
+  const best = fields.reduce((most, { values }) => values.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
+  for (const { values } of fields) values.forEach((value, index) => { values[index] = shadeOf(value, best); });
+  return roomPictures("posterior", fields, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
+}
+
+/** Return the size of the cells of a plan's maps. */
+export function cellSize(plan: PlanDocument): number {
+  const whole = boxOf(plan);
+  return Math.max(Math.max(whole.width, whole.height) / CELLS, MIN_CELL_M);
+}
+
+/** Cover a room with cells. */
+export function cellsOf(room: RoomDocument, cell: number): Cells {
+  const xs = room.polygon.map(([x]) => x), ys = room.polygon.map(([, y]) => y);
+  const left = Math.min(...xs), top = Math.max(...ys);
+  const columns = Math.ceil((Math.max(...xs) - left) / cell), rows = Math.ceil((top - Math.min(...ys)) / cell);
+  return { room, box: { x: left, y: -top, width: columns * cell, height: rows * cell }, columns, rows };
+}
+
+/** Draw shades from 0 to 1 as a picture for each room, clipped to its floor; `name` is unique on the page. */
+export function roomPictures(name: string, fields: Field[], opacity: (shade: number) => number): SVGGElement {
   const ramp = rampOf(getComputedStyle(document.documentElement).getPropertyValue("--heat-ramp"));
-  return s("g", { class: "heat", "aria-hidden": "true" }, ...fields.map((field, index) => {
-    const { room, box: { x, y, width, height } } = field, id = `floor-${index}`;
+  return s("g", { class: `heat ${name}`, "aria-hidden": "true" }, ...fields.map((field, index) => {
+    const { room, box: { x, y, width, height } } = field, id = `${name}-${index}`;
     return s("g", {},
       s("clipPath", { id }, s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" })),
-      s("image", { href: pictureOf(field, best, ramp), x, y, width, height, preserveAspectRatio: "none", "clip-path": `url(#${id})` }));
+      s("image", { href: pictureOf(field, ramp, opacity), x, y, width, height, preserveAspectRatio: "none", "clip-path": `url(#${id})` }));
   }));
 }
 
@@ -44,21 +65,19 @@ export function shadeOf(density: number, best: number): number {
 }
 
 function fieldOf(posterior: Posterior, room: RoomDocument, cell: number): Field | null {
-  const xs = room.polygon.map(([x]) => x), ys = room.polygon.map(([, y]) => y);
-  const left = Math.min(...xs), right = Math.max(...xs), low = Math.min(...ys), high = Math.max(...ys);
-  const columns = Math.ceil((right - left) / cell), rows = Math.ceil((high - low) / cell);
+  const cells = cellsOf(room, cell), { columns, rows, box } = cells;
+  const left = box.x, high = -box.y;
   let spread: Float64Array | null = null;
   posterior.x_m.forEach((x, index) => {
     const y = posterior.y_m[index]!;
-    if (x < left || x > right || y < low || y > high || !inside(room.polygon, x, y)) return;
+    if (x < left || x > left + box.width || y < high - box.height || y > high || !inside(room.polygon, x, y)) return;
     if ((room.holes ?? []).some((hole) => inside(hole, x, y))) return;
     spread ??= new Float64Array(columns * rows);
     splat(spread, columns, rows, [(x - left) / cell - 0.5, (high - y) / cell - 0.5], posterior.probability[index]!);
   });
   if (spread === null) return null;
   const kernel = kernelOf((DEVIATION * posterior.step_m) / cell);
-  const density = blurred(blurred(spread, columns, rows, 1, kernel), columns, rows, columns, kernel);
-  return { room, box: { x: left, y: -high, width: columns * cell, height: rows * cell }, columns, rows, density };
+  return { ...cells, values: blurred(blurred(spread, columns, rows, 1, kernel), columns, rows, columns, kernel) };
 }
 
 /** Distribute a value over the four cells around a place. */
@@ -98,17 +117,17 @@ function rampOf(list: string): Colour[] {
   return list.split(",").map((colour) => [1, 3, 5].map((start) => parseInt(colour.trim().slice(start, start + 2), 16)) as Colour);
 }
 
-function pictureOf({ columns, rows, density }: Field, best: number, ramp: Colour[]): string {
+function pictureOf({ columns, rows, values }: Field, ramp: Colour[], opacity: (shade: number) => number): string {
   const canvas = document.createElement("canvas");
   canvas.width = columns;
   canvas.height = rows;
   const context = canvas.getContext("2d")!;
   const picture = context.createImageData(columns, rows);
-  density.forEach((value, index) => {
-    const shade = shadeOf(value, best), place = shade * (ramp.length - 1);
+  values.forEach((shade, index) => {
+    const place = shade * (ramp.length - 1);
     const low = ramp[Math.floor(place)]!, high = ramp[Math.ceil(place)]!, share = place % 1;
     const colour = low.map((from, k) => Math.round(from + share * (high[k]! - from)));
-    picture.data.set([...colour, Math.round(255 * MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE))], 4 * index);
+    picture.data.set([...colour, Math.round(255 * opacity(shade))], 4 * index);
   });
   context.putImageData(picture, 0, 0);
   return canvas.toDataURL();

@@ -16,6 +16,7 @@ export type VenuePlanDocument = Schemas["VenuePlanDocument"];
 export type VenuePlanList = Schemas["VenuePlanList"];
 export type RoomLayout = Schemas["RoomLayoutAnswer"];
 export type Layout = Schemas["LayoutAnswer"];
+export type Localisability = Schemas["LocalisabilityAnswer"];
 export type Candidate = Schemas["CandidateAnswer"];
 export type Posterior = Schemas["PosteriorAnswer"];
 export type SequenceAnswer = Schemas["SequenceAnswer"];

@@ -66,6 +66,8 @@ export class Client {
   plan = async (id: string, revision?: string) => planOf(await this.request(of("floorplans", id, revisionQuery(revision))));
   layout = (id: string, revision?: string) =>
     this.json<Schemas["LayoutAnswer"]>(of("floorplans", id, `/layout${revisionQuery(revision)}`));
+  /** Predict which photographs of a plan will be found. */
+  localisability = (id: string) => this.json<Schemas["LocalisabilityAnswer"]>(of("floorplans", id, "/localisability"));
   createPlan = async (plan: Schemas["FloorPlanDocument"]) => planOf(await this.request("/floorplans", json("POST", plan)));
   /** Upload a plan as a file; `fields` are import options. */
   uploadPlan = async (file: Blob, fields: Text = {}, options: CallOptions = {}) =>

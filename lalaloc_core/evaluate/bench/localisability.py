@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.evaluate.bench.prediction_errors import outcomes_of, predicted_shares
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.localisability import CONDITIONS, errors_of
+from lalaloc_core.localise.localisability import errors_of
 
 # Each spot is localised six times.
 _MAX_HOMES = 30

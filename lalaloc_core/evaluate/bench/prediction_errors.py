@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.special import ndtri
 
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
@@ -25,7 +26,7 @@ from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.bundle import Bundle, Manifest, write_manifest
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.localisability import CONDITIONS, Errors, Searches
+from lalaloc_core.localise.localisability import Errors, Searches
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.pipeline import Refiner, localise
 from lalaloc_core.localise.poses import Query
@@ -106,7 +107,7 @@ def outcomes_of(bundle: Bundle, homes: int, split: Split, textures: Path | None)
 
 def predicted_shares(manifest: Manifest, errors: Errors, spots: Sequence[Spot], draws: int = DRAWS) -> dict[str, float]:
     """Return the mean probability by condition that photographs of spots are found, from their plans alone."""
-    rng, found = np.random.default_rng(0), {name: list[bool]() for name in CONDITIONS}
+    rng, found = np.random.default_rng(0), {name: list[float]() for name in CONDITIONS}
     for spot in spots:
         search = Searches(spot.plan, manifest, errors, step_m=GRID_STEP_M)
         for name in CONDITIONS:
