@@ -23,8 +23,9 @@ from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
-from lalaloc_core.localise.tracking.state import MAX_STATES
+from lalaloc_core.localise.tracking.state import MAX_STATES, StatePlan
 from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
 from tests.strategies import l_shape, plan_of, rectangle
 
@@ -59,6 +60,11 @@ def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
 @pytest.fixture(scope="module")
 def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
     return WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
+
+
+@pytest.fixture(scope="module")
+def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> Ground:
+    return Ground.of_plan(plan, grid, graph)
 
 
 @pytest.fixture(scope="module")
@@ -139,82 +145,65 @@ class TestMotion:
             Odometry.of_stds(1.0, 0.0, 0.0, (0.1, -1.0, 0.1))
 
 
-def follow(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    graph: WalkGraph,
-    encoders: Encoders,
-    queries: list[Query],
-    moves: list[Odometry | None],
-) -> list[Tracked]:
+def follow(ground: Ground, encoders: Encoders, queries: list[Query], moves: list[Odometry | None]) -> list[Tracked]:
     """Follow a walk, with the state in bytes between photographs."""
-    state, found = TrackState.first(len(grid.poses), len(queries[0].roll)), []
+    state, found = TrackState.first(len(queries[0].roll)), []
     for query, move in zip(queries, moves, strict=True):
-        found.append(run_steps(track_steps(plan, grid, graph, encoders, state, query, move), lambda _job: None))
+        found.append(run_steps(track_steps(ground, encoders, state, query, move), lambda _job: None))
         state = TrackState.from_bytes(found[-1].state.to_bytes())
     return found
 
 
 class TestFilter:
-    def test_walk_is_followed_through_a_door(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        found = follow(plan, grid, graph, encoders, queries, odometry_along(WALK))
+    def test_walk_is_followed_through_a_door(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        found = follow(ground, encoders, queries, odometry_along(WALK))
         for (place, room, heading), answer in list(zip(WALK, found, strict=True))[1:]:
             assert answer.pose.room_index == room
             assert np.linalg.norm(answer.pose.position_m - place) < STEP_M
             assert abs(wrap_angle(answer.pose.heading - heading)) < math.radians(15.0)
         last = found[-1]
         assert last.state.suspected == ()
-        assert [int(number) for number in last.state.path[:, 0]] == [1, 2, 3, 4, 5, 6]
         assert np.linalg.eigvalsh(last.pose.covariance).min() > 0.0
 
     def test_camera_carried_elsewhere_is_found_again(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+        self, ground: Ground, encoders: Encoders, queries: list[Query]
     ) -> None:
         still = Odometry.of_stds(0.0, 0.0, 0.0, EXACT)
         carried = [*queries[:3], *queries[5:], *queries[5:], *queries[5:]]
-        found = follow(plan, grid, graph, encoders, carried, [*odometry_along(WALK)[:3], still, still, still])
+        found = follow(ground, encoders, carried, [*odometry_along(WALK)[:3], still, still, still])
         assert np.linalg.norm(found[-1].pose.position_m - WALK[-1][0]) < STEP_M
 
     @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
     def test_known_heading_is_right_within_its_tolerance(
         self,
-        plan: FloorPlan,
-        grid: PoseGrid,
-        graph: WalkGraph,
+        ground: Ground,
         encoders: Encoders,
         queries: list[Query],
         off_deg: float,
         right: bool,
     ) -> None:
-        state, heading = TrackState.first(len(grid.poses), len(queries[0].roll)), WALK[0][2]
+        state, heading = TrackState.first(len(queries[0].roll)), WALK[0][2]
         beliefs = []
         for error in (0.0, math.radians(off_deg)):
             known = KnownHeading(heading + error, math.radians(30.0), "given")
-            steps = track_steps(plan, grid, graph, encoders, state, queries[0], None, known_heading=known)
+            steps = track_steps(ground, encoders, state, queries[0], None, known_heading=known)
             belief = run_steps(steps, lambda _job: None).state.belief
             beliefs.append(belief.weight[belief.sector == round(heading / (math.tau / state.sectors))].sum())
         # As probable as with the exact heading; far less probable beyond the tolerance.
         assert (beliefs[1] > 0.5 * beliefs[0]) == right
 
-    def test_other_grid_is_refused(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        state = TrackState.first(len(grid.poses) + 1, len(queries[0].roll))
+    def test_other_grid_is_refused(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        other = (StatePlan("", len(ground.grid.poses) + 1),)
+        state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
-            run_steps(track_steps(plan, grid, graph, encoders, state, queries[0], None), lambda _job: None)
+            run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
 
 
 class TestState:
-    def test_size_does_not_grow(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        state = follow(plan, grid, graph, encoders, queries[:1], [None])[0].state
+    def test_size_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        state = follow(ground, encoders, queries[:1], [None])[0].state
         many = np.random.default_rng(0).integers(0, 100, 4096)
-        full = replace(
-            state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)), path=np.ones((200, 6))
-        )
+        full = replace(state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)))
         assert len(full.to_bytes()) < 100_000
         again = TrackState.from_bytes(full.to_bytes())
         np.testing.assert_array_equal(again.belief.pose, full.belief.pose)
@@ -225,7 +214,7 @@ class TestState:
 
     def test_other_number_of_sectors_keeps_the_belief(self) -> None:
         belief = States(np.array([3, 3, 7]), np.array([0, 15, 4]), np.array([0.2, 0.3, 0.5]))
-        state = replace(TrackState.first(10, 16), belief=belief)
+        state = replace(replace(TrackState.first(16), plans=(StatePlan("", 10),)), belief=belief)
         assert state.with_sectors(16) is state
         for sectors in (8, 32, 48):
             other = state.with_sectors(sectors)
@@ -236,29 +225,28 @@ class TestState:
             heading = np.exp(1j * math.tau / sectors * other.belief.sector[of_seven]) @ other.belief.weight[of_seven]
             assert np.angle(heading) == pytest.approx(math.pi / 2)
 
-    def test_long_session_does_not_grow(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
+    def test_long_session_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(260)]
         walk = [WALK[index] for index in order]
-        found = follow(plan, grid, graph, encoders, [queries[index] for index in order], odometry_along(walk))
+        found = follow(ground, encoders, [queries[index] for index in order], odometry_along(walk))
         sizes = [len(answer.state.to_bytes()) for answer in found]
-        # The path of the first photographs grows; bytes of digits and of compressed weights differ.
+        # Bytes of digits and of compressed weights differ.
         assert max(sizes[200:]) < max(sizes[:200]) + 2000
         assert max(sizes) < 100_000
         last = found[-1].state
         assert len(last.belief.pose) <= MAX_STATES
-        assert [int(number) for number in last.path[:, 0]] == list(range(61, 261))
         # Still right.
         assert np.linalg.norm(found[-1].pose.position_m - walk[-1][0]) < STEP_M
 
     @pytest.mark.parametrize("damage", ["cut", "flipped", "version", "number"])
     def test_damaged_state_is_refused(self, damage: str) -> None:
-        state = replace(TrackState.first(10, 4), belief=States(np.array([9]), np.array([3]), np.ones(1)))
+        state = replace(
+            TrackState.first(4), plans=(StatePlan("", 10),), belief=States(np.array([9]), np.array([3]), np.ones(1))
+        )
         content = state.to_bytes()
         if damage == "number":
-            content = replace(state, poses=9).to_bytes()
+            content = replace(state, plans=(StatePlan("", 9),)).to_bytes()
         elif damage == "cut":
             content = content[:12]
         elif damage == "version":
