@@ -4,11 +4,11 @@ The belief after a photograph is
 
     b'(s) ∝ ((1 - c) prediction(s) + c prior(s)) · (L(s) + f),    L(s) = exp(-T (cost(s) - best)),
 
-with the prediction of `Ground.moved`, the probability c of being carried anywhere, and the likelihood L of the posterior
-of a single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere better; f,
-the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds of an outlier, so that
-an outlier is as probable in a room as in a large building. LPO refines the modes of the belief; its gain is evidence for
-a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
+with the prediction of `Ground.moved`, the probability c of being carried anywhere, and the likelihood L of the
+posterior of a single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere
+better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds of an
+outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief; its
+gain is evidence for a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
 """
 
 from __future__ import annotations

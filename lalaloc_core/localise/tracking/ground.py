@@ -104,7 +104,14 @@ class Ground:
         if self.left_out is None:
             return 1.0
         by_plan = np.add.reduceat(evidence, self.graph.first[:-1])
-        return share_searched(self.left_out.log_mass, self.left_out.searched, by_plan / by_plan.sum())
+        log_mass, searched = self.left_out.log_mass.copy(), self.left_out.searched
+        # Plans that are searched only because the camera was there before tell nothing about those left out.
+        best = log_mass[searched] >= np.delete(log_mass, searched).max(initial=-np.inf)
+        if best.any():
+            log_mass[searched[~best]] = -np.inf
+        else:
+            best[:] = True
+        return share_searched(log_mass, searched[best], (by_plan / by_plan.sum())[best])
 
     def in_own_plan(self, candidate: Candidate) -> tuple[int, Candidate]:
         """Return the number of a candidate's plan, and the candidate in that plan's frame."""
