@@ -6,6 +6,7 @@ import itertools
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,9 +26,11 @@ from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
+from lalaloc_core.localise.tracking.passages import PlanOnLevel
 from lalaloc_core.localise.tracking.state import MAX_STATES, StatePlan
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
-from tests.strategies import l_shape, plan_of, rectangle
+from tests.strategies import l_shape, plan_of, present, rectangle
 
 SECTORS = 16
 EXACT = (0.05, 0.05, math.radians(2.0))
@@ -197,6 +200,101 @@ class TestFilter:
         state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
             run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
+
+
+def building(encoders: Encoders, plans: Sequence[FloorPlan]) -> Ground:
+    """Return the ground of a building with one plan per level."""
+    grids = [build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
+    graphs = [WalkGraph.of(grid.poses, grid.layouts(plan), STEP_M) for plan, grid in zip(plans, grids, strict=True)]
+    entries = [PlanOnLevel(plan, float(level)) for level, plan in enumerate(plans)]
+    levels, keys = [entry.level for entry in entries], [f"plan {level}" for level in range(len(plans))]
+    return Ground.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
+
+
+def level_of(*polygons: list[list[float]], stairs: str | None) -> FloorPlan:
+    """Return a level whose last room is called and typed by `stairs`, with doors from there to the first room."""
+    document = plan_of(*polygons).to_dict()
+    if stairs is not None:
+        document["rooms"][-1] |= {"name": stairs, "type": "stairs" if stairs == "stairs" else "unknown"}
+    door = {"kind": "door", "line": [[4.1, 0.5], [4.1, 1.5]]}
+    return FloorPlan.from_dict(document | {"openings": [door], "opening_kinds": ["door", "window", "passage"]})
+
+
+STAIRS = rectangle(2.0, 3.6, corner=(4.2, 0.0))
+LOWER, UPPER = l_shape(4.0, 3.0, 1.2, 0.8), l_shape(4.0, 8.0, 1.5, 3.0)
+# In the room and on the stairs of the lower level, on the stairs and in the room of the upper one.
+CLIMB: list[tuple[int, Walk]] = [
+    (0, [((1.0, 1.0), 0, 1.6), ((3.0, 1.2), 0, 1.5), ((5.0, 1.2), 1, 0.2)]),
+    (1, [((5.2, 2.6), 1, 3.0), ((3.2, 1.0), 0, 4.7), ((1.6, 2.0), 0, 5.5), ((1.5, 3.5), 0, 0.1)]),
+]
+
+
+class TestLevels:
+    @pytest.mark.parametrize("stairs", ["stairs", "Lift 2", None])
+    def test_camera_is_followed_to_another_level(self, encoders: Encoders, stairs: str | None) -> None:
+        plans = [level_of(LOWER, STAIRS, stairs=stairs), level_of(UPPER, STAIRS, stairs=stairs)]
+        height = CameraHeight(CAMERA_M, 0.0)
+        queries = [query for level, walk in CLIMB for query in queries_along(encoders, plans[level], walk, height)]
+        walk = [pose for _, part in CLIMB for pose in part]
+        ground = building(encoders, plans)
+        found = follow(ground, encoders, queries, odometry_along(walk))
+        levels = [level for level, part in CLIMB for _ in part]
+        # The photographs on the stairs of both levels are alike.
+        for index in (1, 2, 5, 6):
+            (place, room, _), answer = walk[index], found[index]
+            assert (answer.pose.plan, answer.pose.room_index) == (levels[index], room)
+            assert np.linalg.norm(answer.pose.position_m - place) < STEP_M
+            assert answer.contradicted == ()
+        assert found[-1].pose.mode == "tracking"
+        kept = found[-1].state
+        assert max(kept.by_plan, key=kept.by_plan.__getitem__) == "plan 1"
+
+    def test_stairs_are_taken_rather_than_walls(self, encoders: Encoders) -> None:
+        ground = building(
+            encoders, [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
+        )
+        moves = Odometry.of_stds(0.5, 0.0, 0.0, EXACT)
+        arrived = []
+        for place in ((1.0, 1.0), (5.0, 1.2)):
+            start = at(ground.grid, tuple(np.add(place, ground.shift_m[0])), 0.0)
+            belief = ground.moved(start, SECTORS, moves)
+            arrived.append(belief[ground.graph.first[1] :].sum())
+        assert arrived[0] == 0.0
+        assert arrived[1] == pytest.approx(0.1, abs=0.02)
+
+    def test_levels_without_stairs_are_joined_everywhere(self, encoders: Encoders) -> None:
+        ground = building(encoders, [level_of(LOWER, STAIRS, stairs=name) for name in (None, None, "stairs")])
+        start = at(ground.grid, tuple(np.add((1.0, 1.0), ground.shift_m[0])), 0.0)
+        belief = ground.moved(start, SECTORS, None)
+        arrived = np.add.reduceat(belief.sum(axis=1), ground.graph.first[:-1])
+        assert arrived[1] == pytest.approx(0.01)
+        assert arrived[2] == 0.0
+
+    def test_right_plan_of_similar_ones_is_found(self, encoders: Encoders) -> None:
+        # The plans differ in their second rooms alone.
+        others = [rectangle(2.0, depth, corner=(4.2, 0.0)) for depth in (2.4, 3.6, 4.8)]
+        plans = [level_of(LOWER, other, stairs=None) for other in others]
+        ground = building(encoders, plans)
+        walk: Walk = [((1.0, 1.0), 0, 1.6), ((3.0, 1.2), 0, 1.5), ((5.0, 1.2), 1, 0.2), ((5.0, 1.7), 1, 0.1)]
+        queries = queries_along(encoders, plans[1], walk, CameraHeight(CAMERA_M, 0.0))
+        found = follow(ground, encoders, queries, odometry_along(walk))
+        assert found[0].pose.probability < 0.6
+        assert [answer.pose.plan for answer in found[2:]] == [1, 1]
+        assert found[-1].pose.probability > 0.6
+
+    def test_belief_keeps_its_plans_when_the_ground_changes(self, encoders: Encoders) -> None:
+        plans = [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
+        query = queries_along(encoders, plans[1], CLIMB[1][1][2:3], CameraHeight(CAMERA_M, 0.0))
+        ground = building(encoders, plans)
+        state = follow(ground, encoders, query, [None])[0].state
+        turned = building(encoders, plans[::-1])
+        turned = replace(turned, keys=ground.keys[::-1])
+        again = turned.left(turned.entered(state))
+        assert again.by_plan == pytest.approx(state.by_plan)
+        assert present(again.pose).position_m == pytest.approx(present(state.pose).position_m)
+        alone = replace(Ground.of_plan(plans[0], ground.grid), keys=("another",))
+        assert alone.entered(state).pose is None
+        assert not len(alone.entered(state).belief.pose)
 
 
 class TestState:

@@ -1,6 +1,6 @@
 /** Client of the service's API; every request of the pages adds the API key here. */
 
-import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, SequenceAnswer, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
+import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, SequenceAnswer, Session, SessionDocument, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
 
 const KEY = "lalaloc-key";
 
@@ -166,6 +166,25 @@ export const api = {
   /** Return the first page of a venue's plans, from the lowest level up. */
   async venuePlans(id: string): Promise<VenuePlanList> {
     return json(`/venues/${encodeURIComponent(id)}/plans?limit=500`);
+  },
+
+  /** Begin to follow a camera in a plan or venue. */
+  async beginSession(document: Partial<SessionDocument>): Promise<Session> {
+    const headers = { "Content-Type": "application/json" };
+    return json("/sessions", { method: "POST", headers, body: JSON.stringify(document) });
+  },
+
+  async session(id: string): Promise<Session> {
+    return json(`/sessions/${encodeURIComponent(id)}`);
+  },
+
+  /** Send the next photograph of a session. */
+  async addPhotograph(id: string, fields: Record<string, string>, photo: File): Promise<Session> {
+    return json(`/sessions/${encodeURIComponent(id)}/photographs`, { method: "POST", body: form(fields, "photo", photo) });
+  },
+
+  async endSession(id: string): Promise<void> {
+    await request(`/sessions/${encodeURIComponent(id)}`, { method: "DELETE" });
   },
 
   async answer(id: string): Promise<Answer> {
