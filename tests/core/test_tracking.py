@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from lalaloc_core.conventions import wrap_angle
@@ -336,6 +337,26 @@ class TestState:
         assert len(last.belief.pose) <= MAX_STATES
         # Still right.
         assert np.linalg.norm(found[-1].pose.position_m - walk[-1][0]) < STEP_M
+
+    @pytest.mark.slow
+    def test_session_of_10_000_photographs_does_not_grow(
+        self, ground: Ground, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
+        order = [there[index % len(there)] for index in range(10_000)]
+        moves = odometry_along([WALK[index] for index in order])
+        content, sizes, before = TrackState.first(len(queries[0].roll)).to_bytes(), list[int](), 0
+        for number, (index, move) in enumerate(zip(order, moves, strict=True)):
+            state = TrackState.from_bytes(content)
+            content = run_steps(
+                track_steps(ground, encoders, state, queries[index], move), lambda _job: None
+            ).state.to_bytes()
+            sizes.append(len(content))
+            if number == 500:
+                before = psutil.Process().memory_info().rss
+        assert psutil.Process().memory_info().rss - before < 32 * 2**20
+        assert max(sizes[500:]) < max(sizes[:500]) + 2000
+        assert np.linalg.norm(present(TrackState.from_bytes(content).pose).position_m - WALK[order[-1]][0]) < STEP_M
 
     @pytest.mark.parametrize("damage", ["cut", "flipped", "version", "number"])
     def test_damaged_state_is_refused(self, damage: str) -> None:

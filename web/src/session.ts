@@ -51,7 +51,7 @@ export class LiveSession {
       this.input.value = "";
       void this.add(files);
     });
-    byId("session").append(h("div", { class: "ask" }, this.begin, this.next, this.stop), this.error, this.state);
+    byId("session").append(h("div", { class: "session-bar" }, this.begin, this.next, this.stop), this.error, this.state);
     this.draw();
   }
 
@@ -190,6 +190,6 @@ export class LiveSession {
           s("title", {}, `${rival.room}, ${percent(rival.probability)} probable`))),
       isHere(pose) && ellipse({ position: pose.position, covariance_m2: [[xx, xy], [xy, yy]] }),
       isHere(pose) && s("g", { class: `camera ${session.mode}`, id: "session-camera", transform: `translate(${x_m} ${-y_m}) rotate(${pose.heading_deg})` },
-        s("title", {}, `Camera in ${pose.room}`), s("path", { d: `M0 ${-5 * unit}L${1.6 * unit} ${-1.6 * unit}H${-1.6 * unit}Z` }), s("circle", { r: 1.3 * unit })));
+        s("title", {}, `Camera in ${pose.room}`), s("path", { d: `M0 ${-4.5 * unit}L${1.1 * unit} 0H${-1.1 * unit}Z` }), s("circle", { r: 1.3 * unit })));
   }
 }
