@@ -192,8 +192,7 @@ async def add_photograph(
     try:
         document = SessionDocument.model_validate_json(session.options)
         place = await _current_place(session, document, runtime)
-        named = {"plan": session.plan_id} if session.venue_id is None else {"venue": session.venue_id}
-        add_log_fields(request, **named, revision=session.revision_id)
+        add_log_fields(request, plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
         query = TrackQuery(session.id, document, session.state, form, parts.files[PHOTO], context)
         outcome = await runtime.tracker.track(place, query)
         stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
