@@ -315,7 +315,15 @@ def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
 
 
 def _follow_session(caller: Caller, stored: Stored, _size: int) -> None:
-    answer = caller.send("POST", "/sessions", _body({"floorplan_id": stored.plan_id}))
+    _follow(caller, {"floorplan_id": stored.plan_id})
+
+
+def _follow_session_in_venue(caller: Caller, stored: Stored, _size: int) -> None:
+    _follow(caller, {"venue_id": stored.venue_id})
+
+
+def _follow(caller: Caller, place: dict[str, str]) -> None:
+    answer = caller.send("POST", "/sessions", _body(place))
     if answer.status == 201:
         path = f"/sessions/{answer.json()['id']}"
         sphere = (("projection", "equirectangular"),)
@@ -428,6 +436,11 @@ LOADS = (
         f"two photographs, {ROOMS_PLAN}",
         _follow_session,
         plan=ROOMS_PLAN,
+    ),
+    Load(
+        ("POST /sessions", "POST /sessions/{session_id}/photographs"),
+        "two photographs, {homes} homes",
+        _follow_session_in_venue,
     ),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),

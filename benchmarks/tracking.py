@@ -42,11 +42,11 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Refiner, run_steps
-from lalaloc_core.localise.poses import PoseGrid, Query
+from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.motion import WalkGraph
+from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.render.sampling import pose_grid
 
 # Lattice of the ways (m), distance of walkers from walls, and of the nodes on both sides of a doorway.
@@ -192,10 +192,9 @@ class Follower:
     """Follows walks through one plan."""
 
     def __init__(self, plan: FloorPlan, encoders: Encoders, refiner: Refiner) -> None:
-        self._plan, self._encoders, self._refiner = plan, encoders, refiner
-        self._grid: PoseGrid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5, latents=False)
-        layouts = self._grid.layouts(plan)
-        self._graph = WalkGraph.of(self._grid.poses, layouts, _GRID_STEP_M)
+        self._encoders, self._refiner = encoders, refiner
+        grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5, latents=False)
+        self._ground = Ground.of_plan(plan, grid)
         self.milliseconds: list[float] = []
 
     def follow(
@@ -211,16 +210,14 @@ class Follower:
 
         Odometry tells nothing of jumps in the order. `shift_m` is the translation of the walk's home into the plan.
         """
-        state = TrackState.first(len(self._grid.poses), len(walk.queries[0].roll))
+        state = TrackState.first(len(walk.queries[0].roll))
         found, still = list[tuple[float, Tracked]](), Odometry.of_stds(0.0, 0.0, 0.0, (0.05, 0.05, 0.03))
         for place, index in enumerate(order):
             move = still if place == 0 or order[place - 1] != index - 1 else walk.moves[index - 1]
             begin = time.perf_counter()
             answer = run_steps(
                 track_steps(
-                    self._plan,
-                    self._grid,
-                    self._graph,
+                    self._ground,
                     self._encoders,
                     state,
                     walk.queries[index],

@@ -18,7 +18,7 @@ class SessionOptions(TypedDict, total=False):
 
     Attributes:
         camera_height_m, camera_height_std_m, top_k: as in `QueryOptions`.
-        near, radius_m, rooms: hints about the first photograph, as in `QueryOptions`.
+        near, radius_m, rooms, level: hints about the first photograph, as in `QueryOptions`; `level` in venues.
     """
 
     camera_height_m: float | None
@@ -26,6 +26,7 @@ class SessionOptions(TypedDict, total=False):
     near: Mapping[str, float] | None
     radius_m: float | None
     rooms: Sequence[str] | None
+    level: float | None
     top_k: int | None
 
 
@@ -56,24 +57,28 @@ class Motion:
 
 @dataclass(frozen=True)
 class Rival:
-    """A possible pose of the last photograph."""
+    """A possible pose of the last photograph; `floorplan_id` and `level` as in `TrackedPose`."""
 
     position: Position
     heading_deg: float
     room: str
     room_id: str
     probability: float
+    floorplan_id: str | None = None
+    level: float | None = None
 
 
 @dataclass(frozen=True)
 class PathPoint:
-    """Pose of one photograph of a session; `number` counts from 1."""
+    """Pose of one photograph of a session; `number` counts from 1, `floorplan_id` and `level` as in `TrackedPose`."""
 
     number: int
     position: Position
     heading_deg: float
     room_id: str
     probability: float
+    floorplan_id: str | None = None
+    level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,8 @@ class TrackedPose:
         motion_contradicted: components of the motion that the photographs contradict.
         warnings: these, and odometry that is wrong again and again.
         view: assumptions about the photograph; None for services without this field.
+        floorplan_id: plan in whose frame the pose is; None for services without this field.
+        level: level of this plan in the venue; None for a session in one plan.
     """
 
     number: int
@@ -103,6 +110,8 @@ class TrackedPose:
     warnings: tuple[str, ...]
     timings_ms: Mapping[str, float]
     view: ReadView | None = None
+    floorplan_id: str | None = None
+    level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,15 +120,19 @@ class Session:
 
     Attributes:
         mode: `searching`, `tracking` or `lost`.
+        floorplan_id, floorplan_revision: the plan; None for a session in a venue.
         pose: pose of the last photograph; None before the first.
         path: poses of the last 200 photographs.
+        venue_id, venue_revision: the venue; None for a session in one plan.
     """
 
     id: str
-    floorplan_id: str
-    floorplan_revision: str
+    floorplan_id: str | None
+    floorplan_revision: str | None
     expires_at: datetime
     photographs: int
     mode: str
     pose: TrackedPose | None
     path: tuple[PathPoint, ...]
+    venue_id: str | None = None
+    venue_revision: str | None = None

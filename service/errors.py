@@ -10,7 +10,7 @@ LaLaLocError
     ├── UnknownAnswerError          no kept answer with this id
     ├── UnknownSessionError         no session with this id, or an expired one
     ├── SessionBusyError            a photograph of the session is in progress
-    ├── SessionOutdatedError        the plan or the model of the session has changed
+    ├── SessionOutdatedError        the plan, the venue or the model of the session has changed
     ├── PhotographOutOfOrderError   the photograph is not the next one of the session
     ├── TooManySessionsError        the tenant's quota of sessions is used up
     ├── UnanchoredPlanError         the floor plan has no anchor
@@ -123,7 +123,7 @@ class UnknownSessionError(ServiceError):
     def __init__(self, session_id: str) -> None:
         super().__init__(
             f"session '{session_id[:64]}' does not exist; sessions expire (session_ttl_s) and are deleted with their "
-            "floor plan"
+            "floor plan or venue"
         )
 
 
@@ -139,7 +139,7 @@ class SessionBusyError(ServiceError):
 
 
 class SessionOutdatedError(ServiceError):
-    """The plan or the model has changed since the session began."""
+    """The plan, the venue or the model has changed since the session began."""
 
     def __init__(self, session_id: str, reason: str) -> None:
         super().__init__(f"session '{session_id}' cannot go on: {reason}; begin a new session")
@@ -282,8 +282,8 @@ class StorageQuotaError(ServiceError):
 class VenueUnsearchableError(ServiceError):
     """The venue has no plans, or all of them failed."""
 
-    def __init__(self, venue_id: str, plans: int) -> None:
-        reason = f"all of its {plans} floor plans failed" if plans else "it has no floor plans"
+    def __init__(self, venue_id: str, plans: int, reason: str = "") -> None:
+        reason = reason or (f"all of its {plans} floor plans failed" if plans else "it has no floor plans")
         super().__init__(f"venue '{venue_id}' cannot be searched: {reason}")
 
 

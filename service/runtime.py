@@ -21,6 +21,7 @@ from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.query import (
     Decoder,
+    Grounds,
     Localiser,
     LocaliserBackend,
     LpoPool,
@@ -30,6 +31,7 @@ from service.query import (
     VenueLocaliser,
     VenueLocaliserBackend,
     VenuePlans,
+    VenueSearch,
 )
 from service.schemas import ModelAnswer
 from service.security import AccessControl
@@ -176,9 +178,12 @@ def start_runtime(
     _closing(cleanup, sweeper).start()
     # A thread of its own: a database that does not answer blocks no reads of queries.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
-    venue_localiser = components.venue_localiser(localiser, _closing(cleanup, components.venue_plans()))
+    plans = _closing(cleanup, components.venue_plans())
+    search = VenueSearch(plans=plans, encoder=components.encoder, queries=components.admission.queries)
+    venue_localiser = components.venue_localiser(localiser, plans, search)
     if backends.localisers is None:
-        localisers: Localisers = localiser, venue_localiser, components.tracker(localiser)
+        tracker = components.tracker(localiser, Grounds(localiser, plans, search))
+        localisers: Localisers = localiser, venue_localiser, tracker
     else:
         localisers = backends.localisers(localiser.model, settings, telemetry)
     renditions = RenditionCache(
@@ -285,7 +290,7 @@ class _QueryComponents:
             permits=self.permits,
         )
 
-    def tracker(self, localiser: Localiser) -> SessionTracker:
+    def tracker(self, localiser: Localiser, grounds: Grounds) -> SessionTracker:
         """Build the tracker of sessions."""
         return SessionTracker(
             settings=self.settings,
@@ -294,6 +299,7 @@ class _QueryComponents:
             localiser=localiser,
             decoder=self.decoder,
             queries=self.admission.queries,
+            grounds=grounds,
         )
 
     def venue_plans(self) -> VenuePlans:
@@ -308,13 +314,14 @@ class _QueryComponents:
             max_poses=min(self.settings.grids.max_grid_poses, _VENUE_POSES),
         )
 
-    def venue_localiser(self, localiser: Localiser, plans: VenuePlans) -> VenueLocaliser:
+    def venue_localiser(self, localiser: Localiser, plans: VenuePlans, search: VenueSearch) -> VenueLocaliser:
         """Build the localiser of venues."""
         return VenueLocaliser(
             settings=self.settings,
             bundle=self.bundle,
             encoder=self.encoder,
             plans=plans,
+            search=search,
             localiser=localiser,
             decoder=self.decoder,
             queries=self.admission.queries,

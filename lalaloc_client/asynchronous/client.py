@@ -492,14 +492,17 @@ class AsyncClient(AsyncTransport):
         content = await self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
         return parse(SequenceLocalisation, content)
 
-    def track(self, floorplan_id: str, **options: Unpack[SessionOptions]) -> AsyncTracker:
+    def track(
+        self, floorplan_id: str | None = None, *, venue_id: str | None = None, **options: Unpack[SessionOptions]
+    ) -> AsyncTracker:
         """Return a tracker, which follows a camera from photograph to photograph.
 
         Args:
             floorplan_id: id of the plan.
+            venue_id: id of a venue instead, between whose plans the camera can move.
             **options: see `SessionOptions`.
         """
-        return AsyncTracker(self, floorplan_id, options)
+        return AsyncTracker(self, floorplan_id, venue_id, options)
 
     async def picture(
         self,

@@ -22,10 +22,12 @@ class Tracker:
     Photographs are numbered, so that one whose answer was lost is not counted twice.
     """
 
-    def __init__(self, service: Transport, floorplan_id: str, options: SessionOptions) -> None:
+    def __init__(
+        self, service: Transport, floorplan_id: str | None, venue_id: str | None, options: SessionOptions
+    ) -> None:
         self._service = service
-        self._document: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-        self._document["floorplan_id"] = floorplan_id
+        given = {"floorplan_id": floorplan_id, "venue_id": venue_id, **options}
+        self._document: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         self._session: Session | None = None
 
     def __enter__(self) -> Tracker:

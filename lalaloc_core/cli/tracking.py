@@ -131,7 +131,7 @@ def _followed(
     from lalaloc_core.localise.stated_camera import known_heading, stated_height
     from lalaloc_core.localise.tracking import TrackState
     from lalaloc_core.localise.tracking.filter import track_steps
-    from lalaloc_core.localise.tracking.motion import WalkGraph
+    from lalaloc_core.localise.tracking.ground import Ground
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
     from lalaloc_core.photograph import open_view
 
@@ -147,7 +147,7 @@ def _followed(
         camera_height_m=height.height_m,
         latents=not encoders.predicts_profile,
     )
-    graph, errors, mount = WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m), OdometryErrors(), arguments.mount
+    ground, errors, mount = Ground.of_plan(plan, grid), OdometryErrors(), arguments.mount
     state, before_s = None, None
     found: list[_Found] = []
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
@@ -155,12 +155,12 @@ def _followed(
         with named(path):
             view = open_view(content, sphere_size=sphere, stated=stated, patch_size=patch)
             query = encoder.query(view, None, height)
-        state = state or TrackState.first(len(grid.poses), len(query.roll))
+        state = state or TrackState.first(len(query.roll))
         motion = None
         if trajectory is not None and before_s is not None:
             motion = trajectory.motion(before_s, time_s, errors, math.radians(mount))
         known = known_heading(plan.north, None, 0.0, view.compass_heading)
-        steps = track_steps(plan, grid, graph, encoders, state, query, motion, known_heading=known)
+        steps = track_steps(ground, encoders, state, query, motion, known_heading=known)
         answer = run_steps(steps, refiner)
         contradictions = [f"the photographs contradict {name} of the odometry" for name in answer.contradicted]
         for warning in (*view.warnings, *contradictions):

@@ -228,11 +228,11 @@ class RemoteVenueLocaliser(_SearchCaller):
 class RemoteTracker(_SearchCaller):
     """Remote `SessionTracker`."""
 
-    async def check(self, record: PlanRecord, document: SessionDocument) -> None:
+    async def check(self, place: PlanRecord | VenueRecord, document: SessionDocument) -> None:
         """See `SessionTracker.check`."""
-        context = QueryContext.starting(record.tenant, self._settings.requests.request_deadline_s)
-        await self._call("check_session", record.id, context, record.tenant, record.id, document)
+        context = QueryContext.starting(place.tenant, self._settings.requests.request_deadline_s)
+        await self._call("check_session", place.id, context, place.tenant, document)
 
-    async def track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+    async def track(self, place: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
         """See `SessionTracker.track`."""
-        return await self._call("track", record.id, query.context, record.tenant, record.id, query)
+        return await self._call("track", place.id, query.context, place.tenant, query)

@@ -120,14 +120,14 @@ class SearchReplica:
         await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
 
     @returning_failures
-    async def check_session(self, tenant: str, plan_id: str, document: SessionDocument) -> None:
+    async def check_session(self, tenant: str, document: SessionDocument) -> None:
         """See `SessionTracker.check`."""
-        await self._runtime.tracker.check(await self._plan(tenant, plan_id), document)
+        await self._runtime.tracker.check(await self._place(tenant, document), document)
 
     @returning_failures
-    async def track(self, tenant: str, plan_id: str, query: TrackQuery) -> TrackOutcome:
+    async def track(self, tenant: str, query: TrackQuery) -> TrackOutcome:
         """See `SessionTracker.track`."""
-        return await self._runtime.tracker.track(await self._plan(tenant, plan_id), query)
+        return await self._runtime.tracker.track(await self._place(tenant, query.document), query)
 
     async def revisions(self) -> frozenset[str]:
         """Return the revisions of plans whose pose grids are in memory."""
@@ -140,6 +140,12 @@ class SearchReplica:
             # The plan was deleted meanwhile.
             raise UnknownFloorPlanError(plan_id)
         return record
+
+    async def _place(self, tenant: str, document: SessionDocument) -> PlanRecord | VenueRecord:
+        if document.venue_id is not None:
+            return await self._venue(tenant, document.venue_id)
+        assert document.floorplan_id is not None
+        return await self._plan(tenant, document.floorplan_id)
 
     async def _venue(self, tenant: str, venue_id: str) -> VenueRecord:
         record = await self._runtime.reads.run(tenant, self._runtime.store.venues.get, tenant, venue_id)

@@ -2,12 +2,14 @@
 
 Begin with `localiser.py`, whose `_localise` shows the steps in order. `stated_camera.py` reads the fields about the
 camera, `photographs.py` encodes decoded photographs, `answers.py` composes the answer. `venue_localiser.py` does the
-same for a venue: `venue_plans.py` chooses the plans by the prototypes in `prototype_file.py`, and `venue_hints.py`
-applies the hints to them. `decoding.py` and `lpo_pool.py` are pools of worker processes. `queries.py` has the queries
-and the interfaces of the components that can run in other processes. `tracking.py` follows the cameras of sessions.
+same for a venue: `venue_search.py` waits for its plans, `venue_plans.py` chooses among them by the prototypes in
+`prototype_file.py`, and `venue_hints.py` applies the hints to them. `tracking.py` follows the cameras of sessions in
+the plans of `grounds.py`. `decoding.py` and `lpo_pool.py` are pools of worker processes. `queries.py` has the queries
+and the interfaces of the components that can run in other processes.
 """
 
 from service.query.decoding import Decoder
+from service.query.grounds import MAX_POSES, Grounds
 from service.query.localiser import Localiser
 from service.query.lpo_pool import LpoPool
 from service.query.queries import (
@@ -26,10 +28,13 @@ from service.query.queries import (
 from service.query.tracking import SessionTracker
 from service.query.venue_localiser import VenueLocaliser
 from service.query.venue_plans import VenuePlans
+from service.query.venue_search import VenueSearch
 
 __all__ = [
+    "MAX_POSES",
     "Content",
     "Decoder",
+    "Grounds",
     "Localiser",
     "LocaliserBackend",
     "LpoPool",
@@ -45,4 +50,5 @@ __all__ = [
     "VenueLocaliser",
     "VenueLocaliserBackend",
     "VenuePlans",
+    "VenueSearch",
 ]

@@ -206,13 +206,13 @@ class VenueLocaliserBackend(Protocol):
 
 
 class TrackerBackend(Protocol):
-    """Tracking in one plan; `SessionTracker` implements and documents it."""
+    """Tracking in one plan or venue; `SessionTracker` implements and documents it."""
 
-    async def check(self, record: PlanRecord, document: SessionDocument) -> None:
+    async def check(self, place: PlanRecord | VenueRecord, document: SessionDocument) -> None:
         """See `SessionTracker.check`."""
         ...
 
-    async def track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+    async def track(self, place: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
         """See `SessionTracker.track`."""
         ...
 

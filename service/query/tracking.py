@@ -1,34 +1,36 @@
-"""Tracking in a stored plan: one photograph of a session, from its upload to the state for the next one."""
+"""Tracking in a stored plan or venue: one photograph of a session, from its upload to the state for the next one."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.hints import NO_HINTS
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.motion import WalkGraph
 from lalaloc_core.photograph import View
-from service.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.http.admission_control import Slots
+from service.query.answers import Place
 from service.query.decoding import Decoder
 from service.query.geopose import geopose_at
+from service.query.grounds import Grounds, SessionGround
 from service.query.localiser import Localiser
 from service.query.photographs import Photograph, encode, read_view
 from service.query.queries import TrackOutcome, TrackQuery
 from service.query.stated_camera import known_heading, stated_height, stated_hints
+from service.query.venue_plans import venue_height
 from service.schemas import (
     ModelAnswer,
     PathPoint,
@@ -41,10 +43,8 @@ from service.schemas import (
     TrackedPoseAnswer,
 )
 from service.settings import Settings
-from service.storage.records import PlanRecord
+from service.storage.records import PlanRecord, VenueRecord
 
-# Memory of the links of pose grids.
-_GRAPH_BYTES = 64 * 2**20
 _UNKNOWN = KnownHeading(None, 0.0, "searched")
 # Stages of tracking that answers report as a stage of a single query.
 _STAGES = {"retrieve": ("predict", "retrieve"), "lpo": ("lpo", "rank")}
@@ -62,6 +62,7 @@ class SessionTracker:
         localiser: Localiser,
         decoder: Decoder,
         queries: Slots,
+        grounds: Grounds,
     ) -> None:
         self._settings = settings
         self._bundle = bundle
@@ -69,83 +70,86 @@ class SessionTracker:
         self._localiser = localiser
         self._decoder = decoder
         self._queries = queries
-        self._graphs = BoundedCache[str, WalkGraph](_GRAPH_BYTES, lambda graph: graph.nbytes)
+        self._grounds = grounds
 
-    async def check(self, record: PlanRecord, document: SessionDocument) -> None:
+    async def check(self, place: PlanRecord | VenueRecord, document: SessionDocument) -> None:
         """Check a request for a session.
 
         Raises:
             InvalidPoseError: the camera height is above the ceiling.
-            InvalidHintError: the hints do not match the plan.
+            InvalidHintError: the hints do not match the plan or venue.
+            VenueUnsearchableError: the venue has no plans.
         """
-        stated_height(document, record)
-        stated_hints(document, record.plan).check(record.plan)
+        if isinstance(place, VenueRecord):
+            await self._grounds.check(place, document)
+            return
+        stated_height(document, place)
+        stated_hints(document, place.plan).check(place.plan)
 
-    async def track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+    async def track(self, place: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
         """Follow a camera to its next photograph.
 
         Raises:
-            SessionOutdatedError: the model has changed since the session began.
-            LaLaLocError: see `Localiser.localise`.
+            SessionOutdatedError: the model, or a plan of the venue, has changed since the session began.
+            LaLaLocError: see `Localiser.localise` and `VenueLocaliser.localise`.
         """
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
-            return await self._track(record, query)
+            return await self._track(place, query)
 
-    async def _track(self, record: PlanRecord, query: TrackQuery) -> TrackOutcome:
+    async def _track(self, place: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
         form, document, context = query.form, query.document, query.context
         clock, compute = context.clock, partial(self._localiser.compute, context)
-        odometry, height = form.odometry, stated_height(document, record)
+        odometry = form.odometry
         with clock.stage("decode"):
             view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
-        known = known_heading(form, record.plan.north, view, self._settings.panoramas.compass_tolerance_deg)
-        encoded = (await compute(partial(encode, self._encoder, [Photograph(view)], [_UNKNOWN], height, clock)))[0]
-        grid = await self._localiser.grid(record, height, context)
-        graph = await compute(partial(self._graph, record, grid))
+        compass_deg = self._settings.panoramas.compass_tolerance_deg
         try:
-            state = TrackState.first(len(grid.poses), len(encoded.roll))
-            if query.state is not None:
-                state = TrackState.from_bytes(query.state)
+            state = None if query.state is None else TrackState.from_bytes(query.state)
+            if isinstance(place, VenueRecord):
+                with clock.stage("wait"):
+                    ready = await self._grounds.ready(place, query)
+                north = None if place.anchor is None else heading_from_degrees(place.anchor.north_deg)
+                known = known_heading(form, north, view, compass_deg)
+                height = venue_height(document, ready.rows)
+                encoded = (await compute(self._encode(view, height, clock)))[0]
+                with clock.stage("shortlist"):
+                    found = await self._grounds.of_venue(place, ready, query, encoded, state)
+            else:
+                known = known_heading(form, place.plan.north, view, compass_deg)
+                encoded = (await compute(self._encode(view, stated_height(document, place), clock)))[0]
+                found = await self._grounds.of_plan(place, query)
             steps = track_steps(
-                record.plan,
-                grid,
-                graph,
+                found.ground,
                 self._encoder.networks,
-                state,
+                state or TrackState.first(len(encoded.roll)),
                 encoded,
                 odometry,
                 known_heading=known,
-                hints=stated_hints(document, record.plan) if query.state is None else NO_HINTS,
+                hints=found.hints,
                 top_k=document.top_k,
                 clock=clock,
             )
-            found = await self._localiser.run_search(steps, context)
+            tracked = await self._localiser.run_search(steps, context)
         except InvalidStateError as error:
             raise SessionOutdatedError(query.session_id, str(error)) from error
-        timings_ms = self._localiser.observe(context, found.stage)
-        return TrackOutcome(found.state.to_bytes(), self._stored(record, found, view, form, timings_ms))
+        timings_ms = self._localiser.observe(context, tracked.stage)
+        return TrackOutcome(tracked.state.to_bytes(), self._stored(found, tracked, view, form, timings_ms))
 
-    def _graph(self, record: PlanRecord, grid: PoseGrid) -> WalkGraph:
-        """Return the links of a plan's pose grid."""
-        return self._graphs.get_or_make(
-            record.revision_id, lambda: WalkGraph.of(grid.poses, grid.layouts(record.plan), grid.step_m)
-        )
+    def _encode(self, view: View, height: CameraHeight, clock: StageClock) -> Callable[[], list[Query]]:
+        return partial(encode, self._encoder, [Photograph(view)], [_UNKNOWN], height, clock)
 
     def _stored(
-        self, record: PlanRecord, found: Tracked, view: View, form: PhotographForm, timings_ms: dict[str, float]
+        self, ground: SessionGround, found: Tracked, view: View, form: PhotographForm, timings_ms: dict[str, float]
     ) -> StoredPose:
-        """Compose the part of the answer that is stored with the session."""
-        plan, pose, query = record.plan, found.pose, found.query
+        """Compose the part of the answer that is stored with the session; its path is the new pose alone."""
+        pose, query, best = found.pose, found.query, found.candidates[0]
+        place = ground.place(best)
         scale = np.array([1.0, 1.0, math.degrees(1.0)])
-        heading_deg, room = heading_to_degrees(pose.heading), plan.rooms[pose.room_index]
-        camera_height_m = query.camera_height.height_m * math.exp(found.candidates[0].height_offset)
+        heading_deg, room = heading_to_degrees(pose.heading), place.plan.rooms[pose.room_index]
+        position = Position(x_m=pose.x_m, y_m=pose.y_m)
+        camera_height_m = query.camera_height.height_m * math.exp(best.height_offset)
         rivals = [
-            RivalAnswer(
-                position=Position(x_m=rival.x_m, y_m=rival.y_m),
-                heading_deg=heading_to_degrees(panorama_heading(query, rival)),
-                room=plan.rooms[rival.room_index].name,
-                room_id=plan.rooms[rival.room_index].id,
-                probability=min(probability, 1.0),
-            )
+            _rival(ground.place(rival), heading_to_degrees(panorama_heading(query, rival)), probability)
             for rival, probability in zip(found.candidates, found.probability, strict=True)
         ]
         totals = {
@@ -154,32 +158,37 @@ class SessionTracker:
         }
         answer = TrackedPoseAnswer(
             number=pose.number,
-            position=Position(x_m=pose.x_m, y_m=pose.y_m),
+            position=position,
             heading_deg=heading_deg,
             room=room.name,
             room_id=room.id,
+            floorplan_id=place.plan_id,
+            level=place.level,
             covariance=(pose.covariance * np.outer(scale, scale)).tolist(),
             probability=min(pose.probability, 1.0),
             camera_height_m=camera_height_m,
             candidates=rivals,
             motion_contradicted=list(found.contradicted),
-            warnings=_warnings(found, form),
-            geopose=geopose_at(plan.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
+            warnings=[*_warnings(found, form), *ground.warnings],
+            geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
             view=read_view(Photograph(view)),
             timings_ms=TimingsAnswer(**totals),
             model=ModelAnswer.of(self._bundle),
         )
-        return StoredPose(mode=pose.mode, pose=answer, path=[_point(row, plan) for row in found.state.path])
+        point = PathPoint(**{name: getattr(answer, name) for name in PathPoint.model_fields})
+        return StoredPose(mode=pose.mode, pose=answer, path=[point])
 
 
-def _point(row: np.ndarray, plan: FloorPlan) -> PathPoint:
-    number, x_m, y_m, heading, room, probability = row.tolist()
-    return PathPoint(
-        number=int(number),
-        position=Position(x_m=x_m, y_m=y_m),
-        heading_deg=heading_to_degrees(heading),
-        room_id=plan.rooms[int(room)].id,
-        probability=min(max(probability, 0.0), 1.0),
+def _rival(place: Place, heading_deg: float, probability: float) -> RivalAnswer:
+    room = place.plan.rooms[place.candidate.room_index]
+    return RivalAnswer(
+        position=Position(x_m=place.candidate.x_m, y_m=place.candidate.y_m),
+        heading_deg=heading_deg,
+        room=room.name,
+        room_id=room.id,
+        floorplan_id=place.plan_id,
+        level=place.level,
+        probability=min(probability, 1.0),
     )
 
 

@@ -19,6 +19,7 @@ from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.query.geopose import plan_anchor
 from service.query.stated_camera import contradiction, near_missed
+from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HintFields
 from service.storage.plan_places import distances_m
 
@@ -50,8 +51,8 @@ class VenueHints:
     strict: bool = False
 
     @classmethod
-    def from_form(cls, form: HintFields, anchor: Anchor | None) -> Self:
-        """Return the hints of a form.
+    def from_form(cls, form: HintFields | SessionDocument, anchor: Anchor | None) -> Self:
+        """Return the hints of a request.
 
         Raises:
             InvalidHintError: a point in a frame that the plans do not share.
@@ -62,7 +63,7 @@ class VenueHints:
             radius_m=math.inf if form.radius_m is None else form.radius_m,
             rooms=tuple(form.rooms or ()),
             level=form.level,
-            strict=form.strict,
+            strict=isinstance(form, HintFields) and form.strict,
         )
 
     def check(self, members: _Rows) -> None:
@@ -205,7 +206,7 @@ class VenueHints:
         return anchor.to_plan(np.array([[self.place.longitude, self.place.latitude]]))[0]
 
 
-def _on_earth(form: HintFields, anchor: Anchor | None) -> EarthPoint | None:
+def _on_earth(form: HintFields | SessionDocument, anchor: Anchor | None) -> EarthPoint | None:
     if form.near is None or isinstance(form.near, EarthPoint):
         return form.near
     if anchor is None:

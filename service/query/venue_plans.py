@@ -29,7 +29,8 @@ from service.bounded_cache import BoundedCache
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider
 from service.query.prototype_file import BlockKey, PrototypeFile
-from service.schemas import EarthPoint, LocaliseForm
+from service.schemas import EarthPoint
+from service.schemas.query_fields import CameraFields
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
 from service.storage.plan_lookup import parsed
@@ -185,6 +186,7 @@ class VenuePlans:
         query: Query,
         weights: MatchingWeights,
         log_prior: Float[np.ndarray, "p"],
+        favour: Float[np.ndarray, "p"] | None = None,
     ) -> ChosenPlans:
         """Return the most probable plans of an index.
 
@@ -194,10 +196,12 @@ class VenuePlans:
             query: the encoded panorama.
             weights: weights of the matching cost.
             log_prior: (p,) log prior of the plans.
+            favour: (p,) log factors by which plans are preferred in the choice alone.
         """
         log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
         poses = np.array([row.poses for row in known])
-        chosen = most_probable(log_mass, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses))
+        ranked = log_mass if favour is None else log_mass + favour
+        chosen = most_probable(ranked, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses))
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
@@ -301,7 +305,7 @@ def not_excluded(ready: Sequence[Row[Any]], log_prior: Float[np.ndarray, "p"]) -
     return [ready[k] for k in np.flatnonzero(possible).tolist()]
 
 
-def venue_height(form: LocaliseForm, ready: Sequence[Row[Any]]) -> CameraHeight:
+def venue_height(form: CameraFields, ready: Sequence[Row[Any]]) -> CameraHeight:
     """Return the camera height in the request, else the one that all plans of a venue share, else an unknown one."""
     if form.camera_height_m is not None:
         std_m = DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m

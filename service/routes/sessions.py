@@ -26,26 +26,35 @@ from service.errors import (
     TooManySessionsError,
     UnknownFloorPlanError,
     UnknownSessionError,
+    UnknownVenueError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
+    VenueNotReadyError,
+    VenueUnsearchableError,
 )
 from service.http import IdempotentRequest
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body
-from service.query import TrackQuery
-from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, is_id, plan_for_query
+from service.query import MAX_POSES, TrackQuery
+from service.routes.dependencies import (
+    IDEMPOTENCY_KEY,
+    Client,
+    Running,
+    Tenant,
+    is_id,
+    plan_for_query,
+    venue_for_query,
+)
 from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, photographs_of, read_query
 from service.runtime import Runtime
 from service.schemas import PhotographForm, SessionAnswer, SessionDocument, StoredPose
-from service.storage.records import PlanRecord
+from service.storage.records import PlanRecord, VenueRecord
 from service.storage.sessions import SessionRecord
 from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
-# Poses of a plan whose belief is computed for every photograph; a belief has a weight for each pose and heading.
-MAX_POSES = 65_536
 # Lists, objects and items of a session document.
 _VALUES = 1000
 _PHOTOGRAPH: dict[str, Any] = {
@@ -82,36 +91,34 @@ _READ_ERRORS = (UnknownSessionError, InvalidRequestError, StoreUnavailableError)
         StoreFullError,
         StorageQuotaError,
         UnknownFloorPlanError,
+        UnknownVenueError,
+        VenueUnsearchableError,
         TooManySessionsError,
         IdempotencyKeyReusedError,
         IdempotencyInProgressError,
     ),
 )
 async def create_session(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Begin to follow a camera in a stored floor plan; send its photographs to `/sessions/{session_id}/photographs`.
+    """Begin to follow a camera in a floor plan or venue; send its photographs to `/sessions/{session_id}/photographs`.
 
-    `near` and `rooms` are hints about the first photograph. A session expires `session_ttl_s` after its last
-    photograph, and ends if its plan is replaced or deleted.
+    `near`, `rooms` and `level` are hints about the first photograph. A session expires `session_ttl_s` after its last
+    photograph, and ends if its plan or venue is changed or deleted.
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /sessions")
     media_type(request, (JSON,))
     content = await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
     document = await runtime.uploads.run(client, parse_document, SessionDocument, content.read(), _VALUES)
     document = _limited(document, runtime)
-    record = await plan_for_query(tenant, document.floorplan_id, runtime)
-    poses = grid_size(record.plan, runtime.settings.grids.grid_step_m)
-    if poses > MAX_POSES:
-        raise InvalidRequestError(
-            [("floorplan_id", f"the plan has about {poses} grid poses; the limit of sessions is {MAX_POSES}")]
-        )
-    await runtime.tracker.check(record, document)
+    place = await _place(tenant, document, runtime)
+    if isinstance(place, PlanRecord):
+        _check_size(place, runtime)
+    await runtime.tracker.check(place, document)
 
     def store(token: str) -> Response:
         session = runtime.store.sessions.add(
             tenant,
             token,
-            record.id,
-            record.revision_id,
+            place,
             document.model_dump_json(exclude_unset=True),
             ttl_s=runtime.settings.storage.session_ttl_s,
             limit=runtime.settings.storage.max_sessions,
@@ -156,6 +163,8 @@ def delete_session(session_id: str, runtime: Running, tenant: Tenant) -> None:
         PhotographOutOfOrderError,
         StorageQuotaError,
         StoreFullError,
+        VenueUnsearchableError,
+        VenueNotReadyError,
         *(
             error
             for error in QUERY_ERRORS
@@ -182,13 +191,14 @@ async def add_photograph(
     (content,) = photographs_of(parts, form, runtime.bundle)
     session = await runtime.reads.run(tenant, runtime.store.sessions.claim, tenant, session_id, form.number)
     try:
-        record = await _plan_of(session, runtime)
-        add_log_fields(request, plan=record.id, revision=record.revision_id)
         document = SessionDocument.model_validate_json(session.options)
+        place = await _current_place(session, document, runtime)
+        add_log_fields(request, plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
         query = TrackQuery(session.id, document, session.state, form, content, context)
-        outcome = await runtime.tracker.track(record, query)
+        outcome = await runtime.tracker.track(place, query)
+        stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
         finish = partial(runtime.store.sessions.finish, ttl_s=runtime.settings.storage.session_ttl_s)
-        after = await runtime.reads.run(tenant, finish, session, outcome.state, outcome.stored.model_dump_json())
+        after = await runtime.reads.run(tenant, finish, session, outcome.state, stored)
     except BaseException:
         # Also if the client leaves; the claim would expire by itself.
         with suppress(StoreUnavailableError):
@@ -197,16 +207,50 @@ async def add_photograph(
     return Response(_answer(after), media_type=JSON)
 
 
-async def _plan_of(session: SessionRecord, runtime: Runtime) -> PlanRecord:
-    """Return the plan of a session.
+async def _place(tenant: str, document: SessionDocument, runtime: Runtime) -> PlanRecord | VenueRecord:
+    """Return the plan or venue of a request.
 
     Raises:
-        SessionOutdatedError: the plan was replaced.
+        UnknownFloorPlanError, UnknownVenueError: no such plan or venue.
     """
-    record = await plan_for_query(session.tenant, session.plan_id, runtime)
-    if record.revision_id != session.revision_id:
-        raise SessionOutdatedError(session.id, f"floor plan '{session.plan_id}' was replaced")
-    return record
+    if document.venue_id is not None:
+        return await venue_for_query(tenant, document.venue_id, runtime)
+    assert document.floorplan_id is not None
+    return await plan_for_query(tenant, document.floorplan_id, runtime)
+
+
+def _check_size(record: PlanRecord, runtime: Runtime) -> None:
+    """Check that the belief over a plan can be computed for every photograph.
+
+    Raises:
+        InvalidRequestError: the plan has too many poses.
+    """
+    poses = grid_size(record.plan, runtime.settings.grids.grid_step_m)
+    if poses > MAX_POSES:
+        raise InvalidRequestError(
+            [("floorplan_id", f"the plan has about {poses} grid poses; the limit of sessions is {MAX_POSES}")]
+        )
+
+
+async def _current_place(
+    session: SessionRecord, document: SessionDocument, runtime: Runtime
+) -> PlanRecord | VenueRecord:
+    """Return the plan or venue of a session.
+
+    Raises:
+        SessionOutdatedError: it was changed.
+    """
+    place = await _place(session.tenant, document, runtime)
+    if place.revision_id != session.revision_id:
+        changed = (
+            f"venue '{place.id}' was changed" if session.plan_id is None else f"floor plan '{place.id}' was replaced"
+        )
+        raise SessionOutdatedError(session.id, changed)
+    return place
+
+
+def _stored_pose(session: SessionRecord) -> StoredPose | None:
+    return None if session.pose is None else StoredPose.model_validate_json(session.pose)
 
 
 def _limited(document: SessionDocument, runtime: Runtime) -> SessionDocument:
@@ -229,11 +273,13 @@ def _id(session_id: str) -> str:
 
 def _answer(session: SessionRecord) -> str:
     """Return the answer about a session as JSON."""
-    stored = None if session.pose is None else StoredPose.model_validate_json(session.pose)
+    stored, in_venue = _stored_pose(session), session.venue_id is not None
     return SessionAnswer(
         id=session.id,
         floorplan_id=session.plan_id,
-        floorplan_revision=session.revision_id,
+        floorplan_revision=None if in_venue else session.revision_id,
+        venue_id=session.venue_id,
+        venue_revision=session.revision_id if in_venue else None,
         expires_at=session.expires_at,
         photographs=session.photographs,
         mode="searching" if stored is None else stored.mode,

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
-from pydantic_core import PydanticCustomError
 
 from service.schemas.fields import Finite
 from service.schemas.photographs import ViewFields
-from service.schemas.query_fields import CameraFields, HintFields
+from service.schemas.query_fields import CameraFields, HintFields, check_plan_or_venue
 
 HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
 
@@ -65,11 +64,8 @@ class LocaliseForm(CameraFields, HintFields, ViewFields):
     @field_validator("floorplan_id")
     @classmethod
     def _plan_or_venue(cls, value: str | None, given: ValidationInfo) -> str | None:
-        venue_id = given.data.get("venue_id")
-        if value is None and venue_id is None and "venue_id" in given.data:
-            raise PydanticCustomError("missing", "missing")
-        if venue_id is not None and value is not None:
-            raise ValueError("set floorplan_id or venue_id, not both")
+        if "venue_id" in given.data:
+            check_plan_or_venue(value, given.data["venue_id"])
         if value is not None and given.data.get("level") is not None:
             raise ValueError("level needs venue_id instead of floorplan_id")
         return value

@@ -7,6 +7,7 @@ import math
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
@@ -54,6 +55,19 @@ class CameraFields(BaseModel):
         if value > limit:
             raise ValueError(f"the limit is {limit} (max_top_k)")
         return value
+
+
+def check_plan_or_venue(floorplan_id: str | None, venue_id: str | None) -> None:
+    """Check that a request names one plan or one venue.
+
+    Raises:
+        PydanticCustomError: it names neither.
+        ValueError: it names both.
+    """
+    if floorplan_id is None and venue_id is None:
+        raise PydanticCustomError("missing", "missing")
+    if floorplan_id is not None and venue_id is not None:
+        raise ValueError("set floorplan_id or venue_id, not both")
 
 
 _MAX_ROOMS = 100

@@ -16,7 +16,7 @@ from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Sh
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import ReadView, ViewFields
-from service.schemas.query_fields import CameraFields, EarthPoint, PlanPoint
+from service.schemas.query_fields import CameraFields, EarthPoint, PlanPoint, check_plan_or_venue
 
 # `Odometry` checks the limits of motions, which this only describes.
 Step = Annotated[float, Finite, Field(json_schema_extra={"minimum": -MAX_STEP_M, "maximum": MAX_STEP_M})]
@@ -24,20 +24,33 @@ StepStd = Annotated[float, Finite, Field(json_schema_extra={"minimum": 0, "maxim
 Row = Annotated[list[Annotated[float, Finite]], Field(min_length=3, max_length=3)]
 _MAX_TURN_DEG = math.degrees(MAX_TURN)
 _ROOMS = 100
+PLAN_OF_POSE = "Floor plan of the pose, in whose frame it is; null for photographs of earlier versions."
+LEVEL_OF_POSE = "Level of this plan in the venue; null for a session in one plan."
+MAX_PATH = 200
 # Errors of odometry whose deviations are not stated: shares of the distance and degrees per metre, and what is added.
 _DRIFT, _LEAST_M, _TURN_PER_M_DEG, _LEAST_DEG = 0.05, 0.02, 2.0, 1.0
 
 
 class SessionDocument(CameraFields):
-    """Begin of a session: the plan, the camera, and what is known about the place of the first photograph."""
+    """Begin of a session: the plan or venue, the camera, and what is known about the place of the first photograph."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", json_schema_extra={"example": {"floorplan_id": "0" * 32, "camera_height_m": 1.5}}
     )
 
-    floorplan_id: str = Field(min_length=1, description="Id of the floor plan.")
+    venue_id: str | None = Field(
+        None, min_length=1, description="Id of a venue; the camera can move between its plans."
+    )
+    floorplan_id: str | None = Field(
+        None,
+        min_length=1,
+        description="Id of the floor plan. Either this or `venue_id` is required.",
+        validate_default=True,
+    )
     near: PlanPoint | EarthPoint | None = Field(
-        None, description="Approximate place of the first photograph. Needs `radius_m`."
+        None,
+        description="Approximate place of the first photograph. Needs `radius_m`. In a venue, `x_m` and `y_m` need the "
+        "venue's `anchor`.",
     )
     radius_m: Annotated[float, Finite] | None = Field(
         None, gt=0, le=1000, description="Largest distance of the first photograph from `near`."
@@ -45,9 +58,21 @@ class SessionDocument(CameraFields):
     rooms: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1, max_length=_ROOMS)] | None = Field(
         None, description="Rooms that the first photograph can be in, by id or name."
     )
+    level: Annotated[float, Finite] | None = Field(
+        None, description="Level of the venue that the first photograph is on. Needs `venue_id`."
+    )
+
+    @field_validator("floorplan_id")
+    @classmethod
+    def _plan_or_venue(cls, value: str | None, given: ValidationInfo) -> str | None:
+        if "venue_id" in given.data:
+            check_plan_or_venue(value, given.data["venue_id"])
+        return value
 
     @model_validator(mode="after")
     def _check_near(self) -> Self:
+        if self.level is not None and self.venue_id is None:
+            raise ValueError("level needs venue_id instead of floorplan_id")
         if (self.near is None) != (self.radius_m is None):
             raise ValueError("near and radius_m are needed together")
         return self
@@ -160,6 +185,8 @@ class RivalAnswer(ResponseModel):
     room: str
     room_id: str
     probability: Share
+    floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)
+    level: float | None = Field(None, description=LEVEL_OF_POSE)
 
 
 class PathPoint(ResponseModel):
@@ -170,6 +197,8 @@ class PathPoint(ResponseModel):
     heading_deg: HeadingDeg = Field(ge=0, lt=360)
     room_id: str
     probability: Share
+    floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)
+    level: float | None = Field(None, description=LEVEL_OF_POSE)
 
 
 TrackingMode = Literal["searching", "tracking", "lost"]
@@ -184,6 +213,8 @@ class TrackedPoseAnswer(ResponseModel):
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
     room_id: str = Field(description="`id` of the room, unique in the plan.")
+    floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)
+    level: float | None = Field(None, description=LEVEL_OF_POSE)
     covariance: Annotated[list[CovarianceRow], Field(min_length=3, max_length=3)] = Field(
         description="Covariance of x_m, y_m and heading_deg in m², m·° and °², given that the position is right within "
         "1 m."
@@ -194,7 +225,9 @@ class TrackedPoseAnswer(ResponseModel):
     motion_contradicted: list[Literal["forward_m", "right_m", "turn_deg"]] = Field(
         description="Components of the stated motion that the photographs contradict by more than 4 deviations."
     )
-    warnings: list[str] = Field(description="Contradicted motions, and odometry that is wrong again and again.")
+    warnings: list[str] = Field(
+        description="Contradicted motions, odometry that is wrong again and again, and plans that were not searched."
+    )
     geopose: GeoPose | None = Field(None, description="Pose on Earth; null for a plan without an anchor.")
     view: ReadView | None = Field(
         None, description="Assumptions about the photograph; null for photographs of earlier versions."
@@ -207,8 +240,14 @@ class SessionAnswer(ResponseModel):
     """Session of a tracked camera."""
 
     id: str
-    floorplan_id: str
-    floorplan_revision: str = Field(description="Revision of the plan; the session ends if the plan is replaced.")
+    floorplan_id: str | None = Field(description="Id of the floor plan; null for a session in a venue.")
+    floorplan_revision: str | None = Field(
+        description="Revision of the plan, with which the session ends; null for a session in a venue."
+    )
+    venue_id: str | None = Field(None, description="Id of the venue; null for a session in one plan.")
+    venue_revision: str | None = Field(
+        None, description="Revision of the venue, with which the session ends; null for a session in one plan."
+    )
     expires_at: datetime = Field(description="End of the session, unless a photograph comes before.")
     photographs: int = Field(description="Photographs so far.")
     mode: TrackingMode = Field(
@@ -216,7 +255,7 @@ class SessionAnswer(ResponseModel):
         "do not fit the plan."
     )
     pose: TrackedPoseAnswer | None = Field(description="Pose of the last photograph; null before the first.")
-    path: list[PathPoint] = Field(description="Poses of the last 200 photographs.")
+    path: list[PathPoint] = Field(description=f"Poses of the last {MAX_PATH} photographs.")
 
 
 class StoredPose(ResponseModel):
@@ -225,3 +264,8 @@ class StoredPose(ResponseModel):
     mode: TrackingMode
     pose: TrackedPoseAnswer
     path: list[PathPoint]
+
+    def after(self, before: StoredPose | None) -> StoredPose:
+        """Return the same with the end of the path before it."""
+        path = [] if before is None else before.path
+        return self.model_copy(update={"path": [*path, *self.path][-MAX_PATH:]})

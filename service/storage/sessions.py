@@ -19,10 +19,12 @@ from service.errors import (
     TooManySessionsError,
     UnknownFloorPlanError,
     UnknownSessionError,
+    UnknownVenueError,
 )
 from service.storage.database import Database
+from service.storage.records import PlanRecord, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, SESSIONS
+from service.storage.tables import FLOORPLANS, SESSIONS, VENUES
 
 _COLUMNS = SESSIONS.c
 
@@ -32,6 +34,8 @@ class SessionRecord:
     """Stored session.
 
     Attributes:
+        plan_id, venue_id: id of its plan, or of its venue; the other one is None.
+        revision_id: revision of the plan or venue when it began.
         options: the request that began it, as JSON.
         photographs: number of photographs so far.
         state: state of the filter; None before the first photograph.
@@ -41,7 +45,8 @@ class SessionRecord:
 
     id: str
     tenant: str
-    plan_id: str
+    plan_id: str | None
+    venue_id: str | None
     revision_id: str
     expires_at: datetime
     options: str
@@ -67,21 +72,26 @@ class Sessions:
         self._claim_s = claim_s
 
     def add(
-        self, tenant: str, session_id: str, plan_id: str, revision_id: str, options: str, *, ttl_s: float, limit: int
+        self,
+        tenant: str,
+        session_id: str,
+        place: PlanRecord | VenueRecord,
+        options: str,
+        *,
+        ttl_s: float,
+        limit: int,
     ) -> SessionRecord:
-        """Store a session; return the one that exists under this id, if the request is repeated.
+        """Store a session in a plan or venue; return the one that exists under this id, if the request is repeated.
 
         Raises:
             TooManySessionsError: the tenant has `limit` sessions.
-            UnknownFloorPlanError: the plan was deleted.
+            UnknownFloorPlanError, UnknownVenueError: the plan or venue was deleted.
             StorageQuotaError: the tenant would store too many bytes.
         """
         now, own = datetime.now(UTC), _COLUMNS.tenant == tenant
         size = ROW_BYTES + len(options.encode())
         with self._database.writing(grows_by=size) as connection:
-            plan = select(FLOORPLANS.c.id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
-            if connection.scalar(plan.with_for_update(read=True)) is None:
-                raise UnknownFloorPlanError(plan_id)
+            _lock(connection, tenant, place)
             row = connection.execute(select(SESSIONS).where(own, _COLUMNS.id == session_id)).one_or_none()
             if row is not None:
                 return _record(row)
@@ -91,8 +101,9 @@ class Sessions:
             values = {
                 "id": session_id,
                 "tenant": tenant,
-                "plan_id": plan_id,
-                "revision_id": revision_id,
+                "plan_id": place.id if isinstance(place, PlanRecord) else None,
+                "venue_id": place.id if isinstance(place, VenueRecord) else None,
+                "revision_id": place.revision_id,
                 "created_at": now,
                 "expires_at": now + timedelta(seconds=ttl_s),
                 "options": options,
@@ -202,6 +213,18 @@ class Sessions:
         if row is None:
             raise UnknownSessionError(session_id)
         return row
+
+
+def _lock(connection: Connection, tenant: str, place: PlanRecord | VenueRecord) -> None:
+    """Lock a plan or venue against deletion until the transaction ends.
+
+    Raises:
+        UnknownFloorPlanError, UnknownVenueError: it was deleted.
+    """
+    table, error = (FLOORPLANS, UnknownFloorPlanError) if isinstance(place, PlanRecord) else (VENUES, UnknownVenueError)
+    query = select(table.c.id).where(table.c.id == place.id, table.c.tenant == tenant)
+    if connection.scalar(query.with_for_update(read=True)) is None:
+        raise error(place.id)
 
 
 def _record(row: Row[tuple[object, ...]]) -> SessionRecord:

@@ -233,7 +233,9 @@ SESSIONS = Table(
     METADATA,
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    # Either a plan or a venue, and the revision at which the session began.
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
+    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
     Column("revision_id", String(32), nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("expires_at", UtcDateTime, nullable=False),
@@ -251,6 +253,7 @@ SESSIONS = Table(
     Index("sessions_by_tenant_and_age", "tenant", "expires_at"),
     Index("sessions_by_age", "expires_at"),
     Index("sessions_by_plan", "plan_id"),
+    Index("sessions_by_venue", "venue_id"),
 )
 
 IDEMPOTENCY = Table(

@@ -38,8 +38,8 @@ from service.storage.records import (
     VenueState,
 )
 from service.storage.statements import is_own_grid, newest_first
-from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
-from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
+from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
+from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, VENUE_PLANS, VENUES
 from service.storage.venue_rows import (
     check_count,
     find_venue,
@@ -264,7 +264,7 @@ class Venues:
             return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
 
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
-        """Delete a venue, but none of its plans; False without one.
+        """Delete a venue with its sessions, but none of its plans; False without one.
 
         Raises:
             RevisionMismatchError: the venue has another revision than `expected`.
@@ -276,8 +276,9 @@ class Venues:
             except UnknownVenueError:
                 return False
             rows = 1 + _count(connection, venue_id)
+            sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.venue_id == venue_id))
             connection.execute(delete(VENUES).where(VENUES.c.id == venue_id))
-            self._quota.settle(connection, tenant, StoredBytes(venues=-ROW_BYTES * rows))
+            self._quota.settle(connection, tenant, StoredBytes(venues=-ROW_BYTES * rows, sessions=-sessions))
             return True
 
         return self._database.freeing(work)

@@ -6,10 +6,12 @@ import itertools
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from lalaloc_core.conventions import wrap_angle
@@ -23,10 +25,13 @@ from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
-from lalaloc_core.localise.tracking.state import MAX_STATES
+from lalaloc_core.localise.tracking.passages import PlanOnLevel
+from lalaloc_core.localise.tracking.state import MAX_STATES, StatePlan
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
-from tests.strategies import l_shape, plan_of, rectangle
+from tests.strategies import l_shape, plan_of, present, rectangle
 
 SECTORS = 16
 EXACT = (0.05, 0.05, math.radians(2.0))
@@ -59,6 +64,11 @@ def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
 @pytest.fixture(scope="module")
 def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
     return WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
+
+
+@pytest.fixture(scope="module")
+def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> Ground:
+    return Ground.of_plan(plan, grid, graph)
 
 
 @pytest.fixture(scope="module")
@@ -139,82 +149,160 @@ class TestMotion:
             Odometry.of_stds(1.0, 0.0, 0.0, (0.1, -1.0, 0.1))
 
 
-def follow(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    graph: WalkGraph,
-    encoders: Encoders,
-    queries: list[Query],
-    moves: list[Odometry | None],
-) -> list[Tracked]:
+def follow(ground: Ground, encoders: Encoders, queries: list[Query], moves: list[Odometry | None]) -> list[Tracked]:
     """Follow a walk, with the state in bytes between photographs."""
-    state, found = TrackState.first(len(grid.poses), len(queries[0].roll)), []
+    state, found = TrackState.first(len(queries[0].roll)), []
     for query, move in zip(queries, moves, strict=True):
-        found.append(run_steps(track_steps(plan, grid, graph, encoders, state, query, move), lambda _job: None))
+        found.append(run_steps(track_steps(ground, encoders, state, query, move), lambda _job: None))
         state = TrackState.from_bytes(found[-1].state.to_bytes())
     return found
 
 
 class TestFilter:
-    def test_walk_is_followed_through_a_door(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        found = follow(plan, grid, graph, encoders, queries, odometry_along(WALK))
+    def test_walk_is_followed_through_a_door(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        found = follow(ground, encoders, queries, odometry_along(WALK))
         for (place, room, heading), answer in list(zip(WALK, found, strict=True))[1:]:
             assert answer.pose.room_index == room
             assert np.linalg.norm(answer.pose.position_m - place) < STEP_M
             assert abs(wrap_angle(answer.pose.heading - heading)) < math.radians(15.0)
         last = found[-1]
         assert last.state.suspected == ()
-        assert [int(number) for number in last.state.path[:, 0]] == [1, 2, 3, 4, 5, 6]
         assert np.linalg.eigvalsh(last.pose.covariance).min() > 0.0
 
     def test_camera_carried_elsewhere_is_found_again(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
+        self, ground: Ground, encoders: Encoders, queries: list[Query]
     ) -> None:
         still = Odometry.of_stds(0.0, 0.0, 0.0, EXACT)
         carried = [*queries[:3], *queries[5:], *queries[5:], *queries[5:]]
-        found = follow(plan, grid, graph, encoders, carried, [*odometry_along(WALK)[:3], still, still, still])
+        found = follow(ground, encoders, carried, [*odometry_along(WALK)[:3], still, still, still])
         assert np.linalg.norm(found[-1].pose.position_m - WALK[-1][0]) < STEP_M
 
     @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
     def test_known_heading_is_right_within_its_tolerance(
         self,
-        plan: FloorPlan,
-        grid: PoseGrid,
-        graph: WalkGraph,
+        ground: Ground,
         encoders: Encoders,
         queries: list[Query],
         off_deg: float,
         right: bool,
     ) -> None:
-        state, heading = TrackState.first(len(grid.poses), len(queries[0].roll)), WALK[0][2]
+        state, heading = TrackState.first(len(queries[0].roll)), WALK[0][2]
         beliefs = []
         for error in (0.0, math.radians(off_deg)):
             known = KnownHeading(heading + error, math.radians(30.0), "given")
-            steps = track_steps(plan, grid, graph, encoders, state, queries[0], None, known_heading=known)
+            steps = track_steps(ground, encoders, state, queries[0], None, known_heading=known)
             belief = run_steps(steps, lambda _job: None).state.belief
             beliefs.append(belief.weight[belief.sector == round(heading / (math.tau / state.sectors))].sum())
         # As probable as with the exact heading; far less probable beyond the tolerance.
         assert (beliefs[1] > 0.5 * beliefs[0]) == right
 
-    def test_other_grid_is_refused(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        state = TrackState.first(len(grid.poses) + 1, len(queries[0].roll))
+    def test_other_grid_is_refused(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        other = (StatePlan("", len(ground.grid.poses) + 1),)
+        state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
-            run_steps(track_steps(plan, grid, graph, encoders, state, queries[0], None), lambda _job: None)
+            run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
+
+
+def building(encoders: Encoders, plans: Sequence[FloorPlan]) -> Ground:
+    """Return the ground of a building with one plan per level."""
+    grids = [build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
+    graphs = [WalkGraph.of(grid.poses, grid.layouts(plan), STEP_M) for plan, grid in zip(plans, grids, strict=True)]
+    entries = [PlanOnLevel(plan, float(level)) for level, plan in enumerate(plans)]
+    levels, keys = [entry.level for entry in entries], [f"plan {level}" for level in range(len(plans))]
+    return Ground.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
+
+
+def level_of(*polygons: list[list[float]], stairs: str | None) -> FloorPlan:
+    """Return a level whose last room is called and typed by `stairs`, with doors from there to the first room."""
+    document = plan_of(*polygons).to_dict()
+    if stairs is not None:
+        document["rooms"][-1] |= {"name": stairs, "type": "stairs" if stairs == "stairs" else "unknown"}
+    door = {"kind": "door", "line": [[4.1, 0.5], [4.1, 1.5]]}
+    return FloorPlan.from_dict(document | {"openings": [door], "opening_kinds": ["door", "window", "passage"]})
+
+
+STAIRS = rectangle(2.0, 3.6, corner=(4.2, 0.0))
+LOWER, UPPER = l_shape(4.0, 3.0, 1.2, 0.8), l_shape(4.0, 8.0, 1.5, 3.0)
+# In the room and on the stairs of the lower level, on the stairs and in the room of the upper one.
+CLIMB: list[tuple[int, Walk]] = [
+    (0, [((1.0, 1.0), 0, 1.6), ((3.0, 1.2), 0, 1.5), ((5.0, 1.2), 1, 0.2)]),
+    (1, [((5.2, 2.6), 1, 3.0), ((3.2, 1.0), 0, 4.7), ((1.6, 2.0), 0, 5.5), ((1.5, 3.5), 0, 0.1)]),
+]
+
+
+class TestLevels:
+    @pytest.mark.parametrize("stairs", ["stairs", "Lift 2", None])
+    def test_camera_is_followed_to_another_level(self, encoders: Encoders, stairs: str | None) -> None:
+        plans = [level_of(LOWER, STAIRS, stairs=stairs), level_of(UPPER, STAIRS, stairs=stairs)]
+        height = CameraHeight(CAMERA_M, 0.0)
+        queries = [query for level, walk in CLIMB for query in queries_along(encoders, plans[level], walk, height)]
+        walk = [pose for _, part in CLIMB for pose in part]
+        ground = building(encoders, plans)
+        found = follow(ground, encoders, queries, odometry_along(walk))
+        levels = [level for level, part in CLIMB for _ in part]
+        # The photographs on the stairs of both levels are alike.
+        for index in (1, 2, 5, 6):
+            (place, room, _), answer = walk[index], found[index]
+            assert (answer.pose.plan, answer.pose.room_index) == (levels[index], room)
+            assert np.linalg.norm(answer.pose.position_m - place) < STEP_M
+            assert answer.contradicted == ()
+        assert found[-1].pose.mode == "tracking"
+        kept = found[-1].state
+        assert max(kept.by_plan, key=kept.by_plan.__getitem__) == "plan 1"
+
+    def test_stairs_are_taken_rather_than_walls(self, encoders: Encoders) -> None:
+        ground = building(
+            encoders, [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
+        )
+        moves = Odometry.of_stds(0.5, 0.0, 0.0, EXACT)
+        arrived = []
+        for place in ((1.0, 1.0), (5.0, 1.2)):
+            start = at(ground.grid, tuple(np.add(place, ground.shift_m[0])), 0.0)
+            belief = ground.moved(start, SECTORS, moves)
+            arrived.append(belief[ground.graph.first[1] :].sum())
+        assert arrived[0] == 0.0
+        assert arrived[1] == pytest.approx(0.1, abs=0.02)
+
+    def test_levels_without_stairs_are_joined_everywhere(self, encoders: Encoders) -> None:
+        ground = building(encoders, [level_of(LOWER, STAIRS, stairs=name) for name in (None, None, "stairs")])
+        start = at(ground.grid, tuple(np.add((1.0, 1.0), ground.shift_m[0])), 0.0)
+        belief = ground.moved(start, SECTORS, None)
+        arrived = np.add.reduceat(belief.sum(axis=1), ground.graph.first[:-1])
+        assert arrived[1] == pytest.approx(0.01)
+        assert arrived[2] == 0.0
+
+    def test_right_plan_of_similar_ones_is_found(self, encoders: Encoders) -> None:
+        # The plans differ in their second rooms alone.
+        others = [rectangle(2.0, depth, corner=(4.2, 0.0)) for depth in (2.4, 3.6, 4.8)]
+        plans = [level_of(LOWER, other, stairs=None) for other in others]
+        ground = building(encoders, plans)
+        walk: Walk = [((1.0, 1.0), 0, 1.6), ((3.0, 1.2), 0, 1.5), ((5.0, 1.2), 1, 0.2), ((5.0, 1.7), 1, 0.1)]
+        queries = queries_along(encoders, plans[1], walk, CameraHeight(CAMERA_M, 0.0))
+        found = follow(ground, encoders, queries, odometry_along(walk))
+        assert found[0].pose.probability < 0.6
+        assert [answer.pose.plan for answer in found[2:]] == [1, 1]
+        assert found[-1].pose.probability > 0.6
+
+    def test_belief_keeps_its_plans_when_the_ground_changes(self, encoders: Encoders) -> None:
+        plans = [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
+        query = queries_along(encoders, plans[1], CLIMB[1][1][2:3], CameraHeight(CAMERA_M, 0.0))
+        ground = building(encoders, plans)
+        state = follow(ground, encoders, query, [None])[0].state
+        turned = building(encoders, plans[::-1])
+        turned = replace(turned, keys=ground.keys[::-1])
+        again = turned.left(turned.entered(state))
+        assert again.by_plan == pytest.approx(state.by_plan)
+        assert present(again.pose).position_m == pytest.approx(present(state.pose).position_m)
+        alone = replace(Ground.of_plan(plans[0], ground.grid), keys=("another",))
+        assert alone.entered(state).pose is None
+        assert not len(alone.entered(state).belief.pose)
 
 
 class TestState:
-    def test_size_does_not_grow(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
-        state = follow(plan, grid, graph, encoders, queries[:1], [None])[0].state
+    def test_size_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+        state = follow(ground, encoders, queries[:1], [None])[0].state
         many = np.random.default_rng(0).integers(0, 100, 4096)
-        full = replace(
-            state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)), path=np.ones((200, 6))
-        )
+        full = replace(state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)))
         assert len(full.to_bytes()) < 100_000
         again = TrackState.from_bytes(full.to_bytes())
         np.testing.assert_array_equal(again.belief.pose, full.belief.pose)
@@ -225,7 +313,7 @@ class TestState:
 
     def test_other_number_of_sectors_keeps_the_belief(self) -> None:
         belief = States(np.array([3, 3, 7]), np.array([0, 15, 4]), np.array([0.2, 0.3, 0.5]))
-        state = replace(TrackState.first(10, 16), belief=belief)
+        state = replace(replace(TrackState.first(16), plans=(StatePlan("", 10),)), belief=belief)
         assert state.with_sectors(16) is state
         for sectors in (8, 32, 48):
             other = state.with_sectors(sectors)
@@ -236,29 +324,48 @@ class TestState:
             heading = np.exp(1j * math.tau / sectors * other.belief.sector[of_seven]) @ other.belief.weight[of_seven]
             assert np.angle(heading) == pytest.approx(math.pi / 2)
 
-    def test_long_session_does_not_grow(
-        self, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph, encoders: Encoders, queries: list[Query]
-    ) -> None:
+    def test_long_session_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(260)]
         walk = [WALK[index] for index in order]
-        found = follow(plan, grid, graph, encoders, [queries[index] for index in order], odometry_along(walk))
+        found = follow(ground, encoders, [queries[index] for index in order], odometry_along(walk))
         sizes = [len(answer.state.to_bytes()) for answer in found]
-        # The path of the first photographs grows; bytes of digits and of compressed weights differ.
+        # Bytes of digits and of compressed weights differ.
         assert max(sizes[200:]) < max(sizes[:200]) + 2000
         assert max(sizes) < 100_000
         last = found[-1].state
         assert len(last.belief.pose) <= MAX_STATES
-        assert [int(number) for number in last.path[:, 0]] == list(range(61, 261))
         # Still right.
         assert np.linalg.norm(found[-1].pose.position_m - walk[-1][0]) < STEP_M
 
+    @pytest.mark.slow
+    def test_session_of_10_000_photographs_does_not_grow(
+        self, ground: Ground, encoders: Encoders, queries: list[Query]
+    ) -> None:
+        there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
+        order = [there[index % len(there)] for index in range(10_000)]
+        moves = odometry_along([WALK[index] for index in order])
+        content, sizes, before = TrackState.first(len(queries[0].roll)).to_bytes(), list[int](), 0
+        for number, (index, move) in enumerate(zip(order, moves, strict=True)):
+            state = TrackState.from_bytes(content)
+            content = run_steps(
+                track_steps(ground, encoders, state, queries[index], move), lambda _job: None
+            ).state.to_bytes()
+            sizes.append(len(content))
+            if number == 500:
+                before = psutil.Process().memory_info().rss
+        assert psutil.Process().memory_info().rss - before < 32 * 2**20
+        assert max(sizes[500:]) < max(sizes[:500]) + 2000
+        assert np.linalg.norm(present(TrackState.from_bytes(content).pose).position_m - WALK[order[-1]][0]) < STEP_M
+
     @pytest.mark.parametrize("damage", ["cut", "flipped", "version", "number"])
     def test_damaged_state_is_refused(self, damage: str) -> None:
-        state = replace(TrackState.first(10, 4), belief=States(np.array([9]), np.array([3]), np.ones(1)))
+        state = replace(
+            TrackState.first(4), plans=(StatePlan("", 10),), belief=States(np.array([9]), np.array([3]), np.ones(1))
+        )
         content = state.to_bytes()
         if damage == "number":
-            content = replace(state, poses=9).to_bytes()
+            content = replace(state, plans=(StatePlan("", 9),)).to_bytes()
         elif damage == "cut":
             content = content[:12]
         elif damage == "version":

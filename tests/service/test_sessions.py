@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
 import threading
+import zlib
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -11,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.query import venue_plans
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
 
@@ -200,11 +203,123 @@ def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: Datab
         store = Store(database_of(tmp_path), claim_s=0.5)
         store.sessions.claim("default", session_id, None)
         picture = encode_picture(512, 256, "JPEG")
-        assert_problem(send(client, session_id, picture), 409, "session-busy")
+        busy = send(client, session_id, picture)
+        assert_problem(busy, 409, "session-busy")
+        assert busy.headers["retry-after"] == "1"
         sleep(0.6)
         assert send(client, session_id, picture, number=1).status_code == 200
         assert_problem(client.get(f"/sessions/{'0' * 32}"), 404, "unknown-session")
         store.close()
+
+
+def venue_of(client: httpx.Client, *plan_ids: str) -> str:
+    """Create a venue with a plan on each level; return its id."""
+    plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
+    answer = client.post("/venues", json={"name": "house", "plans": plans})
+    assert answer.status_code == 201, answer.text
+    return answer.json()["id"]
+
+
+def begin_in(client: httpx.Client, venue_id: str, **fields: Any) -> str:
+    answer = client.post("/sessions", json={"venue_id": venue_id} | fields)
+    assert answer.status_code == 201, answer.text
+    return answer.json()["id"]
+
+
+STAIRS = {"name": "stairs", "type": "stairs", "polygon": [[20, 0], [22, 0], [22, 4], [20, 4]]}
+UPPER = FLAT | {"name": "upper", "rooms": [STAIRS, {"name": "attic", "polygon": [[0, 0], [9, 0], [9, 7], [0, 3]]}]}
+
+
+@pytest.mark.parametrize("chosen", [False, True], ids=["all plans", "chosen plans"])
+@pytest.mark.one_replica
+def test_session_in_a_venue_names_the_plan(
+    client: httpx.Client, panorama: bytes, monkeypatch: pytest.MonkeyPatch, chosen: bool
+) -> None:
+    lower, upper = upload(client, FLAT | {"rooms": [*FLAT["rooms"], STAIRS]}), upload(client, UPPER)
+    venue_id = venue_of(client, lower, upper)
+    if chosen:
+        monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
+    session_id = begin_in(client, venue_id, rooms=["attic"], level=1, camera_height_m=1.5)
+    empty = client.get(f"/sessions/{session_id}").json()
+    assert (empty["venue_id"], empty["floorplan_id"], empty["floorplan_revision"]) == (venue_id, None, None)
+    for number in (1, 2, 3):
+        motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
+        sent = send(client, session_id, panorama, number=number, **motion)
+        assert sent.status_code == 200, sent.text
+    answer = sent.json()
+    levels = {lower: 0.0, upper: 1.0}
+    assert [point["number"] for point in answer["path"]] == [1, 2, 3]
+    for place in (answer["pose"], *answer["pose"]["candidates"], *answer["path"]):
+        assert place["level"] == levels[place["floorplan_id"]]
+    assert sum(rival["probability"] for rival in answer["pose"]["candidates"]) <= 1.001
+    assert client.get(f"/sessions/{session_id}").json() == answer
+
+
+@pytest.mark.parametrize("change", ["plan replaced", "plan deleted", "venue changed", "venue deleted"])
+def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, panorama: bytes, change: str) -> None:
+    plan_ids = [upload(client), upload(client, UPPER)]
+    venue_id = venue_of(client, *plan_ids)
+    session_id = begin_in(client, venue_id)
+    send(client, session_id, panorama).raise_for_status()
+    stored = client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"]
+    if change == "plan replaced":
+        for plan_id in plan_ids:
+            client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "changed"}).raise_for_status()
+    elif change == "plan deleted":
+        client.delete(f"/floorplans/{plan_ids[0]}").raise_for_status()
+    elif change == "venue changed":
+        client.patch(f"/venues/{venue_id}", json={"remove": [plan_ids[1]]}).raise_for_status()
+    else:
+        client.delete(f"/venues/{venue_id}").raise_for_status()
+        assert_problem(send(client, session_id, panorama), 404, "unknown-session")
+        assert client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"] < stored
+        return
+    problem = assert_problem(send(client, session_id, panorama), 409, "session-outdated")
+    assert venue_id in problem["detail"]
+
+
+def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id: str) -> None:
+    venue_id = venue_of(client, plan_id)
+    for document in ({}, {"floorplan_id": plan_id, "venue_id": venue_id}, {"floorplan_id": plan_id, "level": 0}):
+        assert_problem(client.post("/sessions", json=document), 422, "invalid-request")
+    assert_problem(client.post("/sessions", json={"venue_id": venue_id, "level": 7}), 422, "invalid-hint")
+    assert_problem(client.post("/sessions", json={"venue_id": "0" * 32}), 404, "unknown-venue")
+    empty = client.post("/venues", json={"name": "empty"}).json()["id"]
+    assert_problem(client.post("/sessions", json={"venue_id": empty}), 409, "venue-unsearchable")
+
+
+def test_session_of_an_earlier_version_goes_on(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path) as client:
+        session_id = begin(client, upload(client))
+        before = send(client, session_id, panorama).json()
+        store = Store(database_of(tmp_path))
+        record = store.sessions.claim("default", session_id, None)
+        assert record.state is not None
+        assert record.pose is not None
+        pose = json.loads(record.pose)
+        for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
+            del place["floorplan_id"], place["level"]
+        store.sessions.finish(record, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
+        store.close()
+        after = send(client, session_id, panorama, forward_m=0, turn_deg=0)
+        assert after.status_code == 200, after.text
+        # `finish` counted a photograph.
+        assert after.json()["photographs"] == 3
+        assert after.json()["path"][0] == before["path"][0] | {"floorplan_id": None, "level": None}
+
+
+def _first_version(state: bytes) -> bytes:
+    """Return a state in the format of version 1, with a path of one pose."""
+    body = zlib.decompress(state[10:])
+    (length,) = struct.unpack_from("<I", body)
+    header = json.loads(body[4 : 4 + length])
+    header |= {"poses": header.pop("plans")[0][1], "path": 1}
+    del header["pose"]["plan"]
+    text = json.dumps(header).encode()
+    content = struct.pack("<I", len(text)) + text + body[4 + length :] + bytes(24)
+    return struct.pack("<4sHI", b"LTRK", 1, zlib.crc32(content)) + zlib.compress(content)
 
 
 @pytest.mark.slow

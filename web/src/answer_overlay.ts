@@ -20,7 +20,7 @@ export function within95([[xx, xy], [, yy]]: NonNullable<Answer["covariance_m2"]
 }
 
 /** Draw the ellipse that contains the camera with a probability of 95 %. */
-export function ellipse(answer: Answer): SVGElement | null {
+export function ellipse(answer: Pick<Answer, "covariance_m2" | "position">): SVGElement | null {
   if (answer.covariance_m2 === null) return null;
   const [[xx, xy], [, yy]] = answer.covariance_m2, [major, minor] = within95(answer.covariance_m2);
   // Direction of the longer axis, counterclockwise from +x; negative because y points down in SVG.

@@ -4,7 +4,7 @@ import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
 import { companions, ellipse, otherPlaces } from "./answer_overlay";
 import { api } from "./api";
-import { byId, s, show } from "./dom";
+import { byId, named, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { heatMap } from "./heat";
@@ -22,6 +22,7 @@ import { showWarnings } from "./plan_warnings";
 import { Plans } from "./plans";
 import { PoseMarker, showCursor } from "./pose_marker";
 import { askSingle, askTogether } from "./query";
+import { LiveSession } from "./session";
 import type { Answer, Layout, Plan, PlanDocument, Pose, Venue } from "./types";
 import { Venues } from "./venues";
 import { Viewport } from "./viewport";
@@ -55,6 +56,10 @@ class Page {
     fit: (box) => this.viewport.fit(box),
     ended: (stored) => this.onEdited(stored),
   });
+  private readonly session = new LiveSession({
+    place: async () => this.venues.current ?? this.plan ?? this.storeExample(), showPlan: (planId) => void this.plans.choose(planId),
+    opened: () => { this.onStarted(); this.photos.choose(null); },
+  });
   private readonly viewport = new Viewport(this.svg, this.svg.parentElement!, () => this.onViewChanged());
   private readonly find = byId<HTMLButtonElement>("find");
   private plan: Plan | null = null;
@@ -63,6 +68,7 @@ class Page {
   private layout: Layout | null = null;
   private box: Box = boxOf({ rooms: [] });
   private answer: Answer | null = null;
+  private answeredPhoto: Photo | null = null;
   /** Index of the selected candidate. */
   private selected = 0;
   /** The marker's pose after the user moved it away from the candidate. */
@@ -73,7 +79,7 @@ class Page {
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.localisability.element, this.names, this.hints.element, this.overlay, ...this.editor.layers);
+    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.localisability.element, this.names, this.hints.element, this.overlay, this.session.layer, ...this.editor.layers);
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.localise());
@@ -110,10 +116,10 @@ class Page {
     this.find.removeAttribute("aria-busy");
   }
 
-  /** Show the answer that the address names, if any. */
+  /** Show the answer or the session that the address names, if any. */
   private async open(): Promise<boolean> {
-    const id = new URLSearchParams(location.hash.slice(1)).get("answer");
-    if (id === null) return false;
+    const id = named("answer");
+    if (id === null) return this.session.follow(named("session"));
     this.cancelQuery();
     clearError(byId("plan-error"));
     try {
@@ -202,6 +208,7 @@ class Page {
     this.box = boxOf(this.document ?? empty);
     this.viewport.fit(this.box);
     this.drawRooms(this.document ?? empty);
+    this.session.drawOn(this.plan?.id, this.box);
     byId<HTMLButtonElement>("edit-plan").disabled = this.plan === null;
   }
 
@@ -259,8 +266,6 @@ class Page {
   private offerHints(): void {
     byId("hints").hidden = this.venues.current !== null || this.photos.group !== null;
   }
-
-  private answeredPhoto: Photo | null = null;
 
   private get fields(): Record<string, HTMLElement> {
     return { ...this.photos.fields, ...this.hints.fields };
@@ -381,10 +386,10 @@ class Page {
     }
   }
 
-  private async storeExample(signal: AbortSignal): Promise<Plan> {
+  private async storeExample(signal?: AbortSignal): Promise<Plan> {
     if (this.document === null) throw new InputError("Choose or upload a floor plan first.");
     const plan = await api.createPlan(this.document);
-    if (!signal.aborted) this.plans.take(plan);
+    if (signal?.aborted !== true) this.plans.take(plan);
     await this.plans.load();
     return plan;
   }

@@ -45,6 +45,9 @@ export function byId<T extends HTMLElement = HTMLElement>(id: string): T {
   return element as T;
 }
 
+/** Return the id of some kind that the page's address names, as in `#answer=…`. */
+export const named = (kind: string): string | null => new URLSearchParams(location.hash.slice(1)).get(kind);
+
 /** Replace the children of an element. */
 export function show(element: Element, ...children: Child[]): void {
   element.replaceChildren(...present(children));

@@ -22,6 +22,8 @@ export type Posterior = Schemas["PosteriorAnswer"];
 export type SequenceAnswer = Schemas["SequenceAnswer"];
 /** Answer to a photograph; `together` states that it was asked for with others. */
 export type Answer = Schemas["LocaliseAnswer"] & { together?: Together };
+export type Session = Schemas["SessionAnswer"];
+export type SessionDocument = Schemas["SessionDocument"];
 export type ViewAnswer = Schemas["ViewAnswer"];
 export type Problem = Schemas["Problem"];
 export type Fault = Schemas["Fault"];

@@ -2,12 +2,13 @@
 
 The belief after a photograph is
 
-    b'(s) ∝ (prediction(s) + ε prior(s)) · (exp(-T (cost(s) - best)) + exp(-F)),
+    b'(s) ∝ ((1 - c) prediction(s) + c prior(s)) · (L(s) + f),    L(s) = exp(-T (cost(s) - best)),
 
-with the prediction of `motion.moved`, the share ε of being carried anywhere, and the likelihood of the posterior of a
-single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere better;
-exp(-F), the likelihood of an outlier, limits their effect. LPO refines the modes of the belief; its gain is evidence
-for a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
+with the prediction of `Ground.moved`, the probability c of being carried anywhere, and the likelihood L of the
+posterior of a single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere
+better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds of an
+outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief; its
+gain is evidence for a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
 """
 
 from __future__ import annotations
@@ -17,27 +18,24 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import confidence_of, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.matching_cost import MatchingCost
 from lalaloc_core.localise.pipeline import LocaliseConfig, SearchStage, StageClock
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import area_shares
 from lalaloc_core.localise.refinement import refined_candidates, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import grid_costs
 from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.localise.tracking.modes import (
-    OUTLIER,
     Compared,
     hypothesis_of,
-    likelihood,
     modes_of,
     ranked_modes,
     regained,
@@ -45,11 +43,10 @@ from lalaloc_core.localise.tracking.modes import (
     sector_of,
     share_alone,
 )
-from lalaloc_core.localise.tracking.motion import Odometry, States, WalkGraph, moved
+from lalaloc_core.localise.tracking.motion import Odometry, States
 from lalaloc_core.localise.tracking.pose_fusion import carried_on, contradicted, fused, measured_pose
 from lalaloc_core.localise.tracking.state import (
     COMPONENTS,
-    MAX_PATH,
     MAX_STATES,
     RECENT,
     Component,
@@ -58,8 +55,8 @@ from lalaloc_core.localise.tracking.state import (
     TrackState,
 )
 
-# Probability of being carried elsewhere between two photographs.
-_CARRIED = 0.003
+# Probability of being carried elsewhere between two photographs, and odds of a photograph that fits its place badly.
+_CARRIED, _OUTLIER = 0.003, 0.05
 # Predicted states that are compared in full, besides those that the grid offers.
 _PREDICTED = 1024
 # States below this share of the total are dropped.
@@ -81,8 +78,8 @@ class Tracked:
 
     Attributes:
         state: state for the next photograph.
-        pose: the answer.
-        query, candidates: the best poses, the answer first as LPO has it; `probability` of each.
+        pose: the answer, in the frame of its plan; `pose.plan` is its number in the ground.
+        query, candidates: the best poses in the ground, the answer first as LPO has it; `probability` of each.
         fit: probability that this photograph, by itself, is of the plan; None without a model.
         contradicted: components of the motion that this photograph contradicts.
         stage: last stage that ran.
@@ -102,9 +99,7 @@ TrackSteps = Generator[RefinementJob, RefinementResult | None, Tracked]
 
 
 def track_steps(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    graph: WalkGraph,
+    ground: Ground,
     encoders: Encoders,
     state: TrackState,
     query: Query,
@@ -119,15 +114,13 @@ def track_steps(
     """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
 
     Args:
-        plan: the plan.
-        grid: its pose grid.
-        graph: the grid's links.
+        ground: the plans that the camera can be in.
         encoders: the networks.
         state: state after the photographs before.
         query: the photograph, encoded with an unknown heading.
         odometry: motion since the photograph before; None if it is unknown.
         known_heading: heading of the photograph with its largest error; None if it is unknown.
-        hints: the prior of the first photograph.
+        hints: the prior of the first photograph, in the frame of the ground.
         top_k: number of candidates.
         config: settings of the search.
         clock: times the stages.
@@ -138,17 +131,12 @@ def track_steps(
     """
     config, clock = config or LocaliseConfig(), clock or StageClock()
     weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
-    sectors = len(query.roll)
-    if state.poses != len(grid.poses):
-        raise InvalidStateError(
-            f"the session has {state.poses} poses, the grid {len(grid.poses)}: the plan or the model has changed; "
-            "begin a new session"
-        )
-    state = state.with_sectors(sectors)
+    plan, grid = ground.plan, ground.grid
+    state = ground.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):
-        prediction = _prediction(plan, grid, graph, state, odometry, sectors, known_heading, hints)
+        prediction = _predict(ground, state, odometry, known_heading, hints)
     with clock.stage("retrieve"):
-        everything, grid_cost = _compare(plan, grid, encoders, query, prediction, config)
+        everything, grid_cost = _compare(ground, encoders, query, prediction, config)
         compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
     starts = modes_of(grid, query, compared, config)
     refined = ends = starts
@@ -159,7 +147,7 @@ def track_steps(
         if result is not None:
             refined = refined_candidates(plan, encoders, query, starts, result, matching)
             # The photograph is rather an outlier at modes that fit worse than this.
-            followed = relative_likelihood(refined, weights.temperature) >= 2.0 * math.exp(-OUTLIER)
+            followed = relative_likelihood(refined, weights.temperature, compared.outlier) >= 2.0 * compared.outlier
             ends = [
                 end if is_followed else start for start, end, is_followed in zip(starts, refined, followed, strict=True)
             ]
@@ -177,13 +165,16 @@ def track_steps(
     probability = in_plan * posterior.position
     mode = _mode(in_plan, probability)
     measured = measured_pose(plan, encoders, query, candidates[0])
-    predicted = None if state.pose is None or odometry is None else carried_on(state.pose, odometry)
-    tracking = state.pose is not None and state.pose.mode == mode == "tracking"
+    own_plan = ground.plan_of_room(candidates[0].room_index)
+    # Plans have frames of their own, which odometry does not join.
+    before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
+    predicted = None if before is None or odometry is None else carried_on(before, odometry)
+    tracking = before is not None and before.mode == mode == "tracking"
     # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
     sure = share_alone(grid, query, everything, candidates[0], weights.temperature, config.separation_m) >= _SURE
-    comparable = tracking or (sure and state.pose is not None and state.pose.sure)
+    comparable = tracking or (sure and before is not None and before.sure)
     judged = comparable and candidates[0].information is not None
-    differing = contradicted(state.pose, odometry, predicted, measured) if comparable else ()
+    differing = contradicted(before, odometry, predicted, measured) if comparable else ()
     missed = differing if judged else ()
     # A camera that was carried elsewhere is where the photograph says.
     if tracking and predicted is not None and not differing:
@@ -199,58 +190,63 @@ def track_steps(
         mode,
         state.number + 1,
         sure,
+        own_plan,
     )
     shares = tuple(in_plan * share for share in posterior.candidate)
     after = _state_after(state, compared, in_plan, pose, missed, judged=judged and odometry is not None)
-    return Tracked(after, pose, query, candidates, shares, fit, missed, stage)
+    after = ground.left(after)
+    assert after.pose is not None
+    return Tracked(after, replace(after.pose, plan=own_plan), query, candidates, shares, fit, missed, stage)
 
 
-def _prediction(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    graph: WalkGraph,
-    state: TrackState,
-    odometry: Odometry | None,
-    sectors: int,
-    known: KnownHeading | None,
-    hints: Hints,
-) -> Float[np.ndarray, "n k"]:
-    """Return the belief before the photograph is compared."""
-    share = area_shares(grid.poses, plan.areas_m2)
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """Belief before the photograph is compared.
+
+    Attributes:
+        belief: (n, k) probability of each pose and sector.
+        prior: (n, k) the same for a camera that can be anywhere in the ground; the sum is about one.
+        anywhere: probability of a camera that was carried, or of which nothing is known.
+    """
+
+    belief: Float[np.ndarray, "n k"]
+    prior: Float[np.ndarray, "n k"]
+    anywhere: float
+
+
+def _predict(
+    ground: Ground, state: TrackState, odometry: Odometry | None, known: KnownHeading | None, hints: Hints
+) -> _Prediction:
+    sectors, share = state.sectors, area_shares(ground.grid.poses, ground.plan.areas_m2)
     if state.number == 0:
-        hints.check(plan)
-        share = share - hints.penalty(plan, grid.poses.position_m, grid.poses.room_index)
+        hints.check(ground.plan)
+        share = share - hints.penalty(ground.plan, ground.grid.poses.position_m, ground.grid.poses.room_index)
     prior = np.exp(share - share.max())
     prior = np.broadcast_to((prior / (prior.sum() * sectors))[:, None], (len(prior), sectors))
+    anywhere = max(1.0 - float(state.belief.weight.sum()), _CARRIED)
+    covered = 1.0 if ground.left_out is None else ground.left_out.area_share
+    belief = anywhere * covered * prior
     if len(state.belief.pose):
-        walked = moved(graph, state.belief, sectors, odometry)
-        rest = max(1.0 - float(state.belief.weight.sum()), _CARRIED)
-        prediction = (1.0 - rest) * walked + rest * prior
-    else:
-        prediction = prior
+        belief = belief + (1.0 - anywhere) * ground.moved(state.belief, sectors, odometry)
     if known is None or known.heading is None:
-        return prediction
+        return _Prediction(belief, prior, anywhere)
     off = np.abs(wrap_angle(np.arange(sectors) * (TWO_PI / sectors) - known.heading))
     beyond = np.maximum(off - known.tolerance, 0.0) / math.hypot(_HEADING_STD, TWO_PI / sectors / 3.0)
     factor = np.exp(-0.5 * np.square(beyond))
-    return prediction * ((1.0 - _HEADING_DOUBT) * factor / factor.mean() + _HEADING_DOUBT)
+    factor = (1.0 - _HEADING_DOUBT) * factor / factor.mean() + _HEADING_DOUBT
+    return _Prediction(belief * factor, prior * factor, anywhere)
 
 
 def _compare(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    encoders: Encoders,
-    query: Query,
-    prediction: Float[np.ndarray, "n k"],
-    config: LocaliseConfig,
+    ground: Ground, encoders: Encoders, query: Query, prediction: _Prediction, config: LocaliseConfig
 ) -> tuple[Compared, float]:
     """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
     weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
-    sectors = prediction.shape[1]
+    plan, grid, sectors = ground.plan, ground.grid, len(query.roll)
     costs = grid_costs(plan, grid, query, weights, matching)
     number = costs.pose * sectors + sector_of(query, costs.hypothesis)
     cost, offset = costs.cost.astype(np.float64), costs.offset
-    flat = prediction.ravel()
+    flat = prediction.belief.ravel()
     likely = np.argpartition(-flat, min(_PREDICTED, len(flat) - 1))[:_PREDICTED]
     missing = np.setdiff1d(likely, number[: costs.compared])
     if len(missing) and matching.compares_profiles(query):
@@ -260,12 +256,27 @@ def _compare(
         left = ~np.isin(number, missing)
         number = np.append(number[left], missing)
         cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
-    weight = flat[number] * likelihood(cost, float(cost.min()), weights.temperature)
-    rest = max(float(flat.sum() - flat[number].sum()), 0.0) * math.exp(-OUTLIER)
-    total = float(weight.sum()) + rest
     pose, sector = np.divmod(number, sectors)
-    compared = Compared(pose, sector, cost, offset, weight / total, rest / total)
-    return compared, float(costs.cost.min())
+    value = np.exp(-weights.temperature * (cost - cost.min()))
+    outlier, elsewhere = _elsewhere(ground, prediction, pose, prediction.prior.ravel()[number] * value)
+    weight = flat[number] * (value + outlier)
+    rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
+    total = float(weight.sum()) + rest
+    return Compared(pose, sector, cost, offset, weight / total, rest / total, outlier), float(costs.cost.min())
+
+
+def _elsewhere(
+    ground: Ground, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
+) -> tuple[float, float]:
+    """Return the likelihood of an outlier, and the weight of the plans that the ground leaves out.
+
+    `evidence` is prior times likelihood of some states.
+    """
+    by_pose = np.bincount(pose, evidence, minlength=len(ground.grid.poses))
+    share, covered = ground.share(by_pose), 1.0 if ground.left_out is None else ground.left_out.area_share
+    mean = covered * float(by_pose.sum()) / share
+    outlier = _OUTLIER * mean
+    return outlier, prediction.anywhere * ((1.0 - share) * mean + (1.0 - covered) * outlier)
 
 
 def _in_plan(before: float, fit: float | None) -> float:
@@ -301,7 +312,6 @@ def _state_after(
             ((old << 1) | (name in missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
         )
         bits = first, second, third
-    point = [pose.number, pose.x_m, pose.y_m, pose.heading, pose.room_index, pose.probability]
     return replace(
         state,
         belief=States(compared.pose[most], compared.sector[most], compared.weight[most]),
@@ -309,5 +319,4 @@ def _state_after(
         number=pose.number,
         pose=pose,
         contradicted=bits,
-        path=np.concatenate([state.path, [point]])[-MAX_PATH:],
     )

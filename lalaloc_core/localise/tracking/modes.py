@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +13,15 @@ from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candida
 from lalaloc_core.localise.posterior import Posterior, posterior_from_weights
 from lalaloc_core.localise.ranking import HEADING_SEPARATION, panorama_heading, suppress
 
-# F: negative log likelihood of an outlier, relative to the best pose.
-OUTLIER = 8.0
 # Modes that are refined while the belief is spread, and while one mode holds nearly all of it.
 _MODES, _FEW_MODES, _SETTLED = 12, 3, 0.98
 
 
 class Compared(NamedTuple):
-    """States that a photograph was compared with: their costs, height offsets, and weights."""
+    """States that a photograph was compared with: their costs, height offsets, and weights.
+
+    `rest` is the weight of all other states, and `outlier` the likelihood of an outlier, relative to the best pose.
+    """
 
     pose: Int[np.ndarray, "m"]
     sector: Int[np.ndarray, "m"]
@@ -29,12 +29,13 @@ class Compared(NamedTuple):
     offset: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
     rest: float
+    outlier: float
 
     def only(self, kept: np.ndarray) -> Compared:
         """Return some of the states; the others join the rest."""
         rest = self.rest + float(self.weight[~kept].sum())
         pose, sector, cost, offset, weight = (part[kept] for part in self[:5])
-        return Compared(pose, sector, cost, offset, weight, rest)
+        return Compared(pose, sector, cost, offset, weight, rest, self.outlier)
 
 
 def sector_of(query: Query, hypothesis: Int[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
@@ -50,15 +51,10 @@ def hypothesis_of(query: Query) -> Int[np.ndarray, "k"]:
     return found
 
 
-def likelihood(cost: Float[np.ndarray, "m"], best: float, temperature: float) -> Float[np.ndarray, "m"]:
-    """Return the likelihood of a photograph at poses with some costs."""
-    return np.exp(-temperature * np.maximum(cost - best, 0.0)) + math.exp(-OUTLIER)
-
-
-def relative_likelihood(modes: list[Candidate], temperature: float) -> Float[np.ndarray, "r"]:
+def relative_likelihood(modes: list[Candidate], temperature: float, outlier: float) -> Float[np.ndarray, "r"]:
     """Return the likelihood of the photograph at some modes, relative to the best of them."""
     cost = np.array([mode.cost for mode in modes])
-    return likelihood(cost, float(cost.min()), temperature)
+    return np.exp(-temperature * (cost - cost.min())) + outlier
 
 
 def modes_of(grid: PoseGrid, query: Query, compared: Compared, config: LocaliseConfig) -> list[Candidate]:
@@ -119,7 +115,8 @@ def regained(
     radius_m: float,
 ) -> Compared:
     """Return the states with the modes weighed by the gains of their refinement."""
-    gains = relative_likelihood(ends, temperature) / relative_likelihood(starts, temperature)
+    before, after = (relative_likelihood(modes, temperature, compared.outlier) for modes in (starts, ends))
+    gains = after / before
     gains = gains / np.median(gains)
     position = grid.poses.position_m[compared.pose]
     heading = query.roll[hypothesis_of(query)[compared.sector]] + query.frame_heading

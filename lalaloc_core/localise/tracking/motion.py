@@ -2,7 +2,7 @@
 
 Nobody walks through walls, so a pose of the grid can move to those that are reachable by short links alone. Two poses
 are linked if they are neighbours and see each other: the wall profile of the first, or its view through a door or a
-passage, reaches as far as the second. Stairs of neighbouring levels are linked as well (`WalkGraph.of`).
+passage, reaches as far as the second. Links join poses of one plan; `passages.py` has the ways between plans.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array, eye_array
+from scipy.sparse import block_diag, coo_array, csr_array, eye_array
 from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import PASSAGE_CODE, TWO_PI, WALL_CODE, WINDOW_CODE, wrap_angle
@@ -38,13 +38,13 @@ _OFF_GRID = 0.4
 # Residuals beyond which a pair of poses is left out.
 _MAX_DEVIATIONS = 3.0
 # A motion longer than this many links does not respect walls: the way is not known.
-_MAX_HOPS = 10
+MAX_HOPS = 10
 # Without odometry: distance (m) walked and deviation of the turn (radians) between two photographs.
-_STROLL_M, _STROLL_TURN = 2.0, math.radians(60.0)
+STROLL_M, _STROLL_TURN = 2.0, math.radians(60.0)
 # Probability that odometry is wrong about a motion.
 _SLIP = 0.02
-# Pairs of a state and a reachable pose that are weighed at once.
-_PAIRS = 1 << 20
+# Pairs of a state and a reachable pose that are weighed at once, and in all.
+_PAIRS, _MAX_PAIRS = 1 << 20, 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,51 +158,45 @@ def axes(heading: Float[np.ndarray, "*k"]) -> Float[np.ndarray, "*k 2 2"]:
 
 @dataclass(frozen=True, eq=False)
 class WalkGraph:
-    """Poses of a grid and the short links that can be walked.
+    """Poses of one grid, or of the grids of several plans in a row, and the short links that can be walked.
 
     Attributes:
-        position_m: (n, 2) positions in the frame of their own plans, so that stairs of all levels lie above each other.
+        position_m: (n, 2) positions in the frames of their own plans.
         links: (n, n) ones between linked poses, and on the diagonal.
         step_m: step of the grid.
+        first: (p + 1,) number of the first pose of each plan, and that of poses.
     """
 
     position_m: Float[np.ndarray, "n 2"]
     links: csr_array
     step_m: float
+    first: Int[np.ndarray, "_"]
 
     @classmethod
-    def of(
-        cls,
-        poses: PoseSet,
-        layouts: Layouts,
-        step_m: float,
-        *,
-        own_position_m: Float[np.ndarray, "n 2"] | None = None,
-        stairs: Sequence[tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]] = (),
-    ) -> WalkGraph:
-        """Link the poses of a grid.
-
-        Args:
-            poses: poses of the grid, of one plan or of merged plans.
-            layouts: their layouts.
-            step_m: step of the grid.
-            own_position_m: positions in the frames of their own plans; None for `poses.position_m`.
-            stairs: pairs of sets of poses, on stairs or in lifts of two levels that people change between.
-        """
+    def of(cls, poses: PoseSet, layouts: Layouts, step_m: float) -> WalkGraph:
+        """Link the poses of a plan's grid, given their layouts."""
         count, position = len(poses), poses.position_m
         reach_m = max(_LINK_STEPS * step_m, _DOORWAY_M)
         pair = KDTree(position).query_pairs(reach_m, output_type="ndarray")
         both = np.concatenate([pair, pair[:, ::-1]])
         kept = _seen(position, poses.room_index, layouts, both[:, 0], both[:, 1], step_m)
         rows, columns = both[kept].T
-        for lower, upper in stairs:
-            first, second = (part.ravel() for part in np.meshgrid(lower, upper, indexing="ij"))
-            rows, columns = np.concatenate([rows, first, second]), np.concatenate([columns, second, first])
         linked = coo_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(count, count)).tocsr()
         # Who sees is seen.
         links = csr_array(linked + linked.T + eye_array(count, format="csr"))
         links.data = np.ones(links.nnz, np.float32)
-        return cls(position if own_position_m is None else own_position_m, links, step_m)
+        return cls(position, links, step_m, np.array([0, count]))
+
+    @classmethod
+    def joined(cls, graphs: Sequence[WalkGraph]) -> WalkGraph:
+        """Return the graphs of several plans as one; no link leads from plan to plan."""
+        first = np.cumsum([0, *(len(graph.position_m) for graph in graphs)])
+        links = csr_array(block_diag([graph.links for graph in graphs], format="csr"))
+        return cls(np.concatenate([graph.position_m for graph in graphs]), links, graphs[0].step_m, first)
+
+    def plan_of(self, pose: Int[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
+        """Return the number of each pose's plan."""
+        return np.searchsorted(self.first, pose, side="right") - 1
 
     @property
     def nbytes(self) -> int:
@@ -211,12 +205,14 @@ class WalkGraph:
 
     def reachable(self, pose: Int[np.ndarray, "a"], distance_m: float) -> csr_array:
         """Return ones (a, n) at the poses within a walk of about a distance (m) from some poses."""
-        hops = max(math.ceil(distance_m / self.step_m), 1)
-        found = csr_array(self.links[pose])
-        for _ in range(hops - 1):
-            found = csr_array(found @ self.links)
-            found.data[:] = 1.0
-        return found
+        return self.spread(csr_array(self.links[pose]), max(math.ceil(distance_m / self.step_m), 1) - 1)
+
+    def spread(self, reached: csr_array, hops: int) -> csr_array:
+        """Return ones (a, n) at the poses within some links of those with ones."""
+        for _ in range(hops):
+            reached = csr_array(reached @ self.links)
+            reached.data[:] = 1.0
+        return reached
 
 
 def _seen(
@@ -295,7 +291,7 @@ def _turns(sectors: int, turn: float, std: float) -> Float[np.ndarray, "k l"]:
 
 def _strolled(graph: WalkGraph, pose: Int[np.ndarray, "a"], belief: Float[np.ndarray, "a k"]) -> np.ndarray:
     """Return the belief if the camera walked a short way in any direction."""
-    reach = graph.reachable(pose, _STROLL_M)
+    reach = graph.reachable(pose, STROLL_M)
     share = belief / np.maximum(np.diff(reach.indptr), 1)[:, None]
     return reach.T @ share
 
@@ -317,12 +313,19 @@ def _walked(
     precision = np.linalg.inv(covariance)
     density = graph.step_m**2 / (TWO_PI * np.sqrt(np.linalg.det(covariance)))
     reach_m = length_m + _MAX_DEVIATIONS * math.sqrt(np.linalg.eigvalsh(covariance).max())
-    if reach_m > _MAX_HOPS * graph.step_m:
-        reach = csr_array(np.ones((len(pose), count), np.float32))
-    else:
-        reach = graph.reachable(pose, reach_m)
     row, sector = np.nonzero(belief)
-    targets = np.diff(reach.indptr)[row]
+    near = None
+    if reach_m > MAX_HOPS * graph.step_m:
+        # Anywhere in the plan.
+        own = graph.plan_of(pose)
+        begin, targets = graph.first[own][row], np.diff(graph.first)[own][row]
+        # The least probable states are left out if there are too many pairs.
+        kept = np.argsort(-belief[row, sector], kind="stable")
+        kept = np.sort(kept[np.cumsum(targets[kept]) <= _MAX_PAIRS])
+        row, sector, begin, targets = row[kept], sector[kept], begin[kept], targets[kept]
+    else:
+        near = graph.reachable(pose, reach_m)
+        begin, targets = near.indptr[row], np.diff(near.indptr)[row]
     result = np.zeros(count * sectors)
     ends = np.cumsum(targets)
     first = 0
@@ -331,8 +334,8 @@ def _walked(
         last = max(int(np.searchsorted(ends, before + _PAIRS, side="right")), first + 1)
         part = slice(first, last)
         state = np.repeat(np.arange(first, last), targets[part])
-        entry = np.arange(len(state)) - np.repeat(ends[part] - targets[part] - before, targets[part])
-        target = reach.indices[entry + reach.indptr[row[state]]]
+        entry = np.arange(len(state)) - np.repeat(ends[part] - targets[part] - before, targets[part]) + begin[state]
+        target = entry if near is None else near.indices[entry]
         k = sector[state]
         off = graph.position_m[target] - graph.position_m[pose[row[state]]] - target_m[k]
         form = precision[k]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.localise.tracking.motion import States
@@ -17,14 +17,15 @@ from lalaloc_core.localise.tracking.motion import States
 Mode = Literal["searching", "tracking", "lost"]
 Component = Literal["forward_m", "right_m", "turn_deg"]
 COMPONENTS: tuple[Component, ...] = get_args(Component)
-# Largest number of states of a belief, and of poses of the path that are kept.
-MAX_STATES, MAX_PATH = 4096, 200
+# Largest number of states of a belief.
+MAX_STATES = 4096
 # Probability, before the first photograph, that the camera is in the plan.
 _IN_PLAN = 0.9
 # Recent photographs of which contradicted motions are remembered.
 RECENT = 8
-_MAGIC, _VERSION, _HEADER = b"LTRK", 1, struct.Struct("<4sHI")
-_COLUMNS = 6
+# Version 1 was of one plan, and ended with a path.
+_MAGIC, _VERSIONS, _HEADER = b"LTRK", (1, 2), struct.Struct("<4sHI")
+_MAX_BYTES = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +35,12 @@ class TrackedPose:
     Attributes:
         heading: azimuth (radians) of the photograph's centre.
         covariance: of (x, y, heading), in m² and radians².
-        room_index: number of the room in the plan, or in the merged plans of a venue.
+        room_index: number of the room in its plan; x, y and the heading are in the frame of that plan.
         probability: that the pose is right within 1 m.
         mode: mode of the session after the photograph.
         number: number of the photograph, from 1.
         sure: whether the photograph by itself tells this pose.
+        plan: number of the plan in `TrackState.plans`, or in the ground while it is tracked.
     """
 
     x_m: float
@@ -49,8 +51,9 @@ class TrackedPose:
     probability: float
     mode: Mode
     number: int
-    # States of earlier versions do not have it.
+    # States of earlier versions have neither.
     sure: bool = False
+    plan: int = 0
 
     @property
     def position_m(self) -> Float[np.ndarray, "2"]:
@@ -58,34 +61,54 @@ class TrackedPose:
         return np.array([self.x_m, self.y_m])
 
 
+@dataclass(frozen=True)
+class StatePlan:
+    """Plan that a state has poses in: its key, which changes with the plan, and the number of its grid poses."""
+
+    key: str
+    poses: int
+
+
 @dataclass(frozen=True, eq=False)
 class TrackState:
     """State after some photographs; `TrackState.first` is that before the first one.
 
     Attributes:
-        poses, sectors: numbers of grid poses, which must not change, and of sectors of the heading.
-        belief: the probable states; the sum of their weights is at most one, and the rest is anywhere.
-        in_plan: probability that the camera is in the plan.
+        plans: plans of the belief and the pose; their grids must not change.
+        sectors: number of sectors of the heading.
+        belief: the probable states, with poses numbered through all plans; the sum of their weights is at most one,
+            and the rest is anywhere.
+        in_plan: probability that the camera is in a plan.
         number: photographs so far.
-        pose: pose of the last photograph; None before the first.
+        pose: pose of the last photograph; None before the first, and if its plan is not tracked.
         contradicted: for each component of the motions, bits of the recent photographs that contradict it.
-        path: (p, 6) recent poses: number, x, y (m), heading (radians), room and probability.
     """
 
-    poses: int
+    plans: tuple[StatePlan, ...]
     sectors: int
     belief: States
     in_plan: float = _IN_PLAN
     number: int = 0
     pose: TrackedPose | None = None
     contradicted: tuple[int, int, int] = (0, 0, 0)
-    path: Float[np.ndarray, "p 6"] = field(default_factory=lambda: np.empty((0, _COLUMNS)))
 
     @classmethod
-    def first(cls, poses: int, sectors: int) -> TrackState:
+    def first(cls, sectors: int) -> TrackState:
         """Return the state before the first photograph: the camera is anywhere."""
         nothing = np.empty(0, np.int64)
-        return cls(poses, sectors, States(nothing, nothing, np.empty(0)))
+        return cls((), sectors, States(nothing, nothing, np.empty(0)))
+
+    @property
+    def plan_of_state(self) -> Int[np.ndarray, "m"]:
+        """Number of the plan of each state of the belief."""
+        ends = np.cumsum([plan.poses for plan in self.plans])
+        return np.searchsorted(ends, self.belief.pose, side="right")
+
+    @property
+    def by_plan(self) -> dict[str, float]:
+        """Probability of each plan, by key."""
+        weight = np.bincount(self.plan_of_state, self.belief.weight, minlength=len(self.plans))
+        return {plan.key: float(share) for plan, share in zip(self.plans, weight, strict=True)}
 
     def with_sectors(self, sectors: int) -> TrackState:
         """Return the state with another number of sectors of the heading, as views have more of them than spheres."""
@@ -109,13 +132,12 @@ class TrackState:
         """Return the state as bytes, at most about 100 kB."""
         pose, belief = self.pose, self.belief
         header: dict[str, Any] = {
-            "poses": self.poses,
+            "plans": [[plan.key, plan.poses] for plan in self.plans],
             "sectors": self.sectors,
             "in_plan": self.in_plan,
             "number": self.number,
             "contradicted": list(self.contradicted),
             "states": len(belief.pose),
-            "path": len(self.path),
             "pose": None
             if pose is None
             else {**vars(pose), "covariance": np.asarray(pose.covariance, float).ravel().tolist()},
@@ -124,11 +146,10 @@ class TrackState:
         arrays = (
             (belief.pose * self.sectors + belief.sector).astype("<i4"),
             belief.weight.astype("<f4"),
-            self.path.astype("<f4"),
         )
         content = struct.pack("<I", len(text)) + text + b"".join(part.tobytes() for part in arrays)
         # Level 1, because most of the content hardly shrinks.
-        return _HEADER.pack(_MAGIC, _VERSION, zlib.crc32(content)) + zlib.compress(content, 1)
+        return _HEADER.pack(_MAGIC, _VERSIONS[-1], zlib.crc32(content)) + zlib.compress(content, 1)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> TrackState:
@@ -145,34 +166,36 @@ class TrackState:
 
 def _read(content: bytes) -> TrackState:
     magic, version, checksum = _HEADER.unpack_from(content)
-    if magic != _MAGIC or version != _VERSION:
-        raise InvalidStateError(f"the state has version {version}; this version of the service reads {_VERSION}")
-    limit = 2**20
-    body = zlib.decompressobj().decompress(content[_HEADER.size :], limit)
+    if magic != _MAGIC or version not in _VERSIONS:
+        raise InvalidStateError(
+            f"the state has version {version}; this version of the service reads {', '.join(map(str, _VERSIONS))}"
+        )
+    body = zlib.decompressobj().decompress(content[_HEADER.size :], _MAX_BYTES)
     if zlib.crc32(body) != checksum:
         raise InvalidStateError("the state of the session is damaged: its checksum differs")
     (length,) = struct.unpack_from("<I", body)
     header = json.loads(body[4 : 4 + length])
-    states, path, first = int(header["states"]), int(header["path"]), 4 + length
-    if not (0 <= states <= MAX_STATES and 0 <= path <= MAX_PATH):
+    states, first = int(header["states"]), 4 + length
+    if not 0 <= states <= MAX_STATES:
         raise InvalidStateError(f"the state has {states} states; the limit is {MAX_STATES}")
+    plans = tuple(StatePlan(key, int(poses)) for key, poses in header.get("plans", [["", header.get("poses")]]))
     number = np.frombuffer(body, "<i4", states, first).astype(np.int64)
     weight = np.frombuffer(body, "<f4", states, first + 4 * states).astype(np.float64)
-    points = np.frombuffer(body, "<f4", _COLUMNS * path, first + 8 * states).astype(np.float64)
-    poses, sectors = int(header["poses"]), int(header["sectors"])
+    poses, sectors = sum(plan.poses for plan in plans), int(header["sectors"])
     if states and not (number.min() >= 0 and number.max() < poses * sectors and (weight >= 0.0).all()):
         raise InvalidStateError("the state of the session is damaged: a weight or a pose is out of range")
     pose = header["pose"]
     if pose is not None:
         pose = TrackedPose(**{**pose, "covariance": np.array(pose["covariance"]).reshape(3, 3)})
+        if not 0 <= pose.plan < len(plans):
+            raise InvalidStateError("the state of the session is damaged: the plan of its pose is out of range")
     misses = [int(bits) for bits in header["contradicted"]]
     return TrackState(
-        poses,
+        plans,
         sectors,
         States(number // sectors, number % sectors, weight),
         float(header["in_plan"]),
         int(header["number"]),
         pose,
         (misses[0], misses[1], misses[2]),
-        points.reshape(path, _COLUMNS),
     )
