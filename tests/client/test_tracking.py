@@ -60,6 +60,17 @@ def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, panora
             tracker.add(panorama)
 
 
+def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(app)
+    venue = app.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 2}]}).json()
+    with Client(str(app.base_url)) as service, service.track(venue_id=venue["id"], level=2.0) as tracker:
+        session = tracker.add(panorama)
+        assert (session.venue_id, session.venue_revision) == (venue["id"], venue["revision"])
+        assert session.pose is not None
+        assert (session.pose.floorplan_id, session.pose.level) == (plan_id, 2.0)
+        assert (session.path[0].floorplan_id, session.path[0].level) == (plan_id, 2.0)
+
+
 def test_tracker_of_asyncio_follows_a_camera(app: httpx.Client, panorama: bytes, tmp_path: Path) -> None:
     plan_id = upload(app)
     path = tmp_path / "photograph.jpg"
