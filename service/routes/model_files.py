@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.localise.bundle import MANIFEST_NAME
 from lalaloc_core.localise.features import DEVICE_FILES, device_manifest
-from service.errors import UnknownModelFileError
+from service.errors import InvalidRequestError, UnknownModelFileError
 from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
@@ -31,7 +31,7 @@ _CHUNK_BYTES = 2**20
     responses={
         200: {"content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
         **NOT_MODIFIED,
-        **problem_responses(UnknownModelFileError),
+        **problem_responses(UnknownModelFileError, InvalidRequestError),
     },
 )
 async def get_model_file(file: str, request: Request, runtime: Running, client: Client) -> Response:
