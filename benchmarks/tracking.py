@@ -2,13 +2,16 @@
 
 A walk leads along shortest ways between random places of a furnished home, through its doors, with one photograph per
 second at 1 m/s. Odometry drifts: every walk has its own error of scale and of turn per metre, besides the noise of each
-motion. Every walk is followed as it is, without odometry, and carried to another place of the home.
+motion. Every walk is followed as it is, without odometry, and carried to another place of the home. Photographs are
+full spheres, or with `--view` of a narrower field of view, which is stated, and tilted as by hand.
 
     python -m benchmarks.tracking --walks 20
+    python -m benchmarks.tracking --walks 20 --view 80 --endless 0
 """
 
 from __future__ import annotations
 
+import argparse
 import heapq
 import math
 import time
@@ -34,6 +37,7 @@ from lalaloc_core.learn.data.synthetic.generated import (
     RendererCache,
     split_renderer_cache,
 )
+from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph, tilt_by_hand
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import home_of
@@ -41,6 +45,7 @@ from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.pipeline import Refiner, run_steps
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.retrieval import build_grid
@@ -165,14 +170,20 @@ def odometry(poses: Sequence[Pose], rng: np.random.Generator, drift: float, turn
 
 
 def walk_through(
-    home: Home, count: int, rng: np.random.Generator, encoders: Encoders, renderers: RendererCache
+    home: Home,
+    count: int,
+    rng: np.random.Generator,
+    encoder: PhotographEncoder,
+    renderers: RendererCache,
+    field_deg: float | None,
 ) -> Walk:
-    """Walk through a home, and photograph and encode the way."""
+    """Walk through a home, and photograph and encode the way; without a field of view, as full spheres."""
     poses = Ways(home.plan).poses(count, rng)
     lowest_m = min(home.plan.rooms[pose.room].ceiling_height_m for pose in poses)
     height_m = float(min(rng.uniform(1.3, 1.7), lowest_m - CEILING_CLEARANCE_M))
     seed = int(rng.integers(1 << 62))
-    manifest, queries = encoders.manifest, []
+    manifest, queries = encoder.networks.manifest, []
+    height = CameraHeight(height_m)
     for pose in poses:
         shot = Shot(
             home=home,
@@ -183,8 +194,14 @@ def walk_through(
             furniture="full",
             seed=seed,
         )
-        image = RenderedPhotograph(shot, renderers).image(manifest.image_height, manifest.image_width)
-        queries.append(encoders.query(image, None, CameraHeight(height_m)))
+        photograph = RenderedPhotograph(shot, renderers)
+        if field_deg is None:
+            image = photograph.image(manifest.image_height, manifest.image_width)
+            queries.append(encoder.networks.query(image, None, height))
+            continue
+        pitch, roll = tilt_by_hand(rng)
+        view = ViewPhotograph(sphere=CachedSphere(photograph), azimuth=0.0, field_deg=field_deg, pitch=pitch, roll=roll)
+        queries.append(encoder.query(view.open(patch_size(manifest)), None, height))
     return Walk(home.plan, poses, queries, odometry(poses, rng, 0.05, math.radians(2.0)))
 
 
@@ -253,19 +270,21 @@ def main() -> None:
     parser.add_argument("--bundle", type=Path, default=Path("models/default"))
     parser.add_argument("--walks", type=int, default=20)
     parser.add_argument("--photographs", type=int, default=18)
+    parser.add_argument("--view", type=float, metavar="DEG", help="field of view; default: full spheres")
     parser.add_argument("--split", choices=sorted(SPLIT_NUMBERS), default="test")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--office-m2", type=float, default=2000.0, help="floor area of the large building; 0: none")
     parser.add_argument("--endless", type=int, default=10_000, help="photographs of the session that must not grow")
     options = parser.parse_args()
     bundle, split = Bundle.open(options.bundle), SPLIT_NUMBERS[options.split]
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
+    encoders = encoder.networks
     renderers = split_renderer_cache(split, options.seed, None)
     ways: dict[str, list[list[float]]] = {"odometry": [], "none": []}
     again, spent, walk = list[int](), list[float](), None
     for index in range(options.walks):
         home, rng = home_of(split, options.seed, index)
-        walk = walk_through(home, options.photographs, rng, encoders, renderers)
+        walk = walk_through(home, options.photographs, rng, encoder, renderers, options.view)
         follower = Follower(walk.plan, encoders, refiner)
         order = list(range(len(walk.poses)))
         ways["odometry"].append([error for error, _ in follower.follow(walk, order)])
@@ -282,7 +301,7 @@ def main() -> None:
     print(f"carried elsewhere: right again after {np.median(again):.0f} photographs in the median, worst {max(again)}")
     _times("homes", spent)
     if options.office_m2:
-        _office(options.office_m2, split, options.seed, options.photographs, encoders, refiner, renderers)
+        _office(options.office_m2, split, options, encoder, refiner, renderers)
     if walk is not None and options.endless:
         _endless(walk, options.endless, Follower(walk.plan, encoders, refiner))
 
@@ -296,19 +315,18 @@ def _times(name: str, spent: list[float]) -> None:
 def _office(
     area_m2: float,
     split: int,
-    seed: int,
-    count: int,
-    encoders: Encoders,
+    options: argparse.Namespace,
+    encoder: PhotographEncoder,
     refiner: Refiner,
     renderers: RendererCache,
 ) -> None:
     """Print the figures of walks through homes of a large building, searched in all of it."""
-    building = building_of(split, seed, area_m2)
-    follower, errors = Follower(building.plan, encoders, refiner), []
+    building = building_of(split, options.seed, area_m2)
+    follower, errors = Follower(building.plan, encoder.networks, refiner), []
     for index, (home, shift_m) in enumerate(zip(building.homes, building.shift_m, strict=True)):
-        rng = np.random.default_rng([split, seed, index, 9])
-        walk = walk_through(home, count, rng, encoders, renderers)
-        errors.append([error for error, _ in follower.follow(walk, range(count), shift_m=shift_m)])
+        rng = np.random.default_rng([split, options.seed, index, 9])
+        walk = walk_through(home, options.photographs, rng, encoder, renderers, options.view)
+        errors.append([error for error, _ in follower.follow(walk, range(options.photographs), shift_m=shift_m)])
     _summary("building", errors)
     _times(f"{building.plan.area_m2:.0f} m²", follower.milliseconds)
 

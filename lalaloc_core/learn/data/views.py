@@ -77,22 +77,19 @@ class ViewScenes:
 
     def _views(self, scene: str, camera: Camera) -> list[Camera]:
         rng = np.random.default_rng([zlib.crc32(f"{scene}/{camera.name}".encode()), 0])
-        spheres = {look: _Sphere(photograph) for look, photograph in camera.photographs.items()}
+        spheres = {look: CachedSphere(photograph) for look, photograph in camera.photographs.items()}
         views = []
         for number in range(self.per_camera):
             azimuth = float(wrap_angle(TWO_PI * number / self.per_camera))
             lens_deg = rng.uniform(*FIELDS_DEG)
-            pitch_deg, roll_deg = (
-                float(np.clip(rng.normal(0.0, spread), -limit, limit))
-                for spread, limit in ((_PITCH_DEG, _MAX_PITCH_DEG), (_ROLL_DEG, _MAX_ROLL_DEG))
-            )
+            pitch, roll = tilt_by_hand(rng)
             photographs: dict[Appearance, Photograph] = {
                 look: ViewPhotograph(
                     sphere=sphere,
                     azimuth=azimuth,
                     field_deg=lens_deg if self.field_deg is None else self.field_deg,
-                    pitch=math.radians(pitch_deg),
-                    roll=math.radians(roll_deg),
+                    pitch=pitch,
+                    roll=roll,
                     stated=self.stated,
                 )
                 for look, sphere in spheres.items()
@@ -103,14 +100,24 @@ class ViewScenes:
         return views
 
 
+def tilt_by_hand(rng: np.random.Generator) -> tuple[float, float]:
+    """Return a random pitch and roll (radians) of a camera held by hand."""
+    pitch_deg, roll_deg = (
+        float(np.clip(rng.normal(0.0, spread), -limit, limit))
+        for spread, limit in ((_PITCH_DEG, _MAX_PITCH_DEG), (_ROLL_DEG, _MAX_ROLL_DEG))
+    )
+    return math.radians(pitch_deg), math.radians(roll_deg)
+
+
 @dataclass(frozen=True, eq=False)
-class _Sphere:
+class CachedSphere:
     """Photograph of which several views are cut."""
 
     photograph: Photograph
 
     @cached_property
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The whole sphere, of the size that views are cut from."""
         return self.photograph.image(*_SPHERE_SIZE)
 
 
@@ -126,7 +133,7 @@ class ViewPhotograph:
         stated: what is known about it.
     """
 
-    sphere: _Sphere = field(repr=False)
+    sphere: CachedSphere = field(repr=False)
     azimuth: float
     field_deg: float
     pitch: float
