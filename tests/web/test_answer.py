@@ -112,8 +112,10 @@ def _expect_marker(page: Page, x_m: float, y_m: float) -> None:
 def test_keyboard_alone_leads_to_an_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     page.locator("#heading").focus()
-    for _ in range(3):
-        page.keyboard.press("Shift+Tab")
+    # Past the forms that begin in between.
+    for _ in range(8):
+        if page.evaluate("document.activeElement.id") != "find":
+            page.keyboard.press("Shift+Tab")
     expect(page.locator("#find")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.locator("#answer")).to_be_visible()
