@@ -34,7 +34,7 @@ from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
@@ -284,6 +284,14 @@ class TestWarmStart:
         start.load_into(stage.modules)
         assert same_weights({"image_encoder": stage.encoder.state_dict()}, start.checkpoint.weights)
         assert all(value.dtype != torch.float16 for value in stage.encoder.state_dict().values())
+
+    def test_stage_starts_from_the_shipped_bundle(self) -> None:
+        trunk = PRESETS["trunk"]
+        encoder = build_image_encoder(trunk)
+        start = load_warm_start(default_bundle(), "image", trunk)
+        start.load_into({"image_encoder": encoder})
+        trained = start.checkpoint.weights["image_encoder"]
+        assert all(torch.equal(value, trained[key]) for key, value in encoder.state_dict().items())
 
     def test_run_starts_from_the_best_checkpoint_of_another(self, tiny_bundle: Path, tmp_path: Path) -> None:
         trained(tmp_path / "first", tiny_bundle)

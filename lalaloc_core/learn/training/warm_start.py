@@ -60,8 +60,11 @@ class WarmStart:
         """
         for name, module in modules.items():
             if name in self.checkpoint.inference_weights:
+                # Exported networks also hold constants that the module computes itself.
+                constants = dict(module.named_buffers()).keys() - module.state_dict().keys()
+                weights = self.checkpoint.inference_weights[name]
                 try:
-                    module.load_state_dict(self.checkpoint.inference_weights[name])
+                    module.load_state_dict({key: weights[key] for key in weights.keys() - constants})
                 except RuntimeError as error:
                     raise CheckpointError(f"cannot load the {name} of {self.origin}: {error}") from error
 
