@@ -104,7 +104,7 @@ class View:
 
     @property
     def is_sphere(self) -> bool:
-        """Whether the photograph is a full sphere."""
+        """True if the photograph is a full sphere."""
         return self.panorama is not None or (self.encoded is not None and not self.encoded.azimuths)
 
     def tilt_sd(self, azimuth: float) -> float:
