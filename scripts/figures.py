@@ -35,13 +35,12 @@ def accuracy_table() -> str:
     ]
     for name, title in _ACCURACY_ROWS.items():
         scores = _bench()["accuracy"][name]
-        low, high = scores["within_1m_interval"]
         error = scores["expected_calibration_error"]
         median = f"{scores['median_cm']:.1f} cm" if scores["median_cm"] >= 0.01 else "< 0.01 cm"
         rows.append(
             _row(
                 title,
-                f"{_percent(scores['within_1m'])} [{100 * low:.0f}, {100 * high:.0f}]",
+                _share_and_interval(scores),
                 _percent(scores["within_10cm"]),
                 median,
                 _percent(scores["heading_within_2deg"]),
@@ -104,6 +103,11 @@ _SPEED_ROWS = {
 }
 
 
+def _share_and_interval(scores: dict[str, Any]) -> str:
+    low, high = scores["within_1m_interval"]
+    return f"{_percent(scores['within_1m'])} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
 def views_table() -> str:
     """Return accuracy and calibration of views in furnished synthetic homes as a Markdown table."""
     rows = [
@@ -112,11 +116,10 @@ def views_table() -> str:
     ]
     for name, title in _VIEW_ROWS.items():
         scores = _bench()["views"][name]
-        low, high = scores["within_1m_interval"]
         rows.append(
             _row(
                 title,
-                f"{_percent(scores['within_1m'])} [{100 * low:.0f}, {100 * high:.0f}]",
+                _share_and_interval(scores),
                 _percent(scores["within_1m_30deg"]),
                 _percent(scores["among_5"]),
                 f"{scores['median_cm']:.0f} cm",
