@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -26,10 +28,15 @@ def add_audit_commands(commands: Any) -> None:
 def _export(arguments: argparse.Namespace) -> int:
     with configured_store() as store:
         entries = store.audit_log.export(tenant=arguments.tenant, since=arguments.since, until=arguments.until)
-        for entry in entries:
-            detail = None if entry.detail is None else json.loads(entry.detail)
-            line = asdict(entry) | {"created_at": entry.created_at.isoformat(), "detail": detail}
-            print(json.dumps(line))
+        try:
+            for entry in entries:
+                detail = None if entry.detail is None else json.loads(entry.detail)
+                line = asdict(entry) | {"created_at": entry.created_at.isoformat(), "detail": detail}
+                print(json.dumps(line))
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # A reader such as `head` has enough; the interpreter must not write the rest at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 

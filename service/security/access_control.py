@@ -62,8 +62,6 @@ class AccessControl:
     def close(self) -> None:
         """Stop looking up keys."""
         self._keys.close()
-        if self._tokens is not None:
-            self._tokens.close()
 
     async def authorise(self, request: Request) -> Caller:
         """Return the caller of a request.

@@ -38,6 +38,8 @@ from service.telemetry.log_fields import log_fields_of
 
 # Refusals that are audited, besides those of changes.
 AUDITED_REFUSALS = (UnauthenticatedError, InsufficientScopeError, ExposedWithoutKeysError, TooManyRefusedKeysError)
+# nginx's status for a client that disconnected before the answer; a change may have been made.
+CLIENT_CLOSED = 499
 READING = frozenset({"GET", "HEAD"})
 _METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _DETAIL = "lalaloc.audit_detail"
@@ -89,10 +91,16 @@ def entry_of(
         action=f"{method if method in _METHODS else 'OTHER'} {template_of(path) or 'unmatched'}",
         resource=(location or quote(path[:_MAX_RESOURCE], safe="/"))[:_MAX_RESOURCE],
         status=status,
-        result=DONE if status < 400 else (fields.rejection if fields is not None else None) or "failed",
+        result=_result(status, None if fields is None else fields.rejection),
         request_id=None if fields is None else fields.request_id,
         detail=detail,
     )
+
+
+def _result(status: int, rejection: str | None) -> str:
+    if status < 400:
+        return DONE
+    return rejection or ("unanswered" if status == CLIENT_CLOSED else "failed")
 
 
 class AuditTrail:

@@ -239,10 +239,7 @@ def _verify(verifier: TokenVerifier, *tokens: str) -> Identity:
     async def verify() -> Identity:
         return [await verifier.verify(token) for token in tokens][-1]
 
-    try:
-        return asyncio.run(verify())
-    finally:
-        verifier.close()
+    return asyncio.run(verify())
 
 
 def _refusal(verifier: TokenVerifier, token: str) -> str:
@@ -386,7 +383,6 @@ def test_keys_are_not_fetched_per_token(issuer: AnyIssuer) -> None:
         await verifier.verify(valid)
 
     asyncio.run(run())
-    verifier.close()
 
 
 def _endless(handler: BaseHTTPRequestHandler) -> None:
@@ -427,6 +423,7 @@ def _redirecting(handler: BaseHTTPRequestHandler) -> None:
         (None, {"jwks_uri": "http://10.0.0.1/keys"}, "must begin with https"),
         (None, {"jwks_uri": "file:///etc/passwd"}, "not a URL"),
         (None, {"jwks_uri": None}, "not a URL"),
+        (None, {"jwks_uri": "https://a\x01b/"}, "not a URL"),
     ],
 )
 def test_unusable_issuer_is_not_trusted(
@@ -435,7 +432,7 @@ def test_unusable_issuer_is_not_trusted(
     monkeypatch.setattr(oidc, "_FETCH_S", 0.3)
     issuer.answer, issuer.document = answer, document
     with pytest.raises(ValueError, match=reason):
-        oidc.fetch_keys(issuer.url)
+        asyncio.run(oidc.fetch_keys(issuer.url))
     with pytest.raises(IssuerUnavailableError):
         _verify(issuer.verifier(), _signed(FIRST, {"iss": issuer.url}))
 

@@ -9,11 +9,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import http_problem_answer, problem_answer
 from service.security.access_control import REFUSALS, AccessControl, routed_path
-from service.security.audit import AUDITED_REFUSALS, READING, AuditTrail, entry_of, is_audited
+from service.security.audit import AUDITED_REFUSALS, CLIENT_CLOSED, READING, AuditTrail, entry_of, is_audited
 from service.security.permissions import OPEN_PATHS, Caller, put_caller
-
-# nginx's status for a client that disconnected before the answer.
-_CLIENT_CLOSED = 499
 
 
 class AuthorisationMiddleware:
@@ -70,8 +67,7 @@ class AuthorisationMiddleware:
             await self._handle(access, caller, scope, receive, sending)
         finally:
             if not noted:
-                # The client left, but the change may have been made.
-                trail.count(entry_of(scope, _CLIENT_CLOSED, caller=caller))
+                trail.count(entry_of(scope, CLIENT_CLOSED, caller=caller))
 
     async def _handle(self, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["method"] in READING:
