@@ -333,6 +333,17 @@ def _follow(caller: Caller, place: dict[str, str]) -> None:
         caller.send("DELETE", path)
 
 
+def _administer(caller: Caller, _stored: Stored, _size: int) -> None:
+    document = {"tenant": "new", "name": "n" * 200, "scopes": ["metrics", "read", "localise", "write"]}
+    answer = caller.send("POST", "/admin/keys", _body(document))
+    if answer.status == 201:
+        path = f"/admin/keys/{answer.json()['id']}"
+        caller.send("POST", f"{path}/rotation", _body({"overlap_s": 0}))
+        caller.send("GET", path)
+        caller.send("DELETE", path)
+    caller.send("PATCH", "/admin/tenants/new", _body({"cpu_share": 1.0}))
+
+
 _TOO_LONG = frozenset({422})
 LOADS = (
     Load(("GET /floorplans",), "pages of 500", _get("/floorplans", limit=None), 500),
@@ -448,6 +459,21 @@ LOADS = (
         ("GET /answers/{answer_id}", "DELETE /answers/{answer_id}"),
         f"{VERTICES_PLAN}, posterior",
         _read_and_delete_answer,
+    ),
+    Load(
+        (
+            "POST /admin/keys",
+            "POST /admin/keys/{key_id}/rotation",
+            "GET /admin/keys/{key_id}",
+            "DELETE /admin/keys/{key_id}",
+            "PATCH /admin/tenants/{tenant}",
+        ),
+        "keys and limits",
+        _administer,
+    ),
+    *(
+        Load((f"GET /admin/{name}",), "pages of 500", _get(f"/admin/{name}", limit=None), 500)
+        for name in ("keys", "tenants", "audit")
     ),
     *(Load((f"GET /{name}",), "–", _get(f"/{name}")) for name in ("healthz", "readyz", "metrics", "limits", "usage")),
 )

@@ -100,6 +100,7 @@ async def _lifespan(
         app.state.cors_origins = settings.access.cors_origin_set
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control
+        app.state.audit_trail = runtime.audit_trail
         yield
         logger.info("service is stopping")
     logger.info("service stopped")

@@ -1,6 +1,6 @@
-"""Command line of the service: `lalaloc-service serve`, `keys create|list|revoke` and `tenants list|limit|purge`.
+"""Command line of the service: `serve`, `keys create|list|rotate|revoke`, `tenants list|limit|purge`, `audit export`.
 
-Keys and tenants are in the database of the settings, so these commands also work while the service runs.
+Keys, tenants and the audit log are in the database of the settings, so these commands also work while the service runs.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import datetime
+from datetime import datetime, timedelta
 
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from lalaloc_core.localise.bundle import Bundle
-from service.command_parts import configured_store, tenant_name, text_table
+from service.audit_commands import add_audit_commands
+from service.command_parts import audit, configured_store, duration, tenant_name, text_table
+from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
 from service.settings import Settings
@@ -27,7 +29,6 @@ from service.tenant_commands import add_tenant_commands
 # Connections that the kernel accepts while the service is busy.
 _BACKLOG = 1024
 _MAX_NAME = 200
-_MAX_RATE = 10**6
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,7 +97,7 @@ def build_parser() -> argparse.ArgumentParser:
     serving = commands.add_parser("serve", help="run the service")
     add_serve_arguments(serving)
     serving.set_defaults(run=serve)
-    keys = commands.add_parser("keys", help="create, list and revoke API keys").add_subparsers(required=True)
+    keys = commands.add_parser("keys", help="create, list, rotate and revoke API keys").add_subparsers(required=True)
 
     create = keys.add_parser("create", help="create a key and print it; it cannot be shown again")
     create.add_argument(
@@ -116,9 +117,23 @@ def build_parser() -> argparse.ArgumentParser:
         type=_rate,
         help="rate limit in requests per minute; 0: no limit (default: LALALOC_RATE_PER_MINUTE)",
     )
+    create.add_argument(
+        "--expires-in", type=_lifetime, metavar="DURATION", help="lifetime of the key, such as 90d (default: no end)"
+    )
     create.set_defaults(run=_create)
 
-    listing = keys.add_parser("list", help="list all keys, including revoked ones, without secrets")
+    rotate = keys.add_parser("rotate", help="replace a key and print its successor; it cannot be shown again")
+    rotate.add_argument("id", help="id of the key: the part between the underscores")
+    rotate.add_argument(
+        "--overlap",
+        type=_overlap,
+        default="7d",
+        metavar="DURATION",
+        help="time for which the old key stays valid beside the new one (default: %(default)s)",
+    )
+    rotate.set_defaults(run=_rotate)
+
+    listing = keys.add_parser("list", help="list all keys, including revoked and expired ones, without secrets")
     listing.add_argument("--tenant", type=tenant_name, help="list only the keys of this tenant")
     listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
@@ -127,6 +142,7 @@ def build_parser() -> argparse.ArgumentParser:
     revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
     add_tenant_commands(commands)
+    add_audit_commands(commands)
     return parser
 
 
@@ -139,11 +155,32 @@ def _create(arguments: argparse.Namespace) -> int:
             hash_of(secret),
             arguments.scopes,
             rate_per_minute=arguments.rate_per_minute,
+            lifetime=arguments.expires_in,
         )
+        audit(store, key.tenant, "keys create", key.id, name=key.name, scopes=sorted(key.scopes), end=key.expires_at)
+    _print_new(key, secret)
+    return 0
+
+
+def _rotate(arguments: argparse.Namespace) -> int:
+    secret = new_secret()
+    with configured_store() as store:
+        key = store.keys.rotate(arguments.id, hash_of(secret), overlap=arguments.overlap)
+        if key is None:
+            print(f"lalaloc-service: no valid key '{arguments.id[:64]}'; see `keys list`", file=sys.stderr)
+            return 1
+        audit(store, key.tenant, "keys rotate", arguments.id, successor=key.id, end=key.expires_at)
+        replaced = store.keys.get(arguments.id)
+    if replaced is not None:
+        print(f"key {replaced.id} expires at {_moment(replaced.expires_at)}", file=sys.stderr)
+    _print_new(key, secret)
+    return 0
+
+
+def _print_new(key: ApiKey, secret: str) -> None:
     # Only the key goes to standard output, so that it can be piped.
     print(f"key {key.id} of tenant '{key.tenant}'; it is shown only once:", file=sys.stderr)
     print(key_text(key.id, secret))
-    return 0
 
 
 def _list(arguments: argparse.Namespace) -> int:
@@ -158,15 +195,17 @@ def _list(arguments: argparse.Namespace) -> int:
 
 def _revoke(arguments: argparse.Namespace) -> int:
     with configured_store() as store:
-        if not store.keys.revoke(arguments.id):
+        key = store.keys.revoke(arguments.id)
+        if key is None:
             print(f"lalaloc-service: no active key '{arguments.id[:64]}'", file=sys.stderr)
             return 1
+        audit(store, key.tenant, "keys revoke", key.id, name=key.name)
     print(f"revoked {arguments.id}")
     return 0
 
 
 def _table(keys: Sequence[ApiKey]) -> str:
-    head = ("ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST USED", "REVOKED")
+    head = ("ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST USED", "EXPIRES", "REVOKED")
     rows = [
         (
             key.id,
@@ -176,6 +215,7 @@ def _table(keys: Sequence[ApiKey]) -> str:
             "-" if key.rate_per_minute is None else str(key.rate_per_minute),
             _moment(key.created_at),
             _moment(key.last_used_at),
+            _moment(key.expires_at),
             _moment(key.revoked_at),
         )
         for key in keys
@@ -194,9 +234,21 @@ def _name(given: str) -> str:
 
 
 def _rate(given: str) -> int:
-    if not given.isascii() or not given.isdigit() or int(given) > _MAX_RATE:
-        raise argparse.ArgumentTypeError(f"a whole number from 0 to {_MAX_RATE}")
+    if not given.isascii() or not given.isdigit() or int(given) > MAX_RATE:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {MAX_RATE}")
     return int(given)
+
+
+def _lifetime(given: str) -> timedelta:
+    if not 1 <= (lifetime := duration(given)).total_seconds() <= MAX_LIFETIME_S:
+        raise argparse.ArgumentTypeError(f"1s to {MAX_LIFETIME_S // 86400}d")
+    return lifetime
+
+
+def _overlap(given: str) -> timedelta:
+    if (overlap := duration(given)).total_seconds() > MAX_OVERLAP_S:
+        raise argparse.ArgumentTypeError(f"0s to {MAX_OVERLAP_S // 86400}d")
+    return overlap
 
 
 if __name__ == "__main__":

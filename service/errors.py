@@ -37,8 +37,10 @@ LaLaLocError
     ├── StoreUnavailableError       the database cannot be reached
     │   ├── StoreBusyError          all database connections are in use
     │   └── StoreFullError          the database's disk is full
-    ├── UnauthenticatedError        no valid API key
-    ├── InsufficientScopeError      the API key lacks a scope
+    ├── UnauthenticatedError        no valid API key or token
+    ├── InsufficientScopeError      the API key or token lacks a scope
+    ├── IssuerUnavailableError      the issuer of tokens cannot be reached
+    ├── UnknownKeyError             no API key with this id, or an inactive one
     ├── ExposedWithoutKeysError     a remote request while API keys are off
     ├── RateLimitedError            the API key exceeded its rate limit
     ├── TooManyRefusedKeysError     too many invalid API keys from one client
@@ -371,15 +373,38 @@ class SpoolFullError(ServiceError):
 
 
 class UnauthenticatedError(ServiceError):
-    """The request has no valid API key. Unknown and revoked keys get the same message."""
+    """The request has no valid API key or token. Unknown and revoked keys get the same message."""
 
 
 class InsufficientScopeError(ServiceError):
-    """The API key lacks the scope that the route needs."""
+    """The API key or token lacks the scope that the route needs."""
 
-    def __init__(self, needed: str, given: Iterable[str]) -> None:
-        scopes = ", ".join(sorted(given))
-        super().__init__(f"this request needs an API key with scope '{needed}'; the key has: {scopes}")
+    def __init__(self, needed: str, given: Iterable[str] | None) -> None:
+        """Create the error; `given` is None while keys are off."""
+        if given is None:
+            text = f"API keys are off, and this request needs one with scope '{needed}': set LALALOC_API_KEYS=on"
+        else:
+            scopes = ", ".join(sorted(given)) or "none"
+            text = f"this request needs an API key or token with scope '{needed}'; it has: {scopes}"
+        super().__init__(text)
+
+
+class IssuerUnavailableError(ServiceError):
+    """The keys of the tokens' issuer are not known, because it cannot be reached."""
+
+    retry_after_s = 10
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the keys of the OpenID Connect issuer could not be fetched; try again later or use an API key"
+        )
+
+
+class UnknownKeyError(ServiceError):
+    """No API key has this id, or it cannot be changed any more."""
+
+    def __init__(self, key_id: str, state: str = "") -> None:
+        super().__init__(f"no {state}API key has the id '{key_id[:64]}'; list keys with GET /admin/keys")
 
 
 class ExposedWithoutKeysError(ServiceError):

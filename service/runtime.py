@@ -35,7 +35,7 @@ from service.query import (
     VenueSearch,
 )
 from service.schemas import ModelAnswer
-from service.security import AccessControl
+from service.security import AccessControl, AuditTrail
 from service.settings import Settings
 from service.storage import PlanLookup, Store, open_store
 from service.storage.records import DEFAULT_TENANT
@@ -100,6 +100,7 @@ class Runtime:
     tracker: TrackerBackend
     admission: Admission
     access_control: AccessControl
+    audit_trail: AuditTrail
     events: PlanEvents
     uploads: Threads
     file_uploads: Threads
@@ -167,6 +168,8 @@ def start_runtime(
     bundle = Bundle.open(settings.bundle)
     store = _closing(cleanup, open_store(settings))
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
+    audit_trail = _closing(cleanup, AuditTrail(store.audit_log))
+    audit_trail.start()
     components = _QueryComponents.start(settings, telemetry, cleanup, backends, bundle, store)
     # One thread per client beside other clients, because small uploads share the interpreter with queries.
     uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts, cores=1, rests=True)
@@ -222,6 +225,7 @@ def start_runtime(
         tracker=localisers[2],
         admission=components.admission,
         access_control=access_control,
+        audit_trail=audit_trail,
         events=_plan_events(store, grids, components.admission, event_reads, settings),
         uploads=uploads,
         file_uploads=file_uploads,

@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.importers import DEFAULT_IMPORT_LIMITS as _IMPORT
 from lalaloc_core.importers import ImportLimits
 from lalaloc_core.panorama.images import PanoramaLimits
-from service.setting_types import Area, Count, HostNames, Metres, Origins, PortMapping, Seconds
+from service.setting_types import Area, Count, HostNames, IssuerUrl, Metres, Origins, PortMapping, Seconds
 
 
 class SettingGroup(BaseModel):
@@ -164,10 +164,35 @@ class AccessSettings(SettingGroup):
         description="Rate limit per API key and replica, in requests per second. 0: no limit.",
     )
 
+    oidc_issuer: IssuerUrl = Field(
+        default="",
+        description="OpenID Connect: URL of the issuer whose tokens are accepted beside API keys, as in their claim "
+        "`iss`. Needs `LALALOC_API_KEYS=on` and `LALALOC_OIDC_AUDIENCE`.",
+    )
+    oidc_audience: str = Field(default="", description="OpenID Connect: claim `aud` that tokens need.")
+    oidc_tenant_claim: str = Field(
+        default="tenant",
+        min_length=1,
+        description="OpenID Connect: claim with the tenant; dots separate the names of nested claims.",
+    )
+    oidc_scope_claim: str = Field(
+        default="scope",
+        min_length=1,
+        description="OpenID Connect: claim with the scopes, such as `lalaloc:read`, as a list or separated by spaces.",
+    )
+
     @model_validator(mode="after")
     def _any_page_needs_keys(self) -> Self:
         if "*" in self.cors_origin_set and not self.api_keys:
             raise ValueError("LALALOC_CORS_ORIGINS=* needs LALALOC_API_KEYS=on: any page could change all plans")
+        return self
+
+    @model_validator(mode="after")
+    def _tokens_need_keys_and_audience(self) -> Self:
+        if self.oidc_issuer and not self.api_keys:
+            raise ValueError("LALALOC_OIDC_ISSUER needs LALALOC_API_KEYS=on: all requests are accepted without")
+        if bool(self.oidc_issuer) != bool(self.oidc_audience):
+            raise ValueError("LALALOC_OIDC_ISSUER and LALALOC_OIDC_AUDIENCE need each other: set both or none")
         return self
 
     @property
@@ -332,6 +357,19 @@ class StorageSettings(SettingGroup):
     )
     max_sessions: Count = Field(
         default=1000, description="Sessions of tracked cameras per tenant; further ones get 507."
+    )
+    audit_keep_s: float = Field(
+        default=365 * 86400.0,
+        ge=86400.0,
+        le=3660 * 86400.0,
+        description="Lifetime of entries of the audit log.",
+    )
+    max_audit_entries: int = Field(
+        default=10**6,
+        ge=1000,
+        le=10**8,
+        description="Entries of the audit log, about 600 bytes each; the oldest are deleted first. A tenth is for "
+        "requests of unknown callers.",
     )
 
 

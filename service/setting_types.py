@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from typing import Annotated
+from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
@@ -32,6 +34,31 @@ def _port_mapping(value: str) -> str:
     return value
 
 
+def secure_url(value: str) -> str:
+    """Return a URL if what it sends cannot be changed on the way: https, or http on a loopback address.
+
+    Raises:
+        ValueError: another URL.
+    """
+    try:
+        parts = urlsplit(value)
+        host, _port = parts.hostname or "", parts.port
+    except ValueError as error:
+        raise ValueError(f"not a URL: {error}") from error
+    if parts.scheme not in ("https", "http") or not host or parts.query or parts.fragment or parts.username:
+        raise ValueError("not a URL such as https://login.example/realms/acme, without query and user")
+    if parts.scheme == "http" and not _is_loopback(host):
+        raise ValueError("must begin with https://; http:// is for loopback addresses only")
+    return value
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 Count = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -40,3 +67,4 @@ Area = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 HostNames = Annotated[str, AfterValidator(_host_names)]
 Origins = Annotated[str, AfterValidator(_origins)]
 PortMapping = Annotated[str, AfterValidator(_port_mapping)]
+IssuerUrl = Annotated[str, AfterValidator(lambda value: value and secure_url(value))]

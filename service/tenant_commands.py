@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from service.command_parts import configured_store, tenant_name, text_table
+from service.command_parts import audit, configured_store, tenant_name, text_table
 from service.storage.records import OperatorLimits
 
 _DEFAULT = "default"
@@ -65,6 +65,7 @@ def _purge(arguments: argparse.Namespace) -> int:
     with configured_store() as store:
         count = store.purge_tenant(arguments.tenant)
         store.give_back()
+        audit(store, arguments.tenant, "tenants purge", arguments.tenant, floorplans=count)
     print(f"deleted {count} floor plans of tenant '{arguments.tenant}', and all else that it stored")
     return 0
 
@@ -79,6 +80,7 @@ def _limit(arguments: argparse.Namespace) -> int:
     given = {name: value for name, value in vars(arguments).items() if name not in ("run", "tenant")}
     with configured_store() as store:
         limits = store.tenants.change_limits(arguments.tenant, **given)
+        audit(store, arguments.tenant, "tenants limit", arguments.tenant, **given)
     for name, value in asdict(limits).items():
         print(f"{name}: {_text(value)}")
     return 0

@@ -13,11 +13,14 @@ from service.http.problems import add_problems
 from service.schemas import (
     EarthPoint,
     FloorPlanDocument,
+    KeyDocument,
     PlanEvent,
     PlanPoint,
     Problem,
+    RotationDocument,
     SessionDocument,
     StatedMotion,
+    TenantLimitsDocument,
     VenueChangeDocument,
     VenueDocument,
 )
@@ -36,13 +39,16 @@ _SERVERS = [
 _BY_HAND = (
     EarthPoint,
     FloorPlanDocument,
+    KeyDocument,
     OscpRequest,
     PlanEvent,
     PlanPoint,
     Problem,
+    RotationDocument,
     StatedIntrinsics,
     SessionDocument,
     StatedMotion,
+    TenantLimitsDocument,
     VenueDocument,
     VenueChangeDocument,
 )
@@ -86,8 +92,9 @@ def _describe_keys(document: dict[str, Any]) -> None:
             "type": "http",
             "scheme": "bearer",
             "bearerFormat": "lalaloc_<id>_<secret>",
-            "description": "API key, required if `LALALOC_API_KEYS=on`. Each operation names the scope that the key "
-            "needs: `read`, `localise` or `write`. A key sees the floor plans of its own tenant only.",
+            "description": "API key, or token of the OpenID Connect issuer; required if `LALALOC_API_KEYS=on`. Each "
+            "operation names the scope that it needs: `metrics`, `read`, `localise`, `write` or `admin`. Callers see "
+            "the floor plans of their own tenant only.",
         }
     }
     for path, operations in document["paths"].items():

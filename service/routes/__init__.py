@@ -5,6 +5,7 @@ Begin with `localise.py`, the query. `dependencies.py` has the dependencies and 
 """
 
 from service.routes import (
+    admin,
     floorplans,
     geopose,
     health,
@@ -42,6 +43,7 @@ ROUTERS = tuple(
         kept_answers,
         health,
         limits,
+        admin,
         pages,
     )
 )

@@ -15,11 +15,24 @@ sessions         sessions of tracked cameras
 oscp             queries of AR clients
 venues           groups of floor plans
 service_state    limits, health, readiness
+admin            API keys, limits of tenants, audit log
 problem_details  errors
 
 Begin with `localise_answer.py`.
 """
 
+from service.schemas.admin import (
+    AuditEntryAnswer,
+    AuditList,
+    KeyAnswer,
+    KeyDocument,
+    KeyList,
+    NewKeyAnswer,
+    RotationDocument,
+    TenantAnswer,
+    TenantLimitsDocument,
+    TenantList,
+)
 from service.schemas.fields import ResponseModel
 from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.localise_answer import (
@@ -96,6 +109,8 @@ from service.schemas.venues import (
 )
 
 __all__ = [
+    "AuditEntryAnswer",
+    "AuditList",
     "BatchLine",
     "BoundsAnswer",
     "BytesInFlightAnswer",
@@ -113,6 +128,9 @@ __all__ = [
     "HealthAnswer",
     "ImportForm",
     "ImportReport",
+    "KeyAnswer",
+    "KeyDocument",
+    "KeyList",
     "LayerAnswer",
     "LayoutAnswer",
     "LevelAnswer",
@@ -122,6 +140,7 @@ __all__ = [
     "LocaliseAnswer",
     "LocaliseForm",
     "ModelAnswer",
+    "NewKeyAnswer",
     "OpeningDocument",
     "OpeningFaceAnswer",
     "OpeningKind",
@@ -144,6 +163,7 @@ __all__ = [
     "RoomDocument",
     "RoomLayoutAnswer",
     "RoomType",
+    "RotationDocument",
     "Segment",
     "SequenceAnswer",
     "SequenceForm",
@@ -155,6 +175,9 @@ __all__ = [
     "StoredBytesAnswer",
     "StoredBytesByKind",
     "StoredPose",
+    "TenantAnswer",
+    "TenantLimitsDocument",
+    "TenantList",
     "TimingsAnswer",
     "TrackedPoseAnswer",
     "UsageAnswer",

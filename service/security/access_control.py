@@ -1,6 +1,8 @@
-"""Access checks of every request before its body is read: exposure, API key, rate limit, scope."""
+"""Access checks of every request before its body is read: exposure, API key or token, rate limit, scope."""
 
 from __future__ import annotations
+
+from datetime import UTC, datetime
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -10,6 +12,7 @@ from starlette.types import Scope
 from service.errors import (
     ExposedWithoutKeysError,
     InsufficientScopeError,
+    IssuerUnavailableError,
     RateLimitedError,
     StoreUnavailableError,
     TooManyRefusedKeysError,
@@ -17,12 +20,12 @@ from service.errors import (
 )
 from service.security.exposure import check_origin, is_local
 from service.security.key_cache import KeyCache
-from service.security.keys import parse_authorization
-from service.security.permissions import Caller, Permission, anyone, is_page, permissions_needed
+from service.security.keys import PresentedKey, parse_authorization, parse_token
+from service.security.oidc import TokenVerifier
+from service.security.permissions import Caller, Identity, Permission, anyone, is_page, permissions_needed
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
-from service.storage.records import ApiKey
 from service.telemetry import add_log_fields
 
 # Errors of `AuthorisationMiddleware`, besides 404 and 405.
@@ -33,9 +36,11 @@ REFUSALS = (
     RateLimitedError,
     TooManyRefusedKeysError,
     StoreUnavailableError,
+    IssuerUnavailableError,
 )
 _NO_KEY = "an API key is required: send `Authorization: Bearer lalaloc_...`"
 _MALFORMED = "the Authorization header must be `Bearer lalaloc_...`, with one API key"
+_TOKEN_TOO = ", or a token of the issuer"
 _REFUSED = "the API key is unknown or revoked"
 
 
@@ -51,6 +56,8 @@ class AccessControl:
         self._hosts = settings.access.allowed_host_names
         self._keys = KeyCache(keys, fresh_s=settings.access.key_cache_s)
         self._rates = RateLimits(settings)
+        self._tokens = TokenVerifier(settings.access) if settings.access.oidc_issuer else None
+        self._or_token = "" if self._tokens is None else _TOKEN_TOO
 
     def close(self) -> None:
         """Stop looking up keys."""
@@ -61,33 +68,34 @@ class AccessControl:
 
         Raises:
             ExposedWithoutKeysError: a remote request while keys are off.
-            UnauthenticatedError: no valid key.
+            UnauthenticatedError: no valid key or token.
             TooManyRefusedKeysError: too many invalid keys from the client.
-            RateLimitedError: the key exceeded its rate limit.
+            RateLimitedError: the caller exceeded its rate limit.
             StoreUnavailableError: the database is away, and the key is not cached.
-            InsufficientScopeError: the key lacks the scope.
+            IssuerUnavailableError: the issuer of tokens cannot be reached.
+            InsufficientScopeError: the key or token lacks the scope.
             HTTPException: unknown route or method.
         """
         if not self._needs_keys:
             self._check_local(request, request.method)
+            if Permission.ADMIN in permissions_needed(routed_path(request.scope)).values():
+                raise InsufficientScopeError(Permission.ADMIN, None)
             return anyone(_client_of(request))
         is_read = request.method in ("GET", "HEAD")
         if is_read and is_page(routed_path(request.scope)) and "authorization" not in request.headers:
             return anyone(_client_of(request))
-        key = await self._key_of(request)
-        add_log_fields(request, key=key.id, tenant=key.tenant)
-        await self._rates.count(key)
-        scopes = frozenset(scope for scope in Permission if scope in key.scopes)
-        caller = Caller(key.tenant, key, scopes, client=key.tenant)
+        identity = await self._identity_of(request)
+        add_log_fields(request, key=identity.id, tenant=identity.tenant)
+        await self._rates.count(identity)
         needed = _needed(request)
-        if needed not in caller.permissions:
-            raise InsufficientScopeError(needed, caller.permissions)
-        return caller
+        if needed not in identity.permissions:
+            raise InsufficientScopeError(needed, identity.permissions)
+        return Caller(identity.tenant, identity, identity.permissions, client=identity.tenant)
 
     async def charge(self, caller: Caller, sent_bytes: int) -> None:
         """Count the bytes of an answer to a read against the rate limit of its caller's key."""
-        if caller.key is not None:
-            await self._rates.charge(caller.key, sent_bytes)
+        if caller.identity is not None:
+            await self._rates.charge(caller.identity, sent_bytes)
 
     async def count_photographs(self, caller: Caller, photographs: int) -> None:
         """Count each photograph of a request against the rate limit of its caller's key.
@@ -95,17 +103,20 @@ class AccessControl:
         Raises:
             RateLimitedError, InvalidRequestError: see `RateLimits.count_photographs`.
         """
-        if caller.key is not None:
-            await self._rates.count_photographs(caller.key, photographs)
+        if caller.identity is not None:
+            await self._rates.count_photographs(caller.identity, photographs)
 
     async def still_authorised(self, request: Request) -> bool:
-        """Return True while the key of an accepted request is valid, or keys are off."""
-        presented = parse_authorization(Headers(scope=request.scope).getlist("authorization"))
-        if not self._needs_keys or presented is None:
+        """Return True while the key or token of an accepted request is valid, or keys are off."""
+        values = Headers(scope=request.scope).getlist("authorization")
+        presented, token = parse_authorization(values), parse_token(values)
+        if not self._needs_keys or (presented is None and token is None):
             return not self._needs_keys
         try:
-            return await self._keys.find(presented) is not None
-        except StoreUnavailableError:
+            if presented is not None:
+                return await self._holder_of_key(request, presented) is not None
+            return self._tokens is not None and token is not None and await self._tokens.verify(token) is not None
+        except (StoreUnavailableError, IssuerUnavailableError, UnauthenticatedError):
             return False
 
     def check_handshake(self, request: Request) -> None:
@@ -134,23 +145,41 @@ class AccessControl:
             headers = Headers(scope=request.scope)
             check_origin(method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
 
-    async def _key_of(self, request: Request) -> ApiKey:
+    async def _identity_of(self, request: Request) -> Identity:
         values = Headers(scope=request.scope).getlist("authorization")
         if not values:
-            raise UnauthenticatedError(_NO_KEY)
+            raise UnauthenticatedError(_NO_KEY + self._or_token)
         client = _client_of(request)
         presented = parse_authorization(values)
-        if presented is None:
+        try:
+            if presented is not None:
+                # Clients can share an address, so valid keys are not affected by invalid ones.
+                if not self._keys.remembers(presented):
+                    await self._rates.check_refused(client)
+                identity = await self._holder_of_key(request, presented)
+                if identity is None:
+                    raise UnauthenticatedError(_REFUSED)
+                return identity
+            token = parse_token(values)
+            if self._tokens is None or token is None:
+                raise UnauthenticatedError(_MALFORMED + self._or_token)
+            return await self._tokens.verify(token)
+        except UnauthenticatedError:
             await self._rates.count_refused(client)
-            raise UnauthenticatedError(_MALFORMED)
-        # Clients can share an address, so valid keys are not affected by invalid ones.
-        if not self._keys.remembers(presented):
-            await self._rates.check_refused(client)
+            raise
+
+    async def _holder_of_key(self, request: Request, presented: PresentedKey) -> Identity | None:
+        """Return the holder of a key; None if it is unknown or revoked.
+
+        Raises:
+            UnauthenticatedError: the key has expired; only the holder of its secret is told so.
+            StoreUnavailableError: the database is away, and the key is not cached.
+        """
         key = await self._keys.find(presented)
-        if key is None:
-            await self._rates.count_refused(client)
-            raise UnauthenticatedError(_REFUSED)
-        return key
+        if key is not None and key.is_expired(datetime.now(UTC)):
+            add_log_fields(request, key=key.id, tenant=key.tenant)
+            raise UnauthenticatedError(f"the API key expired at {key.expires_at:%Y-%m-%dT%H:%M:%SZ}; use its successor")
+        return None if key is None else Identity.of_key(key)
 
 
 def _client_of(request: Request) -> str:

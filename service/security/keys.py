@@ -14,6 +14,8 @@ from dataclasses import dataclass
 _SECRET_BYTES = 32
 _KEY = re.compile(r"lalaloc_([0-9a-f]{32})_([A-Za-z0-9_-]{43})")
 _BEARER = re.compile(r"bearer +(\S+)", re.IGNORECASE)
+# Signed JSON Web Token, of at most 8 KiB.
+_TOKEN = re.compile(r"(?=.{1,8192}\Z)[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True)
@@ -49,3 +51,9 @@ def parse_authorization(values: Sequence[str]) -> PresentedKey | None:
     bearer = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
     key = _KEY.fullmatch(bearer[1]) if bearer else None
     return None if key is None else PresentedKey(key[1], hash_of(key[2]))
+
+
+def parse_token(values: Sequence[str]) -> str | None:
+    """Parse `Authorization` headers; None unless there is exactly one, with a token in the form of a signed JWT."""
+    bearer = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
+    return bearer[1] if bearer is not None and _TOKEN.fullmatch(bearer[1]) else None

@@ -6,6 +6,7 @@ import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 from starlette.routing import compile_path
 from starlette.types import Scope
@@ -18,11 +19,16 @@ _IPV6_NETWORK_BITS = 64
 
 
 class Permission(StrEnum):
-    """Scope of a key; no scope includes another."""
+    """Scope of a key or token; no scope includes another.
 
+    All but `admin` are about the caller's tenant; `metrics` shows numbers of all tenants.
+    """
+
+    METRICS = "metrics"
     READ = "read"
     LOCALISE = "localise"
     WRITE = "write"
+    ADMIN = "admin"
 
 
 # Open to everyone, so that monitoring needs no key.
@@ -33,7 +39,7 @@ PAGES = frozenset({"/", "/docs", "/web/{name}", "/favicon.ico"})
 # Scopes of all other routes. With keys on, a route without a row does not exist.
 NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/openapi.json"): Permission.READ,
-    ("GET", "/metrics"): Permission.READ,
+    ("GET", "/metrics"): Permission.METRICS,
     ("GET", "/limits"): Permission.READ,
     ("GET", "/usage"): Permission.READ,
     ("GET", "/floorplans"): Permission.READ,
@@ -67,9 +73,40 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/sessions/{session_id}"): Permission.LOCALISE,
     ("DELETE", "/sessions/{session_id}"): Permission.LOCALISE,
     ("POST", "/sessions/{session_id}/photographs"): Permission.LOCALISE,
+    ("GET", "/admin/keys"): Permission.ADMIN,
+    ("POST", "/admin/keys"): Permission.ADMIN,
+    ("GET", "/admin/keys/{key_id}"): Permission.ADMIN,
+    ("DELETE", "/admin/keys/{key_id}"): Permission.ADMIN,
+    ("POST", "/admin/keys/{key_id}/rotation"): Permission.ADMIN,
+    ("GET", "/admin/tenants"): Permission.ADMIN,
+    ("PATCH", "/admin/tenants/{tenant}"): Permission.ADMIN,
+    ("GET", "/admin/audit"): Permission.ADMIN,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
 _PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Holder of a valid key or token.
+
+    Attributes:
+        id: id of the key, or `oidc:` and the subject of the token.
+        tenant: tenant of the holder.
+        permissions: scopes.
+        rate_per_minute: limit of requests per minute; 0 for none, None for the limit in the settings.
+    """
+
+    id: str
+    tenant: str
+    permissions: frozenset[Permission]
+    rate_per_minute: int | None = None
+
+    @classmethod
+    def of_key(cls, key: ApiKey) -> Self:
+        """Return the identity of a key's holder; scopes of other versions of the service are ignored."""
+        scopes = frozenset(scope for scope in Permission if scope in key.scopes)
+        return cls(key.id, key.tenant, scopes, key.rate_per_minute)
 
 
 @dataclass(frozen=True)
@@ -78,29 +115,37 @@ class Caller:
 
     Attributes:
         tenant: tenant whose plans are visible.
-        key: the API key; None while keys are off.
-        permissions: scopes of the key.
+        identity: holder of the key or token; None while keys are off.
+        permissions: scopes of the key or token.
         client: unit of fair sharing: the tenant, or without keys the client address.
     """
 
     tenant: str
-    key: ApiKey | None
+    identity: Identity | None
     permissions: frozenset[Permission]
     client: str
 
 
 def anyone(client: str) -> Caller:
-    """Return the caller of a request while keys are off."""
-    return Caller(DEFAULT_TENANT, None, frozenset(Permission), network_of(client))
+    """Return the caller of a request while keys are off.
+
+    Such a caller is no administrator: a key that is created while keys are off would outlast this state.
+    """
+    return Caller(DEFAULT_TENANT, None, frozenset(Permission) - {Permission.ADMIN}, network_of(client))
+
+
+def template_of(path: str) -> str | None:
+    """Return the route's template of a path; None for an unknown path."""
+    # The framework redirects from a path with a slash at its end.
+    plain = path.rstrip("/") or "/"
+    return next((template for template, pattern in _PATTERNS.items() if pattern.match(plain)), None)
 
 
 def permissions_needed(path: str) -> dict[str, Permission]:
     """Return the methods of a path with their scopes; empty for an unknown path."""
     if is_page(path):
         return {"GET": Permission.READ}
-    # The framework redirects from a path with a slash at its end.
-    plain = path.rstrip("/") or "/"
-    template = next((template for template, pattern in _PATTERNS.items() if pattern.match(plain)), None)
+    template = template_of(path)
     return {method: needed for (method, row), needed in NEEDED.items() if row == template}
 
 

@@ -1,4 +1,4 @@
-"""Rate limits: requests per key, and invalid keys per client address; counted in memory per replica."""
+"""Rate limits: requests per key or token's subject, and invalid ones per client address; in memory per replica."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
 
 from service.errors import InvalidRequestError, RateLimitedError, TooManyRefusedKeysError
-from service.security.permissions import network_of
+from service.security.permissions import Identity, network_of
 from service.settings import Settings
-from service.storage.records import ApiKey
 
 # Client addresses share a fixed number of counters, which bounds memory. A collision only affects addresses that send
 # invalid keys.
@@ -32,38 +31,38 @@ class RateLimits:
         self._burst = settings.access.rate_burst
         self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
 
-    async def count(self, key: ApiKey) -> None:
-        """Count a request of a key.
+    async def count(self, caller: Identity) -> None:
+        """Count a request.
 
         Raises:
             RateLimitedError: the limit is exceeded.
         """
         if self._burst:
-            await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), key.id, "second")
-        if (limit := self._limit_of(key)) is not None:
-            await self._count(limit, key.id, "minute")
+            await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), caller.id, "second")
+        if (limit := self._limit_of(caller)) is not None:
+            await self._count(limit, caller.id, "minute")
 
-    async def count_photographs(self, key: ApiKey, photographs: int) -> None:
+    async def count_photographs(self, caller: Identity, photographs: int) -> None:
         """Count each photograph of a request, which was counted once, as a request; all of them or none.
 
         Raises:
             RateLimitedError: they exceed the limit per minute now.
             InvalidRequestError: they always exceed it.
         """
-        limit = self._limit_of(key)
+        limit = self._limit_of(caller)
         if limit is None or photographs <= 1:
             return
         if photographs > limit.amount:
-            fault = f"is given {photographs} times; the rate limit of the key is {limit.amount} per minute: send fewer"
+            fault = f"is given {photographs} times; the rate limit is {limit.amount} per minute: send fewer"
             raise InvalidRequestError([("photo", fault)])
-        await self._count(limit, key.id, "minute", cost=photographs - 1)
+        await self._count(limit, caller.id, "minute", cost=photographs - 1)
 
-    async def charge(self, key: ApiKey, sent_bytes: int) -> None:
+    async def charge(self, caller: Identity, sent_bytes: int) -> None:
         """Count an answer as one more request per `BYTES_PER_REQUEST`, up to the limit."""
-        more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(key)
+        more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(caller)
         if more and limit is not None:
-            _, left = await self._limiter.get_window_stats(limit, key.id)
-            await self._limiter.hit(limit, key.id, cost=min(more, left))
+            _, left = await self._limiter.get_window_stats(limit, caller.id)
+            await self._limiter.hit(limit, caller.id, cost=min(more, left))
 
     async def count_refused(self, client: str) -> None:
         """Count an invalid key of a client address.
@@ -83,8 +82,8 @@ class RateLimits:
         if not await self._limiter.test(self._refused, _counter_of(client)):
             raise await self._too_many_refused(client)
 
-    def _limit_of(self, key: ApiKey) -> RateLimitItem | None:
-        per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
+    def _limit_of(self, caller: Identity) -> RateLimitItem | None:
+        per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
         return RateLimitItemPerMinute(per_minute, namespace="rate") if per_minute else None
 
     async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Collection
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Row, select, update
+from sqlalchemy import Row, or_, select, update
 
 from service.storage.database import Database
-from service.storage.records import ApiKey
+from service.storage.records import ApiKey, Cursor
+from service.storage.statements import newest_first
 from service.storage.tables import API_KEYS
 
 
@@ -21,9 +22,17 @@ class ApiKeys:
         self._database = database
 
     def create(
-        self, tenant: str, name: str, key_hash: str, scopes: Collection[str], *, rate_per_minute: int | None = None
+        self,
+        tenant: str,
+        name: str,
+        key_hash: str,
+        scopes: Collection[str],
+        *,
+        rate_per_minute: int | None = None,
+        lifetime: timedelta | None = None,
     ) -> ApiKey:
-        """Store a new key by the hash of its secret."""
+        """Store a new key by the hash of its secret; without a lifetime it has no end."""
+        now = datetime.now(UTC)
         values = {
             "id": uuid.uuid4().hex,
             "tenant": tenant,
@@ -31,9 +40,37 @@ class ApiKeys:
             "hash": key_hash,
             "scopes": " ".join(sorted(set(scopes))),
             "rate_per_minute": rate_per_minute,
-            "created_at": datetime.now(UTC),
+            "created_at": now,
+            "expires_at": None if lifetime is None else now + lifetime,
+            "lifetime_s": None if lifetime is None else lifetime.total_seconds(),
         }
         with self._database.writing() as connection:
+            return _key(connection.execute(API_KEYS.insert().values(**values).returning(API_KEYS)).one())
+
+    def rotate(self, key_id: str, key_hash: str, *, overlap: timedelta) -> ApiKey | None:
+        """Store a successor with the same tenant, name, scopes, rate and lifetime.
+
+        Args:
+            key_id: id of the key that is replaced; it expires after the overlap, unless it does so before.
+            key_hash: hash of the successor's secret.
+            overlap: time for which both keys are valid.
+
+        Returns:
+            the successor; None if the key does not exist, was revoked or has expired.
+        """
+        now = datetime.now(UTC)
+        alive = or_(API_KEYS.c.expires_at.is_(None), API_KEYS.c.expires_at > now)
+        wanted = select(API_KEYS).where(API_KEYS.c.id == key_id, API_KEYS.c.revoked_at.is_(None), alive)
+        with self._database.writing() as connection:
+            row = connection.execute(wanted.with_for_update()).one_or_none()
+            if row is None:
+                return None
+            end = now + overlap if row.expires_at is None else min(now + overlap, row.expires_at)
+            connection.execute(update(API_KEYS).where(API_KEYS.c.id == key_id).values(expires_at=end))
+            values = {name: getattr(row, name) for name in ("tenant", "name", "scopes", "rate_per_minute")}
+            values |= {"id": uuid.uuid4().hex, "hash": key_hash, "created_at": now, "replaces": key_id}
+            if row.lifetime_s is not None:
+                values |= {"lifetime_s": row.lifetime_s, "expires_at": now + timedelta(seconds=row.lifetime_s)}
             return _key(connection.execute(API_KEYS.insert().values(**values).returning(API_KEYS)).one())
 
     def list_keys(self, tenant: str | None = None) -> list[ApiKey]:
@@ -44,14 +81,29 @@ class ApiKeys:
         with self._database.reading() as connection:
             return [_key(row) for row in connection.execute(query)]
 
-    def revoke(self, key_id: str) -> bool:
-        """Revoke a key for good; False if it does not exist or was revoked before."""
+    def page(self, *, limit: int, after: Cursor | None, tenant: str | None) -> list[ApiKey]:
+        """Return a page of the keys, newest first; arguments as of `newest_first`."""
+        query = select(API_KEYS) if tenant is None else select(API_KEYS).where(API_KEYS.c.tenant == tenant)
+        with self._database.reading() as connection:
+            rows = connection.execute(newest_first(query, API_KEYS, limit=limit, after=after))
+            return [_key(row) for row in rows]
+
+    def revoke(self, key_id: str) -> ApiKey | None:
+        """Revoke a key for good; None if it does not exist or was revoked before."""
         statement = update(API_KEYS).where(API_KEYS.c.id == key_id, API_KEYS.c.revoked_at.is_(None))
         with self._database.writing() as connection:
-            return connection.execute(statement.values(revoked_at=datetime.now(UTC))).rowcount == 1
+            revoked = statement.values(revoked_at=datetime.now(UTC)).returning(API_KEYS)
+            row = connection.execute(revoked).one_or_none()
+        return None if row is None else _key(row)
+
+    def get(self, key_id: str) -> ApiKey | None:
+        """Return a key in any state; None if it does not exist."""
+        with self._database.reading() as connection:
+            row = connection.execute(select(API_KEYS).where(API_KEYS.c.id == key_id)).one_or_none()
+        return None if row is None else _key(row)
 
     def find(self, key_hash: str) -> ApiKey | None:
-        """Return the key with this hash, unless it was revoked."""
+        """Return the key with this hash, unless it was revoked; callers check its end."""
         query = select(API_KEYS).where(API_KEYS.c.hash == key_hash, API_KEYS.c.revoked_at.is_(None))
         with self._database.reading() as connection:
             row = connection.execute(query).one_or_none()
@@ -74,4 +126,6 @@ def _key(row: Row[Any]) -> ApiKey:
         created_at=row.created_at,
         revoked_at=row.revoked_at,
         last_used_at=row.last_used_at,
+        expires_at=row.expires_at,
+        replaces=row.replaces,
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
@@ -180,7 +180,7 @@ class VenuePlace:
 
 @dataclass(frozen=True)
 class Cursor:
-    """Position in a listing, after this plan or venue."""
+    """Position in a listing, after this row."""
 
     created_at: datetime
     id: str
@@ -199,6 +199,8 @@ class ApiKey:
         created_at: time of creation.
         revoked_at: time of revocation.
         last_used_at: approximate time of the last request.
+        expires_at: time from which the key is rejected; None for a key without an end.
+        replaces: id of the key that this one replaces.
     """
 
     id: str
@@ -209,6 +211,56 @@ class ApiKey:
     created_at: datetime
     revoked_at: datetime | None
     last_used_at: datetime | None
+    expires_at: datetime | None = None
+    replaces: str | None = None
+
+    def is_expired(self, now: datetime) -> bool:
+        """Return True from the key's end on."""
+        return self.expires_at is not None and now >= self.expires_at
+
+
+# Actor of requests without a valid key or token.
+ANONYMOUS = "anonymous"
+# Result of an action that was carried out.
+DONE = "done"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditEntry:
+    """Action of a caller or of an operator, or several equal ones within a minute.
+
+    Attributes:
+        actor: id of the key, `oidc:` and the subject of a token, `cli:` and the user of the command line, `anonymous`.
+        tenant: tenant of the actor, or the tenant that an operator changed; empty for unknown callers.
+        address: address of the client; empty on the command line.
+        action: method and route, or the command.
+        resource: path of the resource, or its id.
+        status: HTTP status; None on the command line.
+        result: `done`, or the kind of the problem.
+        count: number of equal actions; above 1 for those that are counted per minute.
+        request_id: id of the request.
+        detail: further facts, without secrets.
+        created_at: time of the first of the actions.
+    """
+
+    actor: str
+    tenant: str
+    action: str
+    resource: str
+    address: str = ""
+    status: int | None = None
+    result: str = DONE
+    count: int = 1
+    request_id: str | None = None
+    detail: str | None = None
+    created_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredAuditEntry(AuditEntry):
+    """Entry with its id."""
+
+    id: str
 
 
 @dataclass(frozen=True, kw_only=True)

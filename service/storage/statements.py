@@ -19,8 +19,8 @@ CHUNK_BYTES = 2**20
 Query = TypeVar("Query", bound=Select[Any])
 
 
-def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None, name: str | None) -> Query:
-    """Return a page of a query about a table with `id`, `created_at` and `folded_name`.
+def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None, name: str | None = None) -> Query:
+    """Return a page of a query about a table with `id` and `created_at`, and for searches `folded_name`.
 
     Args:
         query: the query.

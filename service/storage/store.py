@@ -18,6 +18,7 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from lalaloc_core.errors import ConfigError
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
+from service.storage.audit_log import AuditLog
 from service.storage.database import Database
 from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.kept_answers import KeptAnswers
@@ -57,6 +58,7 @@ class Store:
         leases: leases on the computation of grids.
         idempotency_keys: answers by idempotency key.
         keys: API keys.
+        audit_log: actions of callers and operators.
         answers: kept answers.
         sessions: sessions of tracked cameras.
         quota: stored bytes of tenants.
@@ -74,6 +76,8 @@ class Store:
         plan_cache_bytes: int = 64 * 2**20,
         stored_bytes: int = _STORED_BYTES,
         idempotency_bytes: int = 64 * 2**20,
+        audit_keep_s: float = 365 * 86400.0,
+        max_audit_entries: int = 10**6,
     ) -> None:
         """Connect, and migrate the schema.
 
@@ -85,6 +89,8 @@ class Store:
             plan_cache_bytes: approximate memory limit of parsed plans; 0 caches none.
             stored_bytes: limit of the stored bytes of a tenant without a limit of its own.
             idempotency_bytes: limit of the bytes of a tenant's idempotency keys and their answers.
+            audit_keep_s: time (s) after which entries of the audit log are deleted.
+            max_audit_entries: limit of the entries of the audit log.
 
         Raises:
             ConfigError: the URL is invalid, or the database cannot be opened.
@@ -105,6 +111,7 @@ class Store:
         self.leases = GridLeases(database)
         self.idempotency_keys = IdempotencyKeys(database, self.quota, claim_s, max_bytes=idempotency_bytes)
         self.keys = ApiKeys(database)
+        self.audit_log = AuditLog(database, keep_s=audit_keep_s, max_entries=max_audit_entries)
         self.answers = KeptAnswers(database, self.quota)
         self.sessions = Sessions(database, self.quota, claim_s)
         self.tenants = Tenants(database)
@@ -165,6 +172,8 @@ def open_store(settings: Settings) -> Store:
         plan_cache_bytes=settings.storage.plan_cache_bytes,
         stored_bytes=settings.storage.max_stored_bytes or _default_stored_bytes(settings),
         idempotency_bytes=settings.storage.max_idempotency_bytes,
+        audit_keep_s=settings.storage.audit_keep_s,
+        max_audit_entries=settings.storage.max_audit_entries,
     )
 
 

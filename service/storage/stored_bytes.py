@@ -99,10 +99,11 @@ class StorageQuota:
         with self._database.reading() as connection:
             return self._find(connection, tenant)
 
-    def accounts(self) -> dict[str, Account]:
-        """Return the stored bytes of all tenants that stored anything or have limits."""
+    def accounts(self, *, after: str = "", limit: int | None = None) -> dict[str, Account]:
+        """Return the stored bytes of the tenants that stored anything or have limits, by name from `after` on."""
+        query = select(TENANTS).where(TENANTS.c.tenant > after).order_by(TENANTS.c.tenant).limit(limit)
         with self._database.reading() as connection:
-            return {row.tenant: self._account(row) for row in connection.execute(select(TENANTS))}
+            return {row.tenant: self._account(row) for row in connection.execute(query)}
 
     def check(self, connection: Connection, tenant: str, growth: int) -> None:
         """Check early that a write fits, before it writes much; only `settle` is exact.

@@ -212,6 +212,35 @@ API_KEYS = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("revoked_at", UtcDateTime),
     Column("last_used_at", UtcDateTime),
+    # NULL for a key without an end.
+    Column("expires_at", UtcDateTime),
+    # Lifetime that a successor inherits; rotation shortens `expires_at`.
+    Column("lifetime_s", Double),
+    # Id of the key that this one replaces.
+    Column("replaces", String(32)),
+    Index("api_keys_by_age", "created_at", "id"),
+)
+
+# Append-only: a trigger refuses updates. No foreign keys, because entries outlive the rows that they are about.
+AUDIT_LOG = Table(
+    "audit_log",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("actor", String(300), nullable=False),
+    # Tenant of the actor, or for operators the tenant that they changed; empty for unknown callers.
+    Column("tenant", String(64), nullable=False),
+    Column("address", String(64), nullable=False),
+    Column("action", String(100), nullable=False),
+    Column("resource", String(300), nullable=False),
+    Column("status", Integer),
+    Column("result", String(64), nullable=False),
+    Column("count", Integer, nullable=False),
+    Column("request_id", String(64)),
+    Column("detail", Text),
+    Index("audit_log_by_age", "created_at", "id"),
+    Index("audit_log_by_tenant", "tenant", "created_at", "id"),
+    Index("audit_log_by_actor", "actor", "created_at", "id"),
 )
 
 KEPT_ANSWERS = Table(

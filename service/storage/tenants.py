@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from sqlalchemy import Row, or_, select
@@ -25,9 +26,11 @@ class Tenants:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def limits(self) -> dict[str, OperatorLimits]:
-        """Return the limits of the tenants that have any."""
+    def limits(self, among: Collection[str] | None = None) -> dict[str, OperatorLimits]:
+        """Return the limits of the tenants that have any, of all tenants or of some."""
         query = select(TENANTS).where(or_(*(column.is_not(None) for column in _LIMITS.values())))
+        if among is not None:
+            query = query.where(TENANTS.c.tenant.in_(among))
         with self._database.reading() as connection:
             return {row.tenant: _limits(row) for row in connection.execute(query)}
 

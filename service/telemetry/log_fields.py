@@ -30,8 +30,8 @@ class RequestLogFields:
         stage: last stage of the query.
         clock: durations of the stages, also of a request that failed.
         rejection: slug of the problem that the request was refused with.
-        key: id of the API key; never the key itself.
-        tenant: tenant of the key.
+        key: id of the API key, or subject of the token; never the key itself.
+        tenant: tenant of the key or token.
         bytes_in: received bytes of the body.
         gave_up: the client disconnected before the end of the answer.
     """
@@ -72,7 +72,7 @@ def add_log_fields(
     tenant: str | None = None,
 ) -> None:
     """Set fields of a request; omitted fields keep their value. Never pass secrets."""
-    log_fields = _log_fields_of(request.scope)
+    log_fields = log_fields_of(request.scope)
     if log_fields is None:
         return
     fields = {
@@ -92,9 +92,10 @@ def add_log_fields(
 
 def request_id_of(scope: Mapping[str, Any]) -> str | None:
     """Return the id of the request with this scope."""
-    log_fields = _log_fields_of(scope)
+    log_fields = log_fields_of(scope)
     return None if log_fields is None else log_fields.request_id
 
 
-def _log_fields_of(scope: Mapping[str, Any]) -> RequestLogFields | None:
+def log_fields_of(scope: Mapping[str, Any]) -> RequestLogFields | None:
+    """Return the fields of the request with this scope; None outside of the service's middleware."""
     return scope.get(_SCOPE_KEY)

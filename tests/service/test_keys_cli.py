@@ -69,7 +69,8 @@ def test_list_shows_all_key_fields(data_dir: Path, capsys: pytest.CaptureFixture
     assert [row["revoked_at"] is None for row in rows] == [False, True]
     assert main(["keys", "list", "--tenant", "other"]) == 0
     table = capsys.readouterr().out.splitlines()
-    assert table[0].split() == ["ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST", "USED", "REVOKED"]
+    head = ["ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST", "USED", "EXPIRES", "REVOKED"]
+    assert table[0].split() == head
     assert len(table) == 2
     assert table[1].split()[:5] == [rows[1]["id"], "other", "x", "read", "-"]
 
@@ -86,7 +87,7 @@ def test_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str])
     ("options", "message"),
     [
         ([], "--scope"),
-        (["--scope", "admin"], "admin"),
+        (["--scope", "root"], "root"),
         (["--scope", "read", "--tenant", "../x"], "--tenant"),
         (["--scope", "read", "--tenant", "x" * 65], "1 to 64"),
         (["--scope", "read", "--name", ""], "--name"),

@@ -129,6 +129,14 @@ class Guarded:
             body = {"files": {"photo": picture}} if method == "POST" else {}
         elif path == "/sessions":
             body = {"json": {PLAN: plan_id}}
+        elif path.startswith("/admin"):
+            new_key = {"tenant": "new", "name": "new", "scopes": ["read"]}
+            if "{key_id}" in path:
+                made = self.client.post("/admin/keys", json=new_key, headers=bearer(self.key)).json()
+                path = path.replace("{key_id}", made["id"])
+            path = path.replace("{tenant}", "new")
+            content = {"/admin/keys": new_key, "/admin/tenants/new": {"cpu_share": 2.0}}.get(path, {})
+            body = {"json": content} if method in ("POST", "PATCH") else {}
         elif path in ("/localise", "/localise/batch"):
             body = form
         elif path == "/geopose":

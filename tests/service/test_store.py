@@ -795,11 +795,18 @@ CREATE TABLE {grids} (
 _OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
 _OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
 _OF_BYTES = tuple((name, "stored_bytes") for name in ("revisions", "latent_grids", "kept_answers", "idempotency"))
+_OF_KEYS = ("expires_at", "lifetime_s", "replaces")
 _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude"))
 
 
 def _undo_tenants(connection: Connection) -> None:
-    """Undo the migrations 0007 to 0009."""
+    """Undo the migrations 0007 to 0011."""
+    connection.exec_driver_sql("DROP TABLE audit_log")
+    if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql("DROP FUNCTION audit_log_refuse_update")
+    connection.exec_driver_sql("DROP INDEX api_keys_by_age")
+    for column in _OF_KEYS:
+        connection.exec_driver_sql(f"ALTER TABLE api_keys DROP COLUMN {column}")
     connection.exec_driver_sql("DROP TABLE sessions")
     connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
     connection.exec_driver_sql("DROP TABLE tenants")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,7 +24,10 @@ import service
 from benchmarks.harness import Caller
 from benchmarks.heaviest import LOADS, Load, Stored, building, missing_routes, store_venue
 from service.conversion import converter, files, rendition_cache
+from service.storage.records import AuditEntry
+from service.storage.store import Store
 from tests.service.conftest import StartApp, upload, wait_for
+from tests.service.test_security import bearer, make_key
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("TEST_DATABASE", "sqlite") != "sqlite", reason="counts steps of SQLite in this process"
@@ -98,14 +101,32 @@ def client(
         # Worker processes, which are not counted, read large plans and make their files.
         for module, name in ((rendition_cache, "_SMALL"), (converter, "LARGE"), (files, "LARGE")):
             patch.setattr(module, name, 10**9)
-        with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle, **unlimited, **quiet) as started:
+        data_dir = tmp_path_factory.mktemp("data")
+        with start_app(data_dir, bundle=tiny_view_bundle, api_keys=True, **unlimited, **quiet) as started:
+            started.headers.update(bearer(_fill_pages(Store(f"sqlite:///{data_dir / 'lalaloc.sqlite3'}"))))
             yield started
+
+
+def _fill_pages(store: Store) -> str:
+    """Store keys, tenants and entries of the audit log for whole pages, and return a key with all scopes."""
+    for number in range(_SIZES[-1]):
+        make_key(store)
+        store.tenants.change_limits(f"t{number}", cpu_share=1.0)
+    entry = AuditEntry(actor="a", tenant="t", action="keys create", resource="x", detail='{"name": "x"}')
+    store.audit_log.add([entry] * _SIZES[-1])
+    key = make_key(store)
+    store.close()
+    return key
+
+
+def _caller(client: httpx.Client, count: Callable[[int], None] = lambda _status: None) -> Caller:
+    return Caller(str(client.base_url), client.headers["authorization"].removeprefix("Bearer "), count)
 
 
 @pytest.fixture(scope="module")
 def stored(client: httpx.Client) -> dict[int, Stored]:
     """Return a plan and a venue by the number of their rooms and homes."""
-    caller, resources = Caller(str(client.base_url)), {}
+    caller, resources = _caller(client), {}
     for size in _SIZES:
         plan_id = upload(client, building(size, openings_per_room=2))
         etag = client.get(f"/floorplans/{plan_id}").headers["etag"]
@@ -123,7 +144,7 @@ def test_every_route_has_a_load() -> None:
 )
 def test_work_grows_linearly(client: httpx.Client, counter: Counter, stored: dict[int, Stored], load: Load) -> None:
     statuses: list[int] = []
-    caller = Caller(str(client.base_url), count=statuses.append)
+    caller = _caller(client, statuses.append)
     operations = []
     for size in _SIZES:
         # Pose grids of earlier requests are ready.
