@@ -121,7 +121,8 @@ class Device {
       worker.onerror = (event) => stop(new Error(`the features could not be computed: ${event.message || "the worker did not start"}`));
       worker.onmessage = ({ data }: MessageEvent<Result>) => {
         if (data.kind === "done") done(data.features);
-        else if (data.kind === "failed") stop(data.isInput ? new InputError(data.message) : new Error(data.message));
+        else if (data.kind === "failed" && data.isInput) fail(new InputError(data.message));
+        else if (data.kind === "failed") stop(new Error(data.message));
         else {
           this.describe(LOADING);
           api.modelFile(data.name).then((content) => {

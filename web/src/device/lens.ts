@@ -14,7 +14,8 @@ export type Stated = Readonly<Partial<Record<"projection" | "hfov_deg" | "pitch_
 export interface Lens {
   projection: "equirectangular" | "perspective" | "cylindrical";
   projectionSource: Source;
-  hfov: number;
+  /** Null if it is to be estimated. */
+  hfov: number | null;
   hfovSource: Source;
   /** Relative standard deviation of the focal length. */
   focalSd: number;
@@ -35,7 +36,7 @@ export function findLens(size: Size, stated: Stated, metadata: Metadata, isSpher
   const exif = readLens(metadata, size), twiceAsWide = Math.abs(size.width / size.height - 2) <= SPHERE_TOLERANCE;
   const hfovDeg = stated.hfov_deg === undefined ? null : Number(stated.hfov_deg);
   const [projection, projectionSource] = projectionOf(size, stated, hfovDeg, metadata, exif, twiceAsWide && isSphere);
-  const lens = (hfov: number, hfovSource: Source, focalSd: number, warnings: string[] = []): Lens =>
+  const lens = (hfov: number | null, hfovSource: Source, focalSd: number, warnings: string[] = []): Lens =>
     ({ projection, projectionSource, hfov, hfovSource, focalSd, warnings });
   if (projection === "equirectangular") {
     if ((hfovDeg !== null && hfovDeg !== 360) || isPart(metadata)) {
@@ -57,10 +58,7 @@ export function findLens(size: Size, stated: Stated, metadata: Metadata, isSpher
     return lens(angle, "gpano", GIVEN_SD);
   }
   const hfov = exif.focal === null ? null : 2 * Math.atan((0.5 * size.width) / exif.focal);
-  if (hfov === null || hfov < radians(HFOV_DEG.perspective[0]) || hfov > radians(HFOV_DEG.perspective[1])) {
-    throw new InputError("The file does not state its focal length (35 mm equivalent), and the browser does not estimate it. " +
-      "Enter the “Field of view” (a phone’s main lens has about 67° in landscape and 53° in portrait format).");
-  }
+  if (hfov === null || hfov < radians(HFOV_DEG.perspective[0]) || hfov > radians(HFOV_DEG.perspective[1])) return lens(null, "estimated", 0);
   return lens(hfov, "exif", exif.sd, exif.warnings);
 }
 

@@ -82,7 +82,11 @@ export class Model {
 
   private async run(file: string, images: Uint8Array, size: number[], heightM: number, names: string[]): Promise<Outputs> {
     if (!this.sessions.has(file)) this.sessions.set(file, this.session(file));
-    const session = await this.sessions.get(file)!;
+    const session = await this.sessions.get(file)!.catch((error: unknown) => {
+      // The file can arrive undamaged next time.
+      this.sessions.delete(file);
+      throw error;
+    });
     const feeds: Record<string, ort.Tensor> = { image: new ort.Tensor("uint8", images, size) };
     if (session.inputNames.includes("camera_height_m")) feeds.camera_height_m = new ort.Tensor("float32", new Float32Array(size[0]!).fill(heightM), [size[0]!]);
     const outputs = await session.run(feeds, names);

@@ -2,12 +2,14 @@
 
 import type { CameraView } from "../camera";
 import { InputError } from "../input_error";
+import { type Attitude, estimateAttitude, estimateCalibration, MAX_ESTIMATED_SD } from "./attitude";
 import { type Header, featuresFile } from "./features_file";
 import { findLens, type Lens, poseAngle, type Stated } from "./lens";
 import { type Metadata, readMetadata } from "./metadata";
 import { type Manifest, Model } from "./model";
 import { cutPatch, FINER, patchSteps, seenDeg } from "./patches";
 import { decoded, levelled, looksSpherical, scaled } from "./pixels";
+import { findSegments } from "./segments";
 
 /** Messages to the worker: a photograph, or a file of the model that it needs. */
 export type Task =
@@ -23,10 +25,12 @@ type Angle = Header["pitch"];
 
 // Standard deviations (degrees) of stated angles, and of pitch and roll of handheld cameras.
 const GIVEN_SD_DEG = 0.5, PITCH_SD_DEG = 12, ROLL_SD_DEG = 4;
+// Longer side of pictures in which lines are found.
+const LINES_SIDE = 640;
 const MIN_PIXELS = 64, MAX_PITCH_DEG = 60, MAX_ROLL_DEG = 180, JUDGED = { width: 256, height: 128 };
 // Photographs are scaled down if they are finer than this times the need.
 const SMALLEST_REDUCTION = 0.85;
-const NOT_ESTIMATED = "pitch and roll count as 0, because the browser does not estimate them; send pitch_deg and roll_deg (0 for a level camera) for a surer answer";
+const NOT_ESTIMATED = "pitch and roll of the strip count as 0, because the browser does not estimate them; send pitch_deg and roll_deg (0 for a level camera) for a surer answer";
 
 const scope = self as unknown as { onmessage: (event: MessageEvent<Task>) => void; postMessage: (result: Result) => void };
 let model: Model | null = null;
@@ -86,26 +90,46 @@ async function sphere({ bitmap, lens, stated, metadata }: Photograph, encoder: M
   return featuresFile(header, await encoder.sphere(pixels.rgb));
 }
 
-async function patched({ bitmap, lens, stated }: Photograph, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
-  const { width, height } = bitmap, { projection, hfov } = lens, size = encoder.patchSize;
+async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
+  const { width, height } = bitmap, size = encoder.patchSize, entered = [statedPitch(stated), statedRoll(stated)] as const;
+  const { lens, tilt } = withLines(bitmap, known, entered.includes(null)), { projection, hfov } = lens;
   const isPerspective = projection === "perspective", focal = isPerspective ? (0.5 * width) / Math.tan(0.5 * hfov) : width / hfov;
+  const isAssumed = entered.includes(null) && !isPerspective;
   const level = (std_deg: number): Angle => ({ value_deg: 0, std_deg, source: "assumed" });
   const view: CameraView = {
     projection, camera: isPerspective ? { width, height, fx: focal, fy: focal, cx: 0.5 * width - 0.5, cy: 0.5 * height - 0.5, distortion: [] } : null,
     hfov: { value_deg: degrees(hfov), std_deg: degrees(lens.focalSd * (isPerspective ? Math.sin(hfov) : hfov)), source: lens.hfovSource },
-    pitch: statedPitch(stated) ?? level(PITCH_SD_DEG), roll: statedRoll(stated) ?? level(ROLL_SD_DEG),
+    pitch: entered[0] ?? tilt?.pitch ?? level(PITCH_SD_DEG), roll: entered[1] ?? tilt?.roll ?? level(ROLL_SD_DEG),
   };
   const wanted = (FINER * size.width) / size.hfov / focal, share = wanted > SMALLEST_REDUCTION ? 1 : wanted;
   const picture = scaled(bitmap, Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height)));
   const steps = patchSteps(hfov, size);
   const arrays = await encoder.patches(steps.map((step) => cutPatch(picture, view, step * size.step, size)));
-  const isAssumed = view.pitch.source === "assumed" || view.roll.source === "assumed";
   const header: Header = {
     ...common(lens, encoder), hfov: view.hfov, pitch: view.pitch, roll: view.roll, seen_deg: seenDeg(view), patches: steps, compass_deg: null,
     camera: view.camera === null ? null : { width, height, intrinsics: { fx: focal, fy: focal, cx: view.camera.cx, cy: view.camera.cy } },
     warnings: [...lens.warnings, ...(isAssumed ? [NOT_ESTIMATED] : [])],
   };
   return featuresFile(header, arrays);
+}
+
+/** Return the lens of a photograph, and the tilt of an ordinary one, estimated from its straight lines where they are not known. */
+function withLines(bitmap: ImageBitmap, lens: Lens, needsTilt: boolean): { lens: Lens & { hfov: number }; tilt: Pick<CameraView, "pitch" | "roll"> | null } {
+  const { hfov } = lens;
+  if (hfov !== null && (lens.projection !== "perspective" || !needsTilt)) return { lens: { ...lens, hfov }, tilt: null };
+  const share = Math.min(1, LINES_SIDE / Math.max(bitmap.width, bitmap.height));
+  const picture = scaled(bitmap, Math.round(share * bitmap.width), Math.round(share * bitmap.height)), segments = findSegments(picture);
+  if (hfov !== null) return { lens: { ...lens, hfov }, tilt: anglesOf(estimateAttitude(segments, picture, hfov)) };
+  const found = estimateCalibration(segments, picture), spread = 2 * found.focalSd * Math.sin(found.hfov);
+  const warning = `the field of view of ${degrees(found.hfov).toFixed(0)}° ± ${degrees(spread).toFixed(0)}° ` +
+    `${segments.length > 0 ? "was estimated from straight lines" : "is only usual"}; send hfov_deg or the camera's original file`;
+  return { lens: { ...lens, hfov: found.hfov, focalSd: found.focalSd, warnings: [...lens.warnings, warning] }, tilt: anglesOf(found.attitude) };
+}
+
+function anglesOf({ pitch, roll, pitchSd, rollSd }: Attitude): Pick<CameraView, "pitch" | "roll"> {
+  const angle = (value: number, sd: number): Angle =>
+    ({ value_deg: degrees(value), std_deg: degrees(sd), source: sd < MAX_ESTIMATED_SD ? "estimated" : "assumed" });
+  return { pitch: angle(pitch, pitchSd), roll: angle(roll, rollSd) };
 }
 
 const common = (lens: Lens, { digest }: Model): Pick<Header, "model" | "projection" | "projection_source" | "warnings"> =>
