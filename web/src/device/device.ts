@@ -71,9 +71,10 @@ class Device {
       try {
         return await send(pictures, query);
       } catch (error) {
-        if (!(error instanceof ServiceError) || error.slug !== "foreign-features" || isRepeated) throw error;
+        if (!(error instanceof ServiceError) || error.slug !== "foreign-features") throw error;
         this.manifest = null;
         this.known = new WeakMap();
+        if (isRepeated) throw error;
       }
     }
   }
