@@ -27,6 +27,12 @@ _HEADERS = {
     # Browsers revalidate each time, because another version can answer next.
     "Cache-Control": "no-cache",
 }
+# Script of the worker that computes features. Only it may compile WebAssembly, and it loads scripts and files of this
+# service only.
+_WORKER = "on_device.js"
+_WORKER_HEADERS = _HEADERS | {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'"
+}
 _MAX_FILES = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
 
@@ -64,7 +70,8 @@ def _file(request: Request, name: str) -> Response:
     if not _NAME.fullmatch(name):
         raise HTTPException(404)
     content, media, etag = _built(name)
-    return not_modified(request, etag, _HEADERS) or tagged_answer([content], media, etag, _HEADERS)
+    headers = _WORKER_HEADERS if name == _WORKER else _HEADERS
+    return not_modified(request, etag, headers) or tagged_answer([content], media, etag, headers)
 
 
 @lru_cache(_MAX_FILES)
@@ -78,5 +85,8 @@ def _built(name: str) -> tuple[bytes, str, str]:
     if not path.is_file():
         raise HTTPException(404)
     content = path.read_bytes()
-    media = "text/javascript" if name.endswith(".js") else guess_type(name)[0] or "application/octet-stream"
+    kind, compression = guess_type(name)
+    # The page unpacks compressed files itself.
+    media = "text/javascript" if name.endswith(".js") else (kind if compression is None else None)
+    media = media or "application/octet-stream"
     return content, media, digest_etag(hashlib.sha256(content).hexdigest())

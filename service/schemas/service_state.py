@@ -37,6 +37,7 @@ class LimitsAnswer(ResponseModel):
     max_sequence_bytes: int = Field(description="Size of all photographs of a sequence query or a batch.")
     max_batch_photographs: int = Field(description="Photographs of a batch.")
     max_pixels: int = Field(description="Pixels of a panorama.")
+    require_features: bool = Field(description="Photographs are refused; queries need features.")
     max_scans: int = Field(description="Scans of a progressive JPEG.")
     max_top_k: int = Field(description="Candidates per answer.")
     max_pending_requests: int = Field(description="Uploads and queries in progress.")

@@ -126,12 +126,12 @@ function facts(answer: Answer): HTMLElement {
 
 function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): HTMLElement {
   const files = (photo?.asked.files ?? []).map(({ name }) => name.replace(/^example-/, "examples/"));
-  const fields = photo?.asked.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
-  const names = files.length > 0 ? files : ["photo.jpg"];
+  const onDevice = photo?.asked.onDevice ?? false, fields = photo?.asked.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
+  const asked = { fields, files: files.length > 0 ? files : ["photo.jpg"], onDevice };
   const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
   return h("div", { class: "sharing" },
-    button("Copy as curl", () => void copy(curlSnippet(fields, names), "curl command"), { id: "copy-curl" }),
-    button("Copy as Python", () => void copy(pythonSnippet(fields, names), "Python code"), { id: "copy-python" }),
+    button("Copy as curl", () => void copy(curlSnippet(asked), "curl command"), { id: "copy-curl" }),
+    button("Copy as Python", () => void copy(pythonSnippet(asked), "Python code"), { id: "copy-python" }),
     // The service draws answers to single photographs in single plans and does not store photographs.
     photo !== null && answer.venue_id == null && answer.together === undefined && button("Save picture", () => void save(photo), { id: "save-picture", title: "The photograph with the layout, and the plan with the place, as PNG" }),
     link !== null && button("Copy link", () => void copy(link, "link"), { id: "copy-link", title: "Opens this answer again while the service stores it" }),

@@ -4,6 +4,7 @@ import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
 import { companions, ellipse, otherPlaces } from "./answer_overlay";
 import { api } from "./api";
+import { device } from "./device/device";
 import { byId, named, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
@@ -90,6 +91,7 @@ class Page {
     addEventListener("hashchange", () => void this.open());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
     await this.panorama.setPicture(null);
+    await device.start().catch((error: unknown) => showError(byId("photo-error"), error));
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
     const example = await examplePlan(FLAT);

@@ -4,8 +4,11 @@ import { radians } from "./layout";
 import type { Size } from "./projection";
 import type { Point, ViewAnswer } from "./types";
 
-type Ray = [number, number, number];
+/** Direction: right, forward, up. */
+export type Ray = [number, number, number];
 type Place = (ray: Ray) => Point | null;
+/** Parts of the view that place rays in the photograph. */
+export type CameraView = Pick<ViewAnswer, "projection" | "camera" | "hfov" | "pitch" | "roll">;
 
 const LARGEST_STEP = radians(1);
 // Perspective cameras are drawn up to this angle from the optical axis.
@@ -15,7 +18,7 @@ const WIDEST = Math.tan(radians(80));
  * Project lines of (azimuth from the photograph's centre, elevation) to a photograph that fills `size`; parts that it does
  * not show are cut off.
  */
-export function throughCamera(lines: Point[][], view: ViewAnswer, size: Size): Point[][] {
+export function throughCamera(lines: Point[][], view: CameraView, size: Size): Point[][] {
   const place = placeOf(view, size), tilt = tiltOf(view);
   return lines.flatMap((line) => {
     const pieces: Point[][] = [[]];
@@ -29,7 +32,8 @@ export function throughCamera(lines: Point[][], view: ViewAnswer, size: Size): P
   });
 }
 
-function inside([x, y]: Point, { width, height }: Size): boolean {
+/** Return whether a picture of a size shows a place. */
+export function inside([x, y]: Point, { width, height }: Size): boolean {
   return x >= 0 && x <= width && y >= 0 && y <= height;
 }
 
@@ -46,7 +50,7 @@ function dense(line: Point[]): Point[] {
 }
 
 /** Return the rotation of level rays (right, forward, up) into the camera's frame. */
-function tiltOf(view: ViewAnswer): (ray: Ray) => Ray {
+export function tiltOf(view: Pick<CameraView, "projection" | "pitch" | "roll">): (ray: Ray) => Ray {
   // The pitch of a strip is in its projection.
   const pitch = view.projection === "cylindrical" ? 0 : radians(view.pitch.value_deg), roll = radians(view.roll.value_deg);
   const [sp, cp, sr, cr] = [Math.sin(pitch), Math.cos(pitch), Math.sin(roll), Math.cos(roll)];
@@ -56,7 +60,8 @@ function tiltOf(view: ViewAnswer): (ray: Ray) => Ray {
   };
 }
 
-function placeOf(view: ViewAnswer, size: Size): Place {
+/** Return the projection of rays in the camera’s frame to a photograph that fills `size`; null for those that it cannot show. */
+export function placeOf(view: CameraView, size: Size): Place {
   const { camera } = view;
   if (camera === null) return around(view, size);
   const across = size.width / camera.width, down = size.height / camera.height;
@@ -89,7 +94,7 @@ function fisheye([k1 = 0, k2 = 0, k3 = 0, k4 = 0]: number[]): Place {
 }
 
 /** Strip around the camera, or a part of the sphere, with square pixels at the horizon. */
-function around(view: ViewAnswer, size: Size): Place {
+function around(view: CameraView, size: Size): Place {
   const perRadian = size.width / radians(view.hfov.value_deg), middle = radians(view.pitch.value_deg);
   const isStrip = view.projection === "cylindrical";
   const horizon = 0.5 * size.height + (isStrip ? Math.tan(middle) : 0) * perRadian;

@@ -2,10 +2,10 @@
 
 import { ServiceError } from "./api";
 import { h, show } from "./dom";
+import { InputError } from "./input_error";
 import { labelOf, plainWords } from "./plain_words";
 
-/** Request of the user that the page cannot follow; the message says what to do. */
-export class InputError extends Error {}
+export { InputError };
 
 /** Show an error in an element with the role alert and mark the fields that cause it. */
 export function showError(place: HTMLElement, error: unknown, fields: Record<string, HTMLElement> = {}): void {
@@ -57,6 +57,8 @@ function plainText(failure: ServiceError | null): string | null {
   if (failure === null) return null;
   const words: Record<string, string> = {
     "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
+    "foreign-features": "The service has another model than this page has loaded. Load the page again.",
+    "features-required": "This service takes no photographs. Load the page again: it then computes features in the browser.",
     overloaded: "The service is overloaded.",
     "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
   };

@@ -14,7 +14,7 @@ export interface Photo {
   hints: Hints;
   answer: Answer | null;
   /** Fields and photographs of the latest query, for code snippets. */
-  asked: { fields: Record<string, string>; files: File[] };
+  asked: { fields: Record<string, string>; files: File[]; onDevice: boolean };
 }
 
 /** Photographs of one visit that are localised together. */
@@ -98,7 +98,7 @@ export class Photos {
       showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
     }
     const added = files.filter(isPicture).map((file): Photo => ({
-      file, url: URL.createObjectURL(file), settings: { ...this.shared }, hints: NO_HINTS, answer: null, asked: { fields: {}, files: [file] },
+      file, url: URL.createObjectURL(file), settings: { ...this.shared }, hints: NO_HINTS, answer: null, asked: { fields: {}, files: [file], onDevice: false },
     }));
     if (added.length > 0) this.forgetGroup();
     this.all.push(...added);

@@ -1,6 +1,7 @@
 /** Pictures to save: the map as it is shown, and the answer to a photograph. */
 
 import { api } from "./api";
+import { device } from "./device/device";
 import { byId, download } from "./dom";
 import { clearError, InputError, showError } from "./notices";
 import type { Photo } from "./photos";
@@ -24,7 +25,8 @@ export function connectSaveMap(map: SVGSVGElement, name: () => string): void {
 export async function savePicture(photo: Photo, fields: Record<string, HTMLElement>): Promise<void> {
   clearError(byId("photo-error"), fields);
   try {
-    download(await api.picture(photo.asked.fields, photo.file), `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
+    const picture = await device.send([photo.file], photo.asked.fields, ([sent], own) => api.picture(own, sent!));
+    download(picture, `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
   } catch (error) {
     showError(byId("photo-error"), error, fields);
   }

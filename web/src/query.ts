@@ -1,6 +1,7 @@
 /** Queries about one photograph, or about several of one visit, and their answers. */
 
 import { api } from "./api";
+import { device } from "./device/device";
 import { hintFields } from "./hints";
 import type { Group, Photo } from "./photos";
 import type { Answer, Plan, SequenceAnswer, Venue } from "./types";
@@ -10,8 +11,9 @@ export async function askSingle(place: Venue | Plan, photo: Photo, signal: Abort
   const isVenue = "plans" in place;
   const fields: Record<string, string> = isVenue ? { venue_id: place.id, ...photo.settings } :
     { floorplan_id: place.id, ...hintFields(photo.hints), ...photo.settings };
-  photo.asked = { fields, files: [photo.file] };
-  const answer = await api.localise(isVenue ? fields : { ...fields, include: "posterior" }, photo.file, { signal });
+  photo.asked = { fields, files: [photo.file], onDevice: device.isOn };
+  const answer = await device.send([photo.file], isVenue ? fields : { ...fields, include: "posterior" },
+    ([picture], own) => api.localise(own, picture!, { signal }));
   if (!signal.aborted) photo.answer = answer;
 }
 
@@ -24,11 +26,11 @@ export async function askTogether(plan: Plan, { motion, photos }: Group, signal:
     fields.headings_deg = JSON.stringify(headings);
     if (tolerance !== undefined) fields.heading_tolerance_deg = tolerance;
   }
-  const files = photos.map(({ file }) => file);
-  const found = await api.localiseSequence(fields, files, { signal });
+  const files = photos.map(({ file }) => file), onDevice = device.isOn;
+  const found = await device.send(files, fields, (pictures, own) => api.localiseSequence(own, pictures, { signal }));
   if (signal.aborted) return;
   photos.forEach((photo, index) => {
-    photo.asked = { fields, files };
+    photo.asked = { fields, files, onDevice };
     photo.answer = answerOf(found, index, motion);
   });
 }

@@ -2,6 +2,7 @@
 
 import { ellipse } from "./answer_overlay";
 import { api, ServiceError } from "./api";
+import { device } from "./device/device";
 import { button, byId, h, s, show } from "./dom";
 import { clearError, showError } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
@@ -118,7 +119,8 @@ export class LiveSession {
   private async sent(file: File): Promise<Session> {
     for (let tries = 1; ; tries++) {
       try {
-        return await api.addPhotograph(this.session!.id, { number: String(this.session!.photographs + 1) }, file);
+        return await device.send([file], { number: String(this.session!.photographs + 1) },
+          ([picture], fields) => api.addPhotograph(this.session!.id, fields, picture!));
       } catch (error) {
         const isBusy = error instanceof ServiceError && error.slug === "session-busy";
         if (!isBusy || tries === BUSY_TRIES || this.session === null) throw error;

@@ -1,6 +1,8 @@
 /** Code for the same query: curl and Python. */
 
 import { key } from "./api";
+import { splitFields } from "./device/device";
+import type { Photo } from "./photos";
 
 const shell = (text: string): string => (/^[\w@./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 const python = (text: string): string => JSON.stringify(text);
@@ -12,21 +14,28 @@ function literal(name: string, value: string): string {
   return name === "near" || name === "rooms" || /^-?[\d.]+$/.test(value) ? value : python(value);
 }
 
-/** Return the query as a curl command. */
-export function curlSnippet(fields: Record<string, string>, files: string[]): string {
+/** Latest query about a photograph, with the names of its files. */
+export type Asked = Omit<Photo["asked"], "files"> & { files: string[] };
+
+/** Return the query as a curl command, after the command that computes the features if these are sent. */
+export function curlSnippet({ fields: all, files, onDevice }: Asked): string {
+  const { query, stated } = splitFields(all), fields = onDevice ? query : all;
+  const camera = Object.entries(stated).map(([name, value]) => ` --${name.replace(/_deg$/, "")} ${shell(value)}`).join("");
+  const encode = onDevice ? `lalaloc encode${files.map((file) => ` ${shell(file)}`).join("")}${camera}\n` : "";
   const parts = [`curl ${shell(`${location.origin}/localise${fields.motion === undefined ? "" : "/sequence"}`)}`];
   if (key.get() !== null) parts.push(`-H "Authorization: Bearer $LALALOC_KEY"`);
   for (const [name, value] of Object.entries(fields)) parts.push(`-F ${shell(`${name}=${value}`)}`);
-  for (const file of files) parts.push(`-F ${shell(`photo=@${file}`)}`);
-  return parts.join(" \\\n  ");
+  for (const file of files) parts.push(`-F ${shell(onDevice ? `features=@${file.replace(/\.[^.]*$/, "")}.features` : `photo=@${file}`)}`);
+  return encode + parts.join(" \\\n  ");
 }
 
 /** Return the query as Python code. */
-export function pythonSnippet(fields: Record<string, string>, files: string[]): string {
+export function pythonSnippet({ fields, files, onDevice }: Asked): string {
   const { floorplan_id: plan, venue_id: venue, ...rest } = fields;
   const options = Object.entries(rest)
     .filter(([name]) => name !== "include")
     .map(([name, value]) => `, ${name}=${literal(name, value)}`);
+  if (onDevice) options.push(", on_device=True");
   const isGroup = fields.motion !== undefined;
   const ask = venue !== undefined ? `localise_in_venue(${python(venue)}` : `localise${isGroup ? "_sequence" : ""}(${python(plan ?? "")}`;
   const photos = isGroup ? `[${files.map(python).join(", ")}]` : python(files[0] ?? "");

@@ -11,9 +11,12 @@ export type Schemas = components["schemas"];
 export type Plan = Schemas["FloorPlanAnswer"] & { etag: string };
 type Text = Readonly<Record<string, string>>;
 type Form<Name extends keyof operations> = operations[Name] extends
-  { requestBody?: { content: { "multipart/form-data": infer Body } } } ? Partial<Omit<Body, "photo" | "panorama" | "file">> : never;
+  { requestBody?: { content: { "multipart/form-data": infer Body } } } ? Partial<Omit<Body, "photo" | "features" | "panorama" | "file">> : never;
 /** Fields of a form; lists and objects are sent as JSON, undefined and null are left out. */
 export type Fields<Name extends keyof operations> = Form<Name> | Text;
+
+/** Photograph, or its features instead, with which it stays on the device: docs/reference/features.md. */
+export type Picture = Blob | { features: Blob };
 
 export interface ClientOptions {
   /** Address of the service. Default: the server of the page. */
@@ -78,27 +81,31 @@ export class Client {
   deletePlan = (id: string) => this.delete(of("floorplans", id));
   /** Return the uploaded file of a plan's current revision. */
   original = async (id: string) => (await this.request(of("floorplans", id, "/original"))).blob();
-  localise = (fields: Fields<"localise">, photo: Blob, options: CallOptions = {}) =>
-    this.json<Schemas["LocaliseAnswer"]>("/localise", { ...options, ...form(fields, "photo", photo) });
-  /** Localise photographs of one visit, in the order in which they were taken. */
-  localiseSequence = (fields: Fields<"localiseSequence">, photos: Blob[], options: CallOptions = {}) =>
-    this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...form(fields, "photo", ...photos) });
+  localise = (fields: Fields<"localise">, photo: Picture, options: CallOptions = {}) =>
+    this.json<Schemas["LocaliseAnswer"]>("/localise", { ...options, ...query(fields, photo) });
+  /** Localise photographs of one visit, in the order in which they were taken; all of them as features, or none. */
+  localiseSequence = (fields: Fields<"localiseSequence">, photos: Picture[], options: CallOptions = {}) =>
+    this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...query(fields, ...photos) });
   /** Localise many photographs, each by itself; yield a line for each, in order, as they are computed. */
   async *localiseBatch(fields: Fields<"localiseBatch">, photos: Blob[], options: CallOptions = {}): AsyncGenerator<Schemas["BatchLine"]> {
     // XMLHttpRequest would return all lines at the end.
     const init = { timeoutMs: 0, ...options, onProgress: undefined, ...form(fields, "photo", ...photos) };
     for await (const line of linesOf(await this.request("/localise/batch", init))) yield JSON.parse(line);
   }
-  /** Return the answer to a query as a picture: the photograph with the layout, and the plan with the place. */
-  picture = async ({ include: _, ...fields }: Fields<"localise">, photo: Blob, options: CallOptions = {}) =>
-    (await this.request("/localise", { ...options, ...form(fields, "photo", photo), headers: { Accept: "image/png" } })).blob();
+  /** Return the answer to a query as a picture: the photograph with the layout, unless features are sent, and the plan with the place. */
+  picture = async ({ include: _, ...fields }: Fields<"localise">, photo: Picture, options: CallOptions = {}) =>
+    (await this.request("/localise", { ...options, ...query(fields, photo), headers: { Accept: "image/png" } })).blob();
   answer = (id: string) => this.json<Schemas["LocaliseAnswer"]>(of("answers", id));
   /** Begin a session, which follows one camera. */
   createSession = (session: Schemas["SessionDocument"]) => this.json<Schemas["SessionAnswer"]>("/sessions", json("POST", session));
   session = (id: string) => this.json<Schemas["SessionAnswer"]>(of("sessions", id));
   /** Send the next photograph of a session, with the motion since the one before. */
-  addPhotograph = (id: string, fields: Fields<"addPhotograph">, photo: Blob, options: CallOptions = {}) =>
-    this.json<Schemas["SessionAnswer"]>(of("sessions", id, "/photographs"), { ...options, ...form(fields, "photo", photo) });
+  addPhotograph = (id: string, fields: Fields<"addPhotograph">, photo: Picture, options: CallOptions = {}) =>
+    this.json<Schemas["SessionAnswer"]>(of("sessions", id, "/photographs"), { ...options, ...query(fields, photo) });
+  /** Return a file of the image encoder, with which devices compute features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`. */
+  modelFile = async (name: string, options: CallOptions = {}) => (await this.request(of("model", name), options)).arrayBuffer();
+  /** Return the limits of the service. */
+  limits = () => this.json<Schemas["LimitsAnswer"]>("/limits");
   deleteSession = (id: string) => this.delete(of("sessions", id));
   venues = (name = "", cursor: string | null = null) => this.json<Schemas["VenueList"]>(`/venues?${page(name, cursor)}`);
   venue = (id: string) => this.json<Schemas["VenueSummary"]>(of("venues", id));
@@ -155,6 +162,15 @@ async function planOf(response: Response): Promise<Plan> {
 
 function json(method: string, document: unknown, headers: Text = {}): RequestInit {
   return { method, headers: { "Content-Type": "application/json", ...headers }, body: JSON.stringify(document) };
+}
+
+function query(fields: object, ...pictures: Picture[]): { method: string; body: FormData } {
+  const { method, body } = form(fields, "photo");
+  for (const picture of pictures) {
+    if (picture instanceof Blob) body.append("photo", picture);
+    else body.append("features", picture.features, "photo.features");
+  }
+  return { method, body };
 }
 
 function form(fields: object, name: string, ...files: Blob[]): { method: string; body: FormData } {
