@@ -13,6 +13,7 @@ from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.descent import refined_by_walls
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps, next_step
 from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
@@ -30,6 +31,7 @@ from service.query.decoding import Decoder
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
 from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
+from service.query.wall_refiner import WallRefiner
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.settings import Settings, work_factor
 from service.storage.records import PlanRecord
@@ -85,6 +87,7 @@ class Localiser:
         self._queries = queries
         self._reads = reads
         self._telemetry = telemetry
+        self._wall_refiner = WallRefiner(telemetry)
         self._threads = Threads(
             "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, permits
         )
@@ -352,17 +355,28 @@ class Localiser:
     async def run_search(
         self, steps: Generator[RefinementJob | SequenceJob | None, Any, T], context: QueryContext
     ) -> T:
-        """Run a search on the compute threads; it holds none in its pauses (None) and while LPO refines poses."""
-        step = await self.compute(context, partial(next_step, steps, None))
+        """Run a search on the compute threads; it holds none in its pauses (None) and while a worker refines poses."""
+        step = await self.compute(context, partial(self._next_step, steps, None, context))
         while step is None or isinstance(step, RefinementJob | SequenceJob):
             result = None
             if step is not None:
                 photographs = step.heading.shape[1] if isinstance(step, SequenceJob) else 1
-                limit_s = self._settings.lpo.deadline_s * work_factor(photographs)
-                timeout_s = min(limit_s, context.left_s - _RESERVED_S)
-                result = await self._optimiser.refine(step, timeout_s, context.client)
-            step = await self.compute(context, partial(next_step, steps, result))
+                result = await self._optimiser.refine(step, self._lpo_timeout_s(context, photographs), context.client)
+            step = await self.compute(context, partial(self._next_step, steps, result, context))
         return step
+
+    def _next_step(
+        self, steps: Generator[RefinementJob | SequenceJob | None, Any, T], result: object, context: QueryContext
+    ) -> RefinementJob | SequenceJob | T | None:
+        """Continue a search to its next pause, job for a worker, or result; refine poses by walls on this thread."""
+        step = next_step(steps, result)
+        # Without workers LPO is off.
+        while isinstance(step, RefinementJob) and refined_by_walls(step) and self._optimiser.state.workers:
+            step = next_step(steps, self._wall_refiner.refine(step, self._lpo_timeout_s(context)))
+        return step
+
+    def _lpo_timeout_s(self, context: QueryContext, photographs: int = 1) -> float:
+        return min(self._settings.lpo.deadline_s * work_factor(photographs), context.left_s - _RESERVED_S)
 
     def observe(self, context: QueryContext, stage: str) -> dict[str, float]:
         """Record an answer in the metrics; return the duration (ms) of each stage, and their `total`."""
