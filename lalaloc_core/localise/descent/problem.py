@@ -144,14 +144,14 @@ class Problem:
         """Return the problem of some of the poses."""
         part = object.__new__(type(self))
         part.__dict__.update(self.__dict__)
-        for name in self.by_pose:
+        for name in self.pose_arrays:
             value = getattr(self, name)
             setattr(part, name, None if value is None else value[index])
         part.origin = self.origin[_numpy(index)]
         return part
 
     @property
-    def by_pose(self) -> tuple[str, ...]:
+    def pose_arrays(self) -> tuple[str, ...]:
         """Names of the arrays with a row for each pose."""
         return ("_walls_m", "_heading", "_targets", "_precision", "start")
 

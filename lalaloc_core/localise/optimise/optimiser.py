@@ -78,8 +78,8 @@ class _EmbeddedProblem(Problem):
         self._ceiling_height_m = torch.as_tensor(job.ceiling_height_m, dtype=torch.float32, device=device)
 
     @property
-    def by_pose(self) -> tuple[str, ...]:
-        return (*super().by_pose, "_camera_height_m", "_ceiling_height_m")
+    def pose_arrays(self) -> tuple[str, ...]:
+        return (*super().pose_arrays, "_camera_height_m", "_ceiling_height_m")
 
     def embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
         by_pose = layout.by_pose[:, : self._moving]
