@@ -51,8 +51,8 @@ class ComputeSettings(SettingGroup):
         default=None,
         ge=0,
         le=64,
-        description="LPO worker processes. Default: a quarter of the usable cores (affinity and cgroup quota), at "
-        "least 1. 0 turns LPO off; answers then end at VDR.",
+        description="LPO worker processes, for sequences and for models that compare latents. Default: a quarter of "
+        "the usable cores (affinity and cgroup quota), at least 1. 0 turns LPO off; answers then end at VDR.",
     )
     worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads per LPO worker. 0: one.")
     onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network. 0: one.")
@@ -60,8 +60,7 @@ class ComputeSettings(SettingGroup):
         default=0,
         ge=0,
         le=256,
-        description="Queries that the main process computes at a time, without LPO. 0: the cores that the LPO workers "
-        "leave free.",
+        description="Queries that the main process computes at a time. 0: the cores that the LPO workers leave free.",
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -131,12 +132,13 @@ class Settings(BaseModel):
             del values[name]
         return cls(**values)
 
+    def value(self, name: str) -> Any:
+        """Return the value of a setting by variable name, in lower case and without `LALALOC_`."""
+        return attrgetter(".".join(_PATHS[name]))(self)
+
     def values(self) -> dict[str, Any]:
-        """Return the value of every setting by variable name, in lower case and without `LALALOC_`."""
-        return {
-            name: getattr(self, path[0]) if len(path) == 1 else getattr(getattr(self, path[0]), path[1])
-            for name, path, _ in _fields()
-        }
+        """Return the value of every setting by variable name."""
+        return {name: self.value(name) for name in _PATHS}
 
     def with_values(self, **values: Any) -> Self:
         """Return a copy with some values changed; names as in the constructor."""
@@ -198,8 +200,9 @@ def _fields() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
             yield name, (name,), field
 
 
-# Names of all settings, in lower case and without `LALALOC_`.
-SETTING_NAMES = frozenset(name for name, _, _ in _fields())
+# Attributes of all settings by name, in lower case and without `LALALOC_`.
+_PATHS = {name: path for name, path, _ in _fields()}
+SETTING_NAMES = frozenset(_PATHS)
 
 
 def _variable(name: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -18,6 +19,8 @@ SPHERE_AZIMUTHS, VIEW_AZIMUTHS = 16, 64
 _BIN = 0.05
 # Distances (m) are clipped to this range.
 _MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.1, 500.0
+# Poses of a part: the sums of their costs stay in the processor's cache.
+_PART = 512
 # Opening classes with a row at every azimuth: all but walls.
 OPENING_ROWS = len(OPENING_CLASSES) - 1
 
@@ -64,7 +67,12 @@ class BinnedLayouts:
     def __len__(self) -> int:
         return len(self.rows.indptr) - 1
 
+    @cached_property
+    def parts(self) -> list[scipy.sparse.csr_array]:
+        """The rows, a few hundred poses at a time; kept, because slices of a sparse matrix are slow."""
+        return [self.rows[first : first + _PART] for first in range(0, len(self), _PART)]
+
     @property
     def nbytes(self) -> int:
-        """Bytes of the arrays."""
+        """Bytes of the arrays, without `parts`."""
         return self.rows.data.nbytes + self.rows.indices.nbytes + self.rows.indptr.nbytes

@@ -25,10 +25,8 @@ from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.localise.binned_layouts import OPENING_ROWS, BinnedLayouts
 from lalaloc_core.localise.matching_cost import MatchingCost
 
-# Poses compared at a time, so that the sums stay in the processor's cache.
-_CHUNK = 512
-# The same by rising bounds, in plans of more than the last number of poses: few at first, as these limit the number of
-# poses; and for the bounds themselves.
+# Poses compared at a time by rising bounds, in plans of more than the last number: few at first, as these limit the
+# number of poses; and for the bounds themselves.
 _FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
 # Neighbouring hypotheses that share a bound.
 _NEIGHBOURS = 2
@@ -130,10 +128,12 @@ def coarse_costs(
     """Return the coarse costs of all poses under all hypotheses, each at its best δ."""
     table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
     shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
-    parts = (slice(first, first + _CHUNK) for first in range(0, len(binned), _CHUNK))
-    return np.concatenate(
-        [_at_best_offset(binned.rows[part] @ table, room_costs[:, room_index[part]], shape) for part in parts]
-    )
+    costs, first = [], 0
+    for rows in binned.parts:
+        last = first + len(rows.indptr) - 1
+        costs.append(_at_best_offset(rows @ table, room_costs[:, room_index[first:last]], shape))
+        first = last
+    return np.concatenate(costs)
 
 
 def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:

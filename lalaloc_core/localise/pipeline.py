@@ -266,9 +266,12 @@ class _Search:
         self._clock, self._hints, self._top_k = clock, hints, top_k
         weights, matching = self._weights, config.matching
         with clock.stage("retrieve"):
-            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching)
+            given = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
+            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=given)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
-            self._costs = costs = grid_costs(plan, grid, query, weights, matching, hints)
+            if given is None or self._doubted:
+                given = grid_costs(plan, grid, query, weights, matching, hints)
+            self._costs = costs = given
             # Refined candidates can meet and become one; spare ones then take their places.
             minimum = config.min_starts(query)
             self.modes = retrieve(

@@ -222,9 +222,17 @@ def _candidate(costs: GridCosts, query: Query, grid: PoseGrid, pair: int) -> Can
 
 
 def contradicted(
-    plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: MatchingConfig
+    plan: FloorPlan,
+    grid: PoseGrid,
+    query: Query,
+    weights: MatchingWeights,
+    config: MatchingConfig,
+    *,
+    given: GridCosts | None = None,
 ) -> bool:
     """Return whether the picture fits another heading so much better that the given one must be wrong.
+
+    `given` are the costs of the grid at the given heading, without hints, if they are known already.
 
     A given heading is wrong with the probability `heading_doubt`; then every heading that is searched is as likely. It
     is kept where its best place fits as well as right headings do, and where the search fits better by no more than
@@ -234,7 +242,7 @@ def contradicted(
     if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
         return False
     doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
-    given = grid_costs(plan, grid, query, weights, config)
+    given = grid_costs(plan, grid, query, weights, config) if given is None else given
     best = int(given.cost[: given.compared].argmin())
     # Costs are non-negative, so no heading is better by more than the given one's cost.
     if given.cost[best] <= max(doubt, weights.usual_cost):

@@ -58,7 +58,7 @@ def log_distance_gradient(
     xp = array_namespace(origin_m, azimuth, walls_m)
     crossings = inverse_crossings(origin_m, azimuth, walls_m)
     wall = xp.argmax(crossings.inverse_m, axis=1)
-    inverse_m = xp.clip(xp.max(crossings.inverse_m, axis=1), 1.0 / _MAX_DISTANCE_M)
+    inverse_m = xp.maximum(xp.max(crossings.inverse_m, axis=1), 1.0 / _MAX_DISTANCE_M)
     edge_x = xp.take_along_axis(crossings.edge_x, wall, axis=1)
     edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
     turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m
@@ -78,4 +78,4 @@ def free_travel_m(
     distance_m = xp.exp(ahead.log_m[:, 0])
     # The gradient of the distance is one over the cosine between the direction and the wall's normal.
     steepness = distance_m * xp.linalg.vector_norm(ahead.by_pose[:, :2, 0], axis=1)
-    return xp.clip(distance_m - margin_m * steepness, 0.0)
+    return xp.maximum(distance_m - margin_m * steepness, 0.0)

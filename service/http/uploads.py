@@ -75,7 +75,7 @@ class UploadLimits:
     def of(cls, settings: Settings, name: Settable) -> Self:
         """Return the limits of one kind of upload."""
         return cls(
-            max_bytes=settings.values()[name],
+            max_bytes=settings.value(name),
             name=name,
             deadline_s=settings.uploads.deadline_s,
             idle_s=settings.uploads.idle_s,

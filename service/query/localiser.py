@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from time import monotonic
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps, next_step
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
 from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
 from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import SequenceJob
@@ -29,6 +29,7 @@ from service.query.answers import compose_answer, compose_sequence_answer, locat
 from service.query.decoding import Decoder
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
+from service.query.search_steps import SearchSteps, StepRunner, completed
 from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.settings import Settings, work_factor
@@ -85,6 +86,7 @@ class Localiser:
         self._queries = queries
         self._reads = reads
         self._telemetry = telemetry
+        self._steps = StepRunner(optimiser, telemetry)
         self._threads = Threads(
             "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, permits
         )
@@ -159,19 +161,22 @@ class Localiser:
             clock=clock,
             hints=hints,
         )
-        found = await self.run_search(steps, context)
-        answer = compose_answer(
-            found,
-            locate=locate_in(record),
-            known=known,
-            warnings=hint_warnings(hints, found, record.plan),
-            timings_ms=self.observe(context, found.stage),
-            bundle=self._bundle,
-            view=partial(view_answer, photograph, plan=record.plan, grid=grid),
-        )
-        if form.include == "posterior":
-            answer = answer.model_copy(update={"posterior": posterior_answer(record.plan, grid, found.posterior)})
-        return _Outcome(answer, view, found, grid)
+
+        def compose(found: Localisation) -> _Outcome:
+            answer = compose_answer(
+                found,
+                locate=locate_in(record),
+                known=known,
+                warnings=hint_warnings(hints, found, record.plan),
+                timings_ms=self.observe(context, found.stage),
+                bundle=self._bundle,
+                view=partial(view_answer, photograph, plan=record.plan, grid=grid),
+            )
+            if form.include == "posterior":
+                answer = answer.model_copy(update={"posterior": posterior_answer(record.plan, grid, found.posterior)})
+            return _Outcome(answer, view, found, grid)
+
+        return await self.run_search(completed(steps, compose), context)
 
     async def _localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
         form, context, clock = query.form, query.context, query.context.clock
@@ -203,21 +208,24 @@ class Localiser:
                 grid, joint = await self._search_turn(record, query, views, known, found_turns(found), heights[0])
                 found = judged_turn(found, joint)
         timings_ms = self.observe(context, found.stage)
-        answers = [
-            compose_answer(
-                picture,
-                locate=locate_in(record),
-                known=heading,
-                timings_ms=timings_ms,
-                bundle=self._bundle,
-                view=partial(view_answer, photograph, plan=plan, grid=grid),
-            )
-            for heading, picture, photograph in zip(
-                known, found.pictures, _photographs(views, found, one_spot=form.motion == "turn"), strict=True
-            )
-        ]
-        motions = form.steps(len(views))
-        return compose_sequence_answer(answers, found, motions, self._bundle.manifest)
+
+        def compose() -> SequenceAnswer:
+            answers = [
+                compose_answer(
+                    picture,
+                    locate=locate_in(record),
+                    known=heading,
+                    timings_ms=timings_ms,
+                    bundle=self._bundle,
+                    view=partial(view_answer, photograph, plan=plan, grid=grid),
+                )
+                for heading, picture, photograph in zip(
+                    known, found.pictures, _photographs(views, found, one_spot=form.motion == "turn"), strict=True
+                )
+            ]
+            return compose_sequence_answer(answers, found, form.steps(len(views)), self._bundle.manifest)
+
+        return await self.compute(context, compose)
 
     async def _search_sequence(
         self,
@@ -349,20 +357,20 @@ class Localiser:
         except TimeoutError as error:
             raise DeadlineExceededError(context.limit_s) from error
 
-    async def run_search(
-        self, steps: Generator[RefinementJob | SequenceJob | None, Any, T], context: QueryContext
-    ) -> T:
-        """Run a search on the compute threads; it holds none in its pauses (None) and while LPO refines poses."""
-        step = await self.compute(context, partial(next_step, steps, None))
+    async def run_search(self, steps: SearchSteps[T], context: QueryContext) -> T:
+        """Run a search on the compute threads; it holds none in its pauses (None) and while a worker refines poses."""
+        lpo_timeout_s = partial(self._lpo_timeout_s, context)
+        step = await self.compute(context, partial(self._steps.next, steps, None, lpo_timeout_s))
         while step is None or isinstance(step, RefinementJob | SequenceJob):
             result = None
             if step is not None:
                 photographs = step.heading.shape[1] if isinstance(step, SequenceJob) else 1
-                limit_s = self._settings.lpo.deadline_s * work_factor(photographs)
-                timeout_s = min(limit_s, context.left_s - _RESERVED_S)
-                result = await self._optimiser.refine(step, timeout_s, context.client)
-            step = await self.compute(context, partial(next_step, steps, result))
+                result = await self._optimiser.refine(step, self._lpo_timeout_s(context, photographs), context.client)
+            step = await self.compute(context, partial(self._steps.next, steps, result, lpo_timeout_s))
         return step
+
+    def _lpo_timeout_s(self, context: QueryContext, photographs: int = 1) -> float:
+        return min(self._settings.lpo.deadline_s * work_factor(photographs), context.left_s - _RESERVED_S)
 
     def observe(self, context: QueryContext, stage: str) -> dict[str, float]:
         """Record an answer in the metrics; return the duration (ms) of each stage, and their `total`."""

@@ -19,6 +19,7 @@ from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import PanoramaQuery
+from service.query.search_steps import completed
 from service.query.stated_camera import known_heading
 from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, venue_height
@@ -135,22 +136,24 @@ class VenueLocaliser:
             clock=clock,
             hints=searched.hints,
         )
-        found = await self._localiser.run_search(steps, context)
-        timings_ms = self._localiser.observe(context, found.stage)
-        hint_warnings = hints.warnings(searched.hints, found, searched.rows, searched.merged)
-        share, probability = searched.shares(found)
-        answer = compose_answer(
-            found,
-            locate=searched.place,
-            known=known,
-            warnings=[*hint_warnings, *searched.warnings],
-            timings_ms=timings_ms,
-            bundle=self._bundle,
-            share=share,
-            view=partial(view_answer, photograph, plan=searched.merged.plan, grid=searched.merged.grid),
-        )
-        plans = self._plan_probabilities(searched, found, share, probability)
-        return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
+
+        def compose(found: Localisation) -> LocaliseAnswer:
+            hint_warnings = hints.warnings(searched.hints, found, searched.rows, searched.merged)
+            share, probability = searched.shares(found)
+            answer = compose_answer(
+                found,
+                locate=searched.place,
+                known=known,
+                warnings=[*hint_warnings, *searched.warnings],
+                timings_ms=self._localiser.observe(context, found.stage),
+                bundle=self._bundle,
+                share=share,
+                view=partial(view_answer, photograph, plan=searched.merged.plan, grid=searched.merged.grid),
+            )
+            plans = self._plan_probabilities(searched, found, share, probability)
+            return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
+
+        return await self._localiser.run_search(completed(steps, compose), context)
 
     def _plan_probabilities(
         self, searched: SearchedPlans, found: Localisation, share: float, probability: Float[np.ndarray, "m"]

@@ -15,7 +15,10 @@ from hypothesis import strategies as st
 
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.optimise import LpoConfig, PoseRefiner
+from lalaloc_core.localise.descent import LpoConfig, refine_walls
+from lalaloc_core.localise.descent.methods import descend
+from lalaloc_core.localise.descent.problem import Problem
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
@@ -187,6 +190,32 @@ class TestProfiles:
         np.testing.assert_allclose(result.cost, fit + latent_weight * latent_distance(result), rtol=1e-3, atol=1e-4)
         latents = latents_at(scene, result.position_m, result.heading)
         np.testing.assert_allclose(latent_distance(result), np.linalg.norm(latents - job.targets, axis=1), atol=1e-4)
+
+    @pytest.mark.parametrize("heading_known", [True, False])
+    @given(polygon=room_polygons(), seed=seeds())
+    @settings(max_examples=10)
+    def test_numpy_refines_as_torch_does(self, heading_known: bool, polygon: list, seed: int) -> None:
+        scene = scene_of(plan_of(polygon), 4, seed)
+        job = profile_job(job_near(scene, seed, heading_known=heading_known), scene, offset=0.03)
+        heights = np.zeros(4, np.float32)
+        job = dataclasses.replace(job, height_offset=heights, height_stiffness=3.0, height_bounds=(-0.1, 0.1))
+        by_torch = dataclasses.replace(job, targets=present(job.log_profile))
+        # Rounding decides which step is the last near a corner; before that, both take the same steps.
+        config = LpoConfig(max_iterations=3, prune_after=99)
+        expected = present(descend(Problem(COLUMNS, "cauchy", by_torch, torch.empty(0)), config))
+        result = present(refine_walls(job, config))
+        np.testing.assert_allclose(result.position_m, expected.position_m, atol=1e-4)
+        np.testing.assert_allclose(result.heading, expected.heading, atol=1e-4)
+        np.testing.assert_allclose(present(result.height_offset), present(expected.height_offset), atol=1e-4)
+        np.testing.assert_allclose(result.cost, expected.cost, atol=1e-4)
+        assert result.information.shape == expected.information.shape == (4, *2 * (2 if heading_known else 3,))
+
+    def test_unwanted_refinement_ends_before_the_next_iteration(self) -> None:
+        scene = scene_of(plan_of(L_ROOM), 3, 1)
+        job = profile_job(job_near(scene, 1, heading_known=False), scene)
+        asked = iter([True, True, False])
+        assert refine_walls(job, LM, wanted=lambda: next(asked)) is None
+        assert list(asked) == []
 
     @given(seeds())
     @settings(max_examples=10)

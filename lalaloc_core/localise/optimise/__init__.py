@@ -13,10 +13,10 @@ renderer are in closed form (`render.gradient`); those of the embedding, usually
 differentiation. `PoseOptimiser` accepts any differentiable function of a layout; a baseline of the paper compares the
 layouts themselves.
 
-Begin with `optimiser.py`; `problem.py` has the evaluation, `descent.py` the two optimisers.
+Begin with `optimiser.py`; `localise.descent` has the evaluation, the two optimisers, and refinement by walls on numpy.
 """
 
+from lalaloc_core.localise.descent import LpoConfig
 from lalaloc_core.localise.optimise.optimiser import PoseOptimiser, PoseRefiner
-from lalaloc_core.localise.optimise.problem import LpoConfig
 
 __all__ = ["LpoConfig", "PoseOptimiser", "PoseRefiner"]

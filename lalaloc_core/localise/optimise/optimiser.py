@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,17 @@ from torch import Tensor
 
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt
-from lalaloc_core.localise.optimise.problem import Embedding, LpoConfig, Norm, Problem
+from lalaloc_core.localise.descent import LpoConfig, refine_walls
+from lalaloc_core.localise.descent.methods import descend
+from lalaloc_core.localise.descent.problem import Norm, Problem
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.render.gradient import ProfileJacobian
 from lalaloc_core.render.profile import wall_profile
+
+# Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
+Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class PoseOptimiser:
@@ -24,7 +30,7 @@ class PoseOptimiser:
 
     def __init__(
         self,
-        embedding: Embedding | None,
+        embedding: Embedding,
         columns: int,
         *,
         norm: Norm = "l2",
@@ -33,8 +39,8 @@ class PoseOptimiser:
     ) -> None:
         """Set the embedding and the norm.
 
-        `embedding` maps layouts with this many azimuth `columns` to what is compared with a job's targets (None: the
-        log wall profile itself); `norm` is the distance that is minimised. The default device is the CPU.
+        `embedding` maps layouts with this many azimuth `columns` to what is compared with a job's targets; `norm` is
+        the distance that is minimised. The default device is the CPU.
 
         Raises:
             ConfigError: Levenberg-Marquardt with absolute differences.
@@ -52,23 +58,44 @@ class PoseOptimiser:
 
         `cost` and `latent_distance` of the result are distances by this optimiser's norm.
         """
-        problem = Problem(self._embedding, self._columns, self._norm, job, self._device)
-        descend = adam if self.config.method == "adam" else levenberg_marquardt
+        problem = _EmbeddedProblem(self._embedding, self._columns, self._norm, job, self._device)
         with torch.no_grad():
-            pose, here, converged, evaluations = descend(problem, self.config)
-        position, heading, height_offset = problem.unpack(pose)
-        information = here.information if height_offset is None else _without_last(here.information)
-        distance = here.distance.cpu().numpy()
-        return RefinementResult(
-            position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
-            heading=heading.cpu().numpy().astype(np.float64),
-            cost=distance,
-            latent_distance=distance,
-            information=information.cpu().numpy(),
-            converged=converged.cpu().numpy(),
-            evaluations=np.full(len(distance), evaluations),
-            height_offset=None if height_offset is None else height_offset.cpu().numpy().astype(np.float64),
-        )
+            result = descend(problem, self.config)
+        # Without a time limit there is always a result.
+        assert result is not None
+        return result
+
+
+class _EmbeddedProblem(Problem):
+    """Residuals of embedded layouts, differentiated in forward mode."""
+
+    def __init__(
+        self, embedding: Embedding, columns: int, norm: Norm, job: RefinementJob, device: torch.device
+    ) -> None:
+        super().__init__(columns, norm, job, torch.empty(0, device=device))
+        self._embedding = embedding
+        self._camera_height_m = torch.as_tensor(job.camera_height_m, dtype=torch.float32, device=device)
+        self._ceiling_height_m = torch.as_tensor(job.ceiling_height_m, dtype=torch.float32, device=device)
+
+    @property
+    def pose_arrays(self) -> tuple[str, ...]:
+        return (*super().pose_arrays, "_camera_height_m", "_ceiling_height_m")
+
+    def embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
+        by_pose = layout.by_pose[:, : self._moving]
+        profile_m = layout.log_m.exp()
+        count = len(profile_m)
+
+        def repeat(value: Tensor) -> Tensor:
+            return value.repeat_interleave(self._moving, dim=0)
+
+        camera, ceiling = repeat(self._camera_height_m), repeat(self._ceiling_height_m)
+        embedding = self._embedding
+        tangent = (by_pose * profile_m[:, None]).flatten(0, 1)
+        value, derivative = torch.func.jvp(
+            lambda profile: embedding(profile, camera, ceiling), (repeat(profile_m),), (tangent,)
+        )[:2]
+        return value[:: self._moving], derivative.reshape(count, self._moving, -1)
 
 
 class PoseRefiner:
@@ -98,16 +125,15 @@ class PoseRefiner:
     def refine(self, job: RefinementJob) -> RefinementResult:
         """Refine every starting pose of a job within its own room, by wall profiles if it has them, else by latents."""
         if job.log_profile is None or job.precision is None:
-            return self._optimiser(self.encoder, "l2").refine(replace(job, precision=None))
-        by_profile = replace(job, targets=job.log_profile)
-        result = self._optimiser(None, "cauchy").refine(by_profile)
+            optimiser = PoseOptimiser(self.encoder, self._columns, config=self._config, device=self._device)
+            return optimiser.refine(replace(job, precision=None))
+        result = refine_walls(job, self._config)
+        # Without a time limit there is always a result.
+        assert result is not None
         if not job.latent_weight:
-            return replace(result, latent_distance=None)
+            return result
         distance = self._latent_distance(job, result)
         return replace(result, cost=result.cost + job.latent_weight * distance, latent_distance=distance)
-
-    def _optimiser(self, embedding: Embedding | None, norm: Norm) -> PoseOptimiser:
-        return PoseOptimiser(embedding, self._columns, norm=norm, config=self._config, device=self._device)
 
     @torch.no_grad()
     def _latent_distance(self, job: RefinementJob, result: RefinementResult) -> Float[np.ndarray, "k"]:
@@ -120,9 +146,3 @@ class PoseRefiner:
         profile = wall_profile(torch.zeros_like(relative[:, 0, :2]), tensor(result.heading), relative, self._columns)
         latent = self.encoder(profile, tensor(job.camera_height_m), tensor(job.ceiling_height_m))
         return torch.linalg.vector_norm(latent - tensor(job.targets), dim=1).cpu().numpy()
-
-
-def _without_last(information: Float[Tensor, "k p p"]) -> Float[Tensor, "k q q"]:
-    """Return the information about all unknowns but the last, which is integrated out (Schur complement)."""
-    cross, last = information[:, :-1, -1], information[:, -1, -1].clamp_min(1e-9)
-    return information[:, :-1, :-1] - cross[:, :, None] * cross[:, None, :] / last[:, None, None]

@@ -6,8 +6,8 @@ profile of the layout at u, the embedding Φ of the layout (or the log profile i
 
     r = p (Φ(layout(u)) - f - δ)                                           `Problem.evaluate`
 
-with the Jacobian J = ∂r / ∂u: the derivative of the renderer in closed form, times that of Φ by forward-mode
-differentiation (`Problem._embedded`). The cost that Levenberg-Marquardt lowers, its slope and its Gauss-Newton
+with the Jacobian J = ∂r / ∂u: the derivative of the renderer in closed form, times that of Φ, which a subclass of
+`Problem` provides (`embedded`). The cost that Levenberg-Marquardt lowers, its slope and its Gauss-Newton
 curvature are
 
     C = ½ Σ ρ(r) + ½ Σ (s u)²    C' = J w r + s² u    H = J w Jᵀ + s²      `Problem._evaluation`
@@ -19,20 +19,17 @@ absolute residuals for "l1", and the mean of log(1 + r²) for "cauchy", which is
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
+from array_api_compat import array_namespace, device, to_device
 from jaxtyping import Float, Int
-from torch import Tensor
 
-from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.conventions import Array
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.render.gradient import ProfileJacobian, free_travel_m, log_profile_gradient
 
-# Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
-Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
 # Distance that is minimised: Euclidean, mean absolute difference, or the mean of log(1 + r²).
 Norm = Literal["l2", "l1", "cauchy"]
 
@@ -89,17 +86,17 @@ class Evaluation:
         gradient: (k, p) derivative of the distance.
     """
 
-    cost: Float[Tensor, "k"]
-    slope: Float[Tensor, "k p"]
-    information: Float[Tensor, "k p p"]
-    distance: Float[Tensor, "k"]
-    gradient: Float[Tensor, "k p"]
+    cost: Float[Array, "k"]
+    slope: Float[Array, "k p"]
+    information: Float[Array, "k p p"]
+    distance: Float[Array, "k"]
+    gradient: Float[Array, "k p"]
 
-    def rows(self, index: Int[Tensor, "m"]) -> Evaluation:
+    def rows(self, index: Int[Array, "m"]) -> Evaluation:
         """Return the evaluation of some of the poses."""
         return Evaluation(*(value[index] for value in vars(self).values()))
 
-    def take_over(self, index: Int[Tensor, "m"], other: Evaluation) -> None:
+    def take_over(self, index: Int[Array, "m"], other: Evaluation) -> None:
         """Replace these rows by those of `other`."""
         for name, value in vars(self).items():
             value[index] = getattr(other, name)
@@ -108,129 +105,156 @@ class Evaluation:
 class Problem:
     """Residuals of one job as a function of the unknowns: x, y, then heading and height offset if they are refined.
 
-    Positions are relative to each starting pose, to keep millimetres in single precision in large plans.
+    The arrays are of `like`'s library and on its device. Positions are relative to each starting pose, to keep
+    millimetres in single precision in large plans.
     """
 
-    def __init__(
-        self, embedding: Embedding | None, columns: int, norm: Norm, job: RefinementJob, device: torch.device
-    ) -> None:
-        """Set up the problem.
+    def __init__(self, columns: int, norm: Norm, job: RefinementJob, like: Array) -> None:
+        """Set up the problem; `columns` and `norm` are as in `PoseOptimiser`."""
+        xp = array_namespace(like)
 
-        The arguments are those of `PoseOptimiser`, and the refinement job.
-        """
+        def array(values: np.ndarray) -> Array:
+            return xp.asarray(np.asarray(values, dtype=np.float32), device=device(like))
 
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(array, dtype=torch.float32, device=device)
-
-        self._embedding = embedding
         self._columns = columns
         self.norm: Norm = norm
         self.origin = job.position_m
-        self._walls_m = tensor(job.walls_m - np.tile(job.position_m, 2)[:, None, :])
-        self._heading = tensor(job.heading)
-        self._camera_height_m = tensor(job.camera_height_m)
-        self._ceiling_height_m = tensor(job.ceiling_height_m)
-        self._targets = tensor(job.targets)
-        self._precision = None if job.precision is None else tensor(job.precision)
+        self._walls_m = array(job.walls_m - np.tile(job.position_m, 2)[:, None, :])
+        self._heading = array(job.heading)
+        self._targets = array(job.targets)
+        self._precision = None if job.precision is None else array(job.precision)
         # Number of unknowns that move the layout; the camera height follows them.
         self._moving = 3 if job.optimise_heading else 2
         self._height_bounds = job.height_bounds
-        stiffness = [0.0] * self._moving
-        start = torch.zeros(len(job.targets), self._moving, device=device)
+        start, stiffness = np.zeros((len(job.targets), self._moving)), [0.0] * self._moving
         if job.height_offset is not None:
-            start = torch.cat([start, tensor(job.height_offset)[:, None]], dim=1)
+            start = np.concatenate([start, job.height_offset[:, None]], axis=1)
             stiffness.append(job.height_stiffness)
-        self.start = start
-        self._stiffness = torch.tensor(stiffness, device=device).square()
+        self.start = array(start)
+        self._stiffness = array(np.square(stiffness))
 
     def unpack(
-        self, pose: Float[Tensor, "k p"]
-    ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"], Float[Tensor, "k"] | None]:
+        self, pose: Float[Array, "k p"]
+    ) -> tuple[Float[Array, "k 2"], Float[Array, "k"], Float[Array, "k"] | None]:
         """Return position (m, relative to the start), heading (radians), and height offset if it is solved for."""
         turned = self._heading + pose[:, 2] if self._moving == 3 else self._heading
         return pose[:, :2], turned, pose[:, self._moving] if pose.shape[1] > self._moving else None
 
-    def rows(self, index: Int[Tensor, "m"]) -> Problem:
+    def rows(self, index: Int[Array, "m"]) -> Problem:
         """Return the problem of some of the poses."""
-        part = object.__new__(Problem)
+        part = object.__new__(type(self))
         part.__dict__.update(self.__dict__)
-        for name in ("_walls_m", "_heading", "_camera_height_m", "_ceiling_height_m", "_targets", "_precision"):
+        for name in self.pose_arrays:
             value = getattr(self, name)
             setattr(part, name, None if value is None else value[index])
-        part.start, part.origin = self.start[index], self.origin[index.cpu().numpy()]
+        part.origin = self.origin[_numpy(index)]
         return part
 
-    def evaluate(self, pose: Float[Tensor, "k p"]) -> Evaluation:
+    @property
+    def pose_arrays(self) -> tuple[str, ...]:
+        """Names of the arrays with a row for each pose."""
+        return ("_walls_m", "_heading", "_targets", "_precision", "start")
+
+    def evaluate(self, pose: Float[Array, "k p"]) -> Evaluation:
         """Return the costs at these poses with their derivatives, from the residuals r and the Jacobian J."""
+        xp = array_namespace(pose)
         position_m, heading, height_offset = self.unpack(pose)
         layout = log_profile_gradient(position_m, heading, self._walls_m, self._columns)
-        value, jacobian = self._embedded(layout)
+        value, jacobian = self.embedded(layout)
         residual = value - self._targets
         if height_offset is not None:
             # The offset adds to the target, equally at all azimuths, so its column of J is -1.
             residual = residual - height_offset[:, None]
-            jacobian = torch.cat([jacobian, torch.full_like(residual, -1.0)[:, None]], dim=1)
+            jacobian = xp.concat([jacobian, xp.full_like(residual, -1.0)[:, None]], axis=1)
         if self._precision is not None:
             residual, jacobian = residual * self._precision, jacobian * self._precision[:, None]
         return self._evaluation(pose, residual, jacobian)
 
-    def _embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
-        """Return Φ of the layouts, and its derivatives by the m unknowns that move the layout."""
-        by_pose = layout.by_pose[:, : self._moving]
-        if self._embedding is None:
-            return layout.log_m, by_pose
-        profile_m = layout.log_m.exp()
-        count = len(profile_m)
-
-        def repeat(value: Tensor) -> Tensor:
-            return value.repeat_interleave(self._moving, dim=0)
-
-        camera, ceiling = repeat(self._camera_height_m), repeat(self._ceiling_height_m)
-        embedding = self._embedding
-        tangent = (by_pose * profile_m[:, None]).flatten(0, 1)
-        value, derivative = torch.func.jvp(
-            lambda profile: embedding(profile, camera, ceiling), (repeat(profile_m),), (tangent,)
-        )[:2]
-        return value[:: self._moving], derivative.reshape(count, self._moving, -1)
+    def embedded(self, layout: ProfileJacobian) -> tuple[Float[Array, "k d"], Float[Array, "k m d"]]:
+        """Return Φ of the layouts, here their log profile, and its derivatives by the m unknowns that move them."""
+        return layout.log_m, layout.by_pose[:, : self._moving]
 
     def _evaluation(
-        self, pose: Float[Tensor, "k p"], residual: Float[Tensor, "k d"], jacobian: Float[Tensor, "k p d"]
+        self, pose: Float[Array, "k p"], residual: Float[Array, "k d"], jacobian: Float[Array, "k p d"]
     ) -> Evaluation:
         """Return C, C', H, D and its gradient, from r and J; `self._stiffness` is s²."""
+        xp = array_namespace(pose)
         prior_slope = pose * self._stiffness
-        prior = 0.5 * (pose * prior_slope).sum(dim=1)
+        prior = 0.5 * xp.sum(pose * prior_slope, axis=1)
         if self.norm == "cauchy":
-            factor = 1.0 + residual.square()
-            total, weight = factor.log().sum(dim=1), 1.0 / factor
+            factor = 1.0 + xp.square(residual)
+            total, weight = xp.sum(xp.log(factor), axis=1), 1.0 / factor
             slope = _by_unknown(jacobian, residual * weight)
             distance, gradient = total / residual.shape[1], 2.0 * slope / residual.shape[1]
-            information = (jacobian * weight[:, None]) @ jacobian.mT
+            information = (jacobian * weight[:, None]) @ xp.matrix_transpose(jacobian)
         else:
-            total = residual.square().sum(dim=1)
-            slope, information = _by_unknown(jacobian, residual), jacobian @ jacobian.mT
+            total = xp.sum(xp.square(residual), axis=1)
+            slope, information = _by_unknown(jacobian, residual), jacobian @ xp.matrix_transpose(jacobian)
             if self.norm == "l1":
-                distance = residual.abs().mean(dim=1)
-                gradient = _by_unknown(jacobian, residual.sign()) / residual.shape[1]
+                distance = xp.mean(xp.abs(residual), axis=1)
+                gradient = _by_unknown(jacobian, xp.sign(residual)) / residual.shape[1]
             else:
-                distance = total.sqrt()
-                gradient = slope / distance.clamp_min(1e-9)[:, None]
-        information = information + torch.diag(self._stiffness)
+                distance = xp.sqrt(total)
+                gradient = slope / xp.maximum(distance, 1e-9)[:, None]
+        information = information + diagonal(self._stiffness)
         return Evaluation(0.5 * total + prior, slope + prior_slope, information, distance, gradient)
 
     def stay_inside(
-        self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig
-    ) -> Float[Tensor, "k p"]:
+        self, pose: Float[Array, "k p"], step: Float[Array, "k p"], config: LpoConfig
+    ) -> Float[Array, "k p"]:
         """Return the steps, shortened so that poses keep the margin to walls and all limits of the settings."""
-        length = torch.linalg.vector_norm(step[:, :2], dim=1)
-        allowed = free_travel_m(pose[:, :2], step[:, :2], self._walls_m, config.margin_m).clamp(max=config.max_step_m)
-        scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
-        turn = step[:, 2 : self._moving].clamp(-config.max_turn, config.max_turn)
+        xp = array_namespace(pose)
+        length = xp.linalg.vector_norm(step[:, :2], axis=1)
+        allowed = free_travel_m(pose[:, :2], step[:, :2], self._walls_m, config.margin_m)
+        allowed = xp.minimum(allowed, config.max_step_m)
+        scale = xp.where(length > allowed, allowed / xp.maximum(length, 1e-9), xp.ones_like(length))
+        turn = clipped(step[:, 2 : self._moving], -config.max_turn, config.max_turn)
         height, (low, high) = pose[:, self._moving :], self._height_bounds
-        return torch.cat(
-            [step[:, :2] * scale[:, None], turn, (height + step[:, self._moving :]).clamp(low, high) - height], dim=1
+        raised = clipped(height + step[:, self._moving :], low, high) - height
+        return xp.concat([step[:, :2] * scale[:, None], turn, raised], axis=1)
+
+    def result(
+        self, pose: Float[Array, "k p"], found: Evaluation, converged: Array, evaluations: int
+    ) -> RefinementResult:
+        """Return the result of a descent that ended at these poses; both of its costs are the distance D."""
+        position, heading, height_offset = self.unpack(pose)
+        information = found.information if height_offset is None else _without_last(found.information)
+        distance = _numpy(found.distance)
+        return RefinementResult(
+            position_m=_numpy(position).astype(np.float64) + self.origin,
+            heading=_numpy(heading).astype(np.float64),
+            cost=distance,
+            latent_distance=distance,
+            information=_numpy(information),
+            converged=_numpy(converged),
+            evaluations=np.full(len(distance), evaluations),
+            height_offset=None if height_offset is None else _numpy(height_offset).astype(np.float64),
         )
 
 
-def _by_unknown(jacobian: Float[Tensor, "k p d"], values: Float[Tensor, "k d"]) -> Float[Tensor, "k p"]:
+def diagonal(values: Float[Array, "*k p"]) -> Float[Array, "*k p p"]:
+    """Return diagonal matrices."""
+    xp = array_namespace(values)
+    return values[..., None] * xp.eye(values.shape[-1], dtype=values.dtype, device=device(values))
+
+
+def clipped(values: Float[Array, "*n"], low: float, high: float) -> Float[Array, "*n"]:
+    """Return values within limits; several times as fast as the array API's `clip`."""
+    xp = array_namespace(values)
+    return xp.minimum(xp.maximum(values, low), high)
+
+
+def _by_unknown(jacobian: Float[Array, "k p d"], values: Float[Array, "k d"]) -> Float[Array, "k p"]:
     """Return the product of the Jacobian and the values of each pose."""
     return (jacobian @ values[:, :, None])[:, :, 0]
+
+
+def _without_last(information: Float[Array, "k p p"]) -> Float[Array, "k q q"]:
+    """Return the information about all unknowns but the last, which is integrated out (Schur complement)."""
+    xp = array_namespace(information)
+    cross, last = information[:, :-1, -1], xp.maximum(information[:, -1, -1], 1e-9)
+    return information[:, :-1, :-1] - cross[:, :, None] * cross[:, None, :] / last[:, None, None]
+
+
+def _numpy(values: Array) -> np.ndarray:
+    return np.asarray(to_device(values, "cpu"))

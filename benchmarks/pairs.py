@@ -1,0 +1,165 @@
+"""CPU time per query of two checkouts of this repository, taken in turns, and the differences of their answers.
+
+    git worktree add ../before v0.9.0
+    python -m benchmarks.pairs ../before . --rounds 6 --clients 1 4
+
+Each checkout runs the service of its own code with this interpreter. In every round each answers as many queries, in
+changing order, so that other load on the machine affects both; the CPU time (user and system) of all processes is
+counted, which load affects less than durations. Prints a Markdown table of medians over the rounds, and the largest
+differences. Exits with 1 if an answer of one checkout is more than 1e-6 m, degrees or probability from the other's.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import psutil
+
+from benchmarks.harness import UNLIMITED, argument_parser, free_port, query_of, upload_example_plan
+from examples.truth import read_poses
+
+_START_S, _TIMEOUT_S, _WARM_UP = 180.0, 60.0, 20
+_TOLERANCE = 1e-6
+
+
+@dataclass(eq=False)
+class _Checkout:
+    """Running service of a checkout, with the example plan."""
+
+    name: str
+    url: str
+    process: psutil.Process
+    plan_id: str
+    answers: dict[tuple[bool, int], dict[str, Any]] = field(default_factory=dict)
+
+    def ask(self, client: httpx.Client, number: int, *, known: bool) -> float:
+        """Localise an example panorama; return the duration (s)."""
+        poses = read_poses()
+        query = query_of(poses[number % len(poses)], floorplan_id=self.plan_id)
+        if not known:
+            del query["data"]["heading_deg"]
+        begin = time.perf_counter()
+        response = client.post("/localise", **query).raise_for_status()
+        duration_s = time.perf_counter() - begin
+        self.answers[known, number % len(poses)] = response.json()
+        return duration_s
+
+    def burst(self, queries: int, clients: int, *, known: bool) -> _Burst:
+        """Answer queries of several clients; return CPU time per query, duration and rate."""
+        before_s, begin = self._cpu_s(), time.perf_counter()
+        with ThreadPoolExecutor(clients) as threads:
+            parts = threads.map(lambda first: self._series(range(first, queries, clients), known=known), range(clients))
+            durations_s = [duration for part in parts for duration in part]
+        wall_s = time.perf_counter() - begin
+        return _Burst(1e3 * (self._cpu_s() - before_s) / queries, [1e3 * s for s in durations_s], queries / wall_s)
+
+    def _series(self, numbers: Sequence[int], *, known: bool) -> list[float]:
+        with httpx.Client(base_url=self.url, timeout=_TIMEOUT_S) as client:
+            return [self.ask(client, number, known=known) for number in numbers]
+
+    def _cpu_s(self) -> float:
+        times = [part.cpu_times() for part in (self.process, *self.process.children(recursive=True))]
+        return sum(part.user + part.system for part in times)
+
+
+@dataclass(frozen=True)
+class _Burst:
+    cpu_ms: float
+    durations_ms: list[float]
+    per_second: float
+
+
+def main() -> int:
+    """Measure; return 1 when answers differ."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("checkouts", nargs=2, type=Path, help="folders of the checkouts, the one before first")
+    parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--queries", type=int, default=80, help="queries of each checkout and round")
+    parser.add_argument("--clients", type=int, nargs="*", default=(1, 4))
+    options = parser.parse_args()
+    with ExitStack() as stack:
+        checkouts = [stack.enter_context(_running(folder.resolve())) for folder in options.checkouts]
+        print("| heading | clients | checkout | CPU per query | p50 | p99 | queries/s |", flush=True)
+        print("|---|---|---|---|---|---|---|", flush=True)
+        for known in (True, False):
+            for clients in options.clients:
+                for row in _rows(checkouts, options.rounds, options.queries, clients, known=known):
+                    print(row, flush=True)
+    differences = _differences(*checkouts)
+    print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
+    return int(max(differences.values()) > _TOLERANCE)
+
+
+def _rows(checkouts: list[_Checkout], rounds: int, queries: int, clients: int, *, known: bool) -> Iterator[str]:
+    for checkout in checkouts:
+        checkout.burst(_WARM_UP, clients, known=known)
+    bursts: dict[str, list[_Burst]] = {checkout.name: [] for checkout in checkouts}
+    for index in range(rounds):
+        for checkout in checkouts if index % 2 else reversed(checkouts):
+            bursts[checkout.name].append(checkout.burst(queries, clients, known=known))
+    for name, found in bursts.items():
+        durations_ms = [duration for burst in found for duration in burst.durations_ms]
+        p50, p99 = np.quantile(durations_ms, [0.5, 0.99])
+        cpu_ms = statistics.median(burst.cpu_ms for burst in found)
+        rate = statistics.median(burst.per_second for burst in found)
+        heading = "known" if known else "unknown"
+        yield f"| {heading} | {clients} | {name} | {cpu_ms:.1f} ms | {p50:.0f} ms | {p99:.0f} ms | {rate:.1f} |"
+
+
+def _differences(before: _Checkout, after: _Checkout) -> dict[str, float]:
+    """Return the largest absolute differences of the answers to equal queries."""
+    largest: dict[str, float] = {"position (m)": 0.0, "heading (°)": 0.0, "confidence": 0.0}
+    for key, old in before.answers.items():
+        new = after.answers[key]
+        turned = (new["heading_deg"] - old["heading_deg"] + 180.0) % 360.0 - 180.0
+        moved = max(abs(new["position"][axis] - old["position"][axis]) for axis in ("x_m", "y_m"))
+        found = moved, abs(turned), abs((new["confidence"] or 0.0) - (old["confidence"] or 0.0))
+        largest = {name: max(value, part) for (name, value), part in zip(largest.items(), found, strict=True)}
+    return largest
+
+
+@contextmanager
+def _running(folder: Path) -> Iterator[_Checkout]:
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
+    with tempfile.TemporaryDirectory() as data:
+        environment = os.environ | UNLIMITED | {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
+        # The folder's own packages come before installed ones.
+        environment["PYTHONPATH"] = str(folder)
+        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+        try:
+            _wait_until_ready(url, process)
+            yield _Checkout(str(folder.name), url, psutil.Process(process.pid), upload_example_plan(url))
+        finally:
+            process.terminate()
+            process.wait(_START_S)
+
+
+def _wait_until_ready(url: str, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + _START_S
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            if httpx.get(f"{url}/readyz", timeout=_TIMEOUT_S).status_code == httpx.codes.OK:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.2)
+    raise RuntimeError(f"the service at {url} was not ready within {_START_S:g} s: see its messages above")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
