@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -198,6 +198,10 @@ class GridProvider:
             StoreUnavailableError: the grid is not in memory, and the database is unavailable.
         """
         return self._cache.find(key)
+
+    def find_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
+        """Return the computed grids among `keys`; raises as `find` does."""
+        return self._cache.find_all(keys)
 
     def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
         """Make and store the prototypes of a grid that was stored without; None if the grid was deleted."""

@@ -799,7 +799,9 @@ _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m",
 
 
 def _undo_tenants(connection: Connection) -> None:
-    """Undo the migrations 0007 to 0009."""
+    """Undo the migrations 0007 to 0011."""
+    connection.exec_driver_sql("DROP INDEX floorplans_by_change")
+    connection.exec_driver_sql("ALTER TABLE floorplans DROP COLUMN changed")
     connection.exec_driver_sql("DROP TABLE sessions")
     connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
     connection.exec_driver_sql("DROP TABLE tenants")

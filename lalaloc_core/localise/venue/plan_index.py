@@ -244,7 +244,7 @@ class PlanIndex:
         (k, j), per_family = costs.shape, len(self.cells) // FAMILIES
         if len(self) * k * j <= scanned:
             return None
-        sizes = sum(part.cell_sizes for part in self.parts)
+        sizes = np.sum([part.cell_sizes for part in self.parts], axis=0)
         nonempty = by_family(np.flatnonzero(sizes), per_family)
         costs_of = self.cells.costs(costs, nonempty)
         cost = np.concatenate([costs_of[family][cell % per_family].ravel() for family, cell in nonempty.items()])
@@ -265,7 +265,5 @@ class PlanIndex:
         return probed
 
 
-def _part(
-    rows: np.ndarray, begin: np.ndarray, count: np.ndarray, numbers: Int[np.ndarray, "p"], cells: Cells
-) -> _Part:
+def _part(rows: np.ndarray, begin: np.ndarray, count: np.ndarray, numbers: Int[np.ndarray, "p"], cells: Cells) -> _Part:
     return _Part(Segment.build(rows, begin, count, cells), numbers, np.empty(0, np.intp))

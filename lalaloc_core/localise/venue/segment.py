@@ -46,9 +46,7 @@ class Segment:
     cell_begin: Int[np.ndarray, "v"]
 
     @classmethod
-    def build(
-        cls, rows: np.ndarray, begin: Int[np.ndarray, "p"], count: Int[np.ndarray, "p"], cells: Cells
-    ) -> Segment:
+    def build(cls, rows: np.ndarray, begin: Int[np.ndarray, "p"], count: Int[np.ndarray, "p"], cells: Cells) -> Segment:
         """Return the segment of plans whose prototypes are in `rows`; see `PlanIndex.build`."""
         owner = np.repeat(np.arange(len(count), dtype=np.int32), count)
         ends = np.cumsum(count)
