@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Self
@@ -16,7 +16,7 @@ from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
-from service.grids.embedding import check_size, embed
+from service.grids.embedding import RENDERED, check_size, embed
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
 from service.schemas import PlanStatus
@@ -154,16 +154,21 @@ class GridProvider:
         if self._estimate(plan) > self._settings.grids.inline_grid_poses:
             return None
         try:
-            with self._telemetry.timed(self._telemetry.grid_seconds):
-                grid = embed(
-                    plan,
-                    self._encoders,
-                    step_m=self._settings.grids.grid_step_m,
-                    camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
-                    computing=partial(self._permits.hold, client),
-                )
-            with self._permits.hold(client):
-                prototypes = SortedPrototypes.of_grid(grid, plan)
+            hold = partial(self._permits.hold, client)
+            # Work of a few milliseconds needs one permit; each permit can wake another thread.
+            is_brief = self._estimate(plan) <= RENDERED
+            with hold() if is_brief else nullcontext():
+                part = nullcontext if is_brief else hold
+                with self._telemetry.timed(self._telemetry.grid_seconds):
+                    grid = embed(
+                        plan,
+                        self._encoders,
+                        step_m=self._settings.grids.grid_step_m,
+                        camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
+                        computing=part,
+                    )
+                with part():
+                    prototypes = SortedPrototypes.of_grid(grid, plan)
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
             # The background will fail as well, and store the error with the plan.

@@ -250,9 +250,10 @@ class VenuePlans:
         state = self._store.venues.state(venue_id)
         venue = self._venues.get(venue_id)
         if venue is None or venue.state != state:
-            changed = None if venue is None else self._changed(tenant, venue_id, venue, state)
-            rows = self._store.venues.searchable_plans(venue_id, *self._grids.model) if changed is None else changed
-            venue = _Venue(state, rows if isinstance(rows, PlanList) else PlanList.of(rows))
+            rows = None if venue is None else self._changed(tenant, venue_id, venue, state)
+            if rows is None:
+                rows = PlanList.of(self._store.venues.searchable_plans(venue_id, *self._grids.model))
+            venue = _Venue(state, rows)
             self._venues.put(venue_id, venue)
         return venue.rows
 
@@ -260,20 +261,16 @@ class VenuePlans:
         """Return the rows of a venue after a change, most of them from before; None to read all of them."""
         if not state.shows_changes_since(venue.state):
             return None
-        store, rows = self._store.venues, {row.plan_id: row for row in venue.rows}
-        changed = [plan_id for plan_id in store.changed_plans(tenant, venue.state.changes) if plan_id in rows]
+        store, before = self._store.venues, set(venue.rows.members)
+        after, changed = before, set(store.changed_plans(tenant, venue.state.changes))
         if state.revision_id != venue.state.revision_id:
-            places = {member.plan_id: (member.level, member.name) for member in store.members(venue_id)}
-            rows = {key: row for key, row in rows.items() if places.get(key) == (row.level, row.name_in_venue)}
-            changed = [plan_id for plan_id in changed if plan_id in rows]
-            changed += [plan_id for plan_id in places if plan_id not in rows]
-        if 2 * len(changed) > len(rows):
+            after = set(map(tuple, store.members(venue_id)))
+        left = {member for member in before & after if member[1] not in changed}
+        read = [plan_id for _, plan_id, _ in after - left]
+        if 2 * len(read) > len(after):
             return None
-        if not changed and len(rows) == len(venue.rows):
-            return venue.rows
-        fresh = store.searchable_plans(venue_id, *self._grids.model, changed)
-        rows = {key: row for key, row in rows.items() if key not in set(changed)} | {row.plan_id: row for row in fresh}
-        return PlanList(sorted(rows.values(), key=lambda row: (row.level, row.plan_id)))
+        fresh = PlanList.of(store.searchable_plans(venue_id, *self._grids.model, read) if read else [])
+        return venue.rows.updated({plan_id for _, plan_id, _ in before - left}, fresh)
 
     async def _make_index(self, tenant: str, ready: PlanList, compute: Compute, base: _Indexed | None) -> _Indexed:
         """Return the index of plans, beginning with that of most of them if there is one."""

@@ -237,9 +237,9 @@ class Venues:
         return VenueState(None, 0, 0) if row is None else VenueState(*row)
 
     def members(self, venue_id: str) -> Sequence[Any]:
-        """Return `plan_id`, `level` and `name`, None for the plan's own one, of every plan of a venue."""
+        """Return `level`, `plan_id` and `name`, None for the plan's own one, of every plan of a venue."""
         columns = VENUE_PLANS.c
-        query = select(columns.plan_id, columns.level, columns.name).where(columns.venue_id == venue_id)
+        query = select(columns.level, columns.plan_id, columns.name).where(columns.venue_id == venue_id)
         with self._database.reading() as connection:
             return connection.execute(query).all()
 
