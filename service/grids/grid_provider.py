@@ -29,6 +29,8 @@ from service.tenancy.fair_share import FairSemaphore
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16
+# Share of the cache that small grids may fill before a query reads them.
+_UNREAD_SHARE = 1.0 / 32.0
 
 
 @dataclass(frozen=True)
@@ -188,9 +190,15 @@ class GridProvider:
         return packed_bytes(self._estimate(plan), manifest.profile_columns, latent_size)
 
     def on_plan_stored(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
-        """Cache the grid that was stored with a plan, or queue its computation."""
+        """Cache the grid that was stored with a plan, or queue its computation.
+
+        Beyond a share of the cache, small grids enter memory with the first query that reads them, so that the upload
+        of thousands of homes does not displace the grids that queries use.
+        """
         if prepared is not None:
-            self._cache.put(prepared.key(record.revision_id), prepared.grid)
+            is_small, limit_bytes = len(prepared.grid.poses) <= RENDERED, self._settings.storage.grid_cache_bytes
+            if not is_small or self._cache.bytes < _UNREAD_SHARE * limit_bytes:
+                self._cache.put(prepared.key(record.revision_id), prepared.grid)
             return
         # A grid that cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):
