@@ -63,6 +63,8 @@ _MAX_STRETCH = 0.1
 # Pairs that brute force compares exactly where it compares all pairs by codes.
 _MAX_COMPARED = 1_000_000
 _STEP_M = 0.5
+# Homes that `recall` generates at most; further plans are variants of them. Ranks within which it counts right plans.
+_HOMES, _RANKS = 2500, (1, 20, 128)
 
 _Figures = defaultdict[str, defaultdict[str, list[Any]]]
 
@@ -129,6 +131,39 @@ def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, 
         yield number, "heading known", encoders.query(image, shot.heading, known)
         yield number, "heading unknown", encoders.query(image, None, known)
         yield number, "heading and height unknown", encoders.query(image, None, unknown)
+
+
+def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[str, dict[str, float]]:
+    """Return how often the index ranks the right plan among the first ones, and its processor time.
+
+    Args:
+        bundle: the model.
+        plans: number of plans, homes and variants of them.
+        photographs: number of photographs, each of another home where there are as many.
+        seed: seed of the homes.
+    """
+    homes = min(plans, _HOMES)
+    blocks = repeated(prototypes(homes, seed), plans // homes, np.random.default_rng(seed))
+    count = np.array([len(block) for block in blocks])
+    rows, cells = np.concatenate(blocks), shipped_cells()
+    index = PlanIndex.build(rows, np.cumsum(count) - count, count, step_m=_STEP_M, cells=cells)
+    index.prepare()
+    columns: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    photographed = np.linspace(0, homes - 1, photographs).astype(int).tolist()
+    for number, name, query in queries(bundle, photographed, seed):
+        begin = time.process_time()
+        mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
+        seconds = time.process_time() - begin
+        columns[name].append((int((mass > mass[number]).sum()), seconds))
+    return {
+        name: {
+            "plans": len(blocks),
+            "n": len(values),
+            **{f"right_among_{first}": float(np.mean([rank < first for rank, _ in values])) for first in _RANKS},
+            "cpu_ms_p50": round(1e3 * float(np.median([seconds for _, seconds in values])), 1),
+        }
+        for name, values in columns.items()
+    }
 
 
 def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:

@@ -19,7 +19,7 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 from lalaloc_core.localise.poses import PoseGrid
-from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, nearest
+from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, half_norms, nearest
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
@@ -53,14 +53,14 @@ def sample(homes: int, seed: int) -> np.ndarray:
 def centres(feature: Float[np.ndarray, "n f"], count: int, rounds: int, rng: np.random.Generator) -> np.ndarray:
     """Return the number of the nearest centre of each row after k-means."""
     centre = feature[rng.choice(len(feature), count, replace=False)]
-    chosen = nearest(feature, centre)
+    chosen = nearest(feature, centre, half_norms(centre))
     for _ in range(rounds):
         members = np.bincount(chosen, minlength=count)
         total = np.zeros_like(centre)
         np.add.at(total, chosen, feature)
         # A centre without members keeps its place.
         centre = np.where(members[:, None] > 0, total / np.maximum(members, 1)[:, None], centre)
-        chosen = nearest(feature, centre)
+        chosen = nearest(feature, centre, half_norms(centre))
     return chosen
 
 

@@ -57,6 +57,11 @@ class PoseGrid:
         kept = replace(layouts, log_profile=np.log(profile_m.astype(np.float32)).astype(np.float16))
         return cls.with_layouts(poses, None, profile_m, step_m, camera_height_m, kept)
 
+    @property
+    def is_rendered(self) -> bool:
+        """True if the layouts are in memory."""
+        return bool(self._layouts)
+
     def layouts(self, plan: FloorPlan) -> Layouts:
         """Return the layouts of the poses; rendered at first use, since grids are stored without openings."""
         if not self._layouts:

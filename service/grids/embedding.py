@@ -17,7 +17,7 @@ from service.errors import PlanTooLargeError
 from service.settings import Settings
 
 # Poses per chunk, for models with wall profiles and for models with latents; queries go first between chunks.
-_RENDERED, _EMBEDDED = 256, 128
+RENDERED, _EMBEDDED = 256, 128
 # Memory that queries add at first use. Per azimuth: the log distance, in half precision without latents, and a code.
 # Per pose: views through openings, and arrays of the coarse pass.
 _BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400
@@ -49,7 +49,7 @@ def embed(
     """
     with computing():
         poses = pose_grid(plan, step_m, after_room)
-    chunk = _RENDERED if encoders.predicts_profile else _EMBEDDED
+    chunk = RENDERED if encoders.predicts_profile else _EMBEDDED
     layouts, latents = [], []
     for first in range(0, len(poses), chunk):
         part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from lalaloc_core.localise.poses import PoseGrid
 from service.bounded_cache import BoundedCache
 from service.grids.embedding import grid_bytes
@@ -36,6 +38,16 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
             return grid
         self._telemetry.grid_cache_misses.inc()
         return self.load(key)
+
+    def find_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
+        """Return the grids of a model that are in memory or in the store, as `find` does; one read for all others."""
+        found = {key: grid for key in keys if (grid := self.cached(key)) is not None}
+        missing = [key for key in keys if key not in found]
+        self._telemetry.grid_cache_misses.inc(len(missing))
+        loaded = self._store.grids.get_all(missing) if missing else {}
+        for key, grid in loaded.items():
+            self.put(key, grid)
+        return found | loaded
 
     def load(self, key: GridKey) -> PoseGrid | None:
         """Return a grid as `find` does, without metrics."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Self
@@ -16,7 +16,7 @@ from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
-from service.grids.embedding import check_size, embed
+from service.grids.embedding import RENDERED, check_size, embed
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
 from service.schemas import PlanStatus
@@ -29,6 +29,8 @@ from service.tenancy.fair_share import FairSemaphore
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16
+# Share of the cache that small grids may fill before a query reads them.
+_UNREAD_SHARE = 1.0 / 32.0
 
 
 @dataclass(frozen=True)
@@ -154,16 +156,21 @@ class GridProvider:
         if self._estimate(plan) > self._settings.grids.inline_grid_poses:
             return None
         try:
-            with self._telemetry.timed(self._telemetry.grid_seconds):
-                grid = embed(
-                    plan,
-                    self._encoders,
-                    step_m=self._settings.grids.grid_step_m,
-                    camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
-                    computing=partial(self._permits.hold, client),
-                )
-            with self._permits.hold(client):
-                prototypes = SortedPrototypes.of_grid(grid, plan)
+            hold = partial(self._permits.hold, client)
+            # Work of a few milliseconds needs one permit; each permit can wake another thread.
+            is_brief = self._estimate(plan) <= RENDERED
+            with hold() if is_brief else nullcontext():
+                part = nullcontext if is_brief else hold
+                with self._telemetry.timed(self._telemetry.grid_seconds):
+                    grid = embed(
+                        plan,
+                        self._encoders,
+                        step_m=self._settings.grids.grid_step_m,
+                        camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
+                        computing=part,
+                    )
+                with part():
+                    prototypes = SortedPrototypes.of_grid(grid, plan)
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
             # The background will fail as well, and store the error with the plan.
@@ -183,9 +190,15 @@ class GridProvider:
         return packed_bytes(self._estimate(plan), manifest.profile_columns, latent_size)
 
     def on_plan_stored(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
-        """Cache the grid that was stored with a plan, or queue its computation."""
+        """Cache the grid that was stored with a plan, or queue its computation.
+
+        Beyond a share of the cache, small grids enter memory with the first query that reads them, so that the upload
+        of thousands of homes does not displace the grids that queries use.
+        """
         if prepared is not None:
-            self._cache.put(prepared.key(record.revision_id), prepared.grid)
+            is_small, limit_bytes = len(prepared.grid.poses) <= RENDERED, self._settings.storage.grid_cache_bytes
+            if not is_small or self._cache.bytes < _UNREAD_SHARE * limit_bytes:
+                self._cache.put(prepared.key(record.revision_id), prepared.grid)
             return
         # A grid that cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):
@@ -198,6 +211,10 @@ class GridProvider:
             StoreUnavailableError: the grid is not in memory, and the database is unavailable.
         """
         return self._cache.find(key)
+
+    def find_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
+        """Return the computed grids among `keys`; raises as `find` does."""
+        return self._cache.find_all(keys)
 
     def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
         """Make and store the prototypes of a grid that was stored without; None if the grid was deleted."""

@@ -23,6 +23,7 @@ from service.errors import SessionOutdatedError, VenueUnsearchableError
 from service.query.answers import Place
 from service.query.geopose import plan_anchor
 from service.query.localiser import Localiser
+from service.query.plan_list import PlanList
 from service.query.queries import TrackQuery
 from service.query.stated_camera import stated_height, stated_hints
 from service.query.venue_hints import VenueHints
@@ -74,7 +75,7 @@ class SessionGround:
 class ReadyPlans:
     """Rows of the plans of a venue that are ready, hints about the photograph, and warnings about other plans."""
 
-    rows: Sequence[Row[Any]]
+    rows: PlanList
     hints: VenueHints
     warnings: list[str]
 
@@ -121,7 +122,7 @@ class Grounds:
             hints = VenueHints.from_form(query.document, venue.anchor)
         members = partial(self._plans.members, venue.tenant, venue.id)
         rows, warnings = await self._search.ready(venue, members, hints, query.context)
-        small = [row for row in rows if row.poses <= MAX_POSES]
+        small = rows.chosen(rows.poses <= MAX_POSES)
         if len(small) < len(rows):
             large = f"{len(rows) - len(small)} floor plans have more than {MAX_POSES} grid poses"
             if not small:

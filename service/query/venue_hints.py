@@ -72,8 +72,7 @@ class VenueHints:
         Raises:
             InvalidHintError: no plan is on the level, or none is known to be near the place.
         """
-        levels = sorted({row.level for row in members})
-        if self.level is not None and self.level not in levels:
+        if self.level is not None and self.level not in (levels := sorted({row.level for row in members})):
             listed = ", ".join(f"{level:g}" for level in levels[:_MAX_LEVELS_LISTED])
             more = f" and {len(levels) - _MAX_LEVELS_LISTED} more" if len(levels) > _MAX_LEVELS_LISTED else ""
             raise InvalidHintError(
@@ -96,7 +95,10 @@ class VenueHints:
 
     def shares(self, rows: _Rows) -> dict[HintName, float]:
         """Return the share of the plans' area that the hints `level` and `near` leave."""
-        area, found = np.array([row.area_m2 for row in rows]), dict[HintName, float]()
+        found = dict[HintName, float]()
+        if self.level is None and self.place is None:
+            return found
+        area = np.array([row.area_m2 for row in rows])
         if self.level is not None:
             found["level"] = float(area[self._on_level(rows)].sum() / area.sum())
         if self.place is not None:

@@ -6,7 +6,6 @@ import hashlib
 import logging
 import math
 import threading
-from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from cachetools import LRUCache
+from jaxtyping import Float, Int, UInt64
 from sqlalchemy import Row
 
 from lalaloc_core.errors import InvalidHintError
@@ -28,12 +28,12 @@ from lalaloc_core.localise.venue.prototypes import most_probable
 from service.bounded_cache import BoundedCache
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider
+from service.query.plan_list import PlanList
 from service.query.prototype_file import BlockKey, PrototypeFile
 from service.schemas import EarthPoint
 from service.schemas.query_fields import CameraFields
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
-from service.storage.plan_lookup import parsed
 from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord, VenueState
 from service.telemetry import LOGGER_NAME
@@ -50,6 +50,8 @@ _MAX_NEAR = 2000
 _BATCH_SIZE = 1000
 # Approximate memory of a plan's row.
 _ROW_BYTES = 600
+# Maximum number of venues whose last index is remembered; the indices themselves are bounded in bytes.
+_MAX_LATEST = 1000
 
 
 # Function that runs CPU work on the threads of `Localiser`.
@@ -61,15 +63,25 @@ class _Venue:
     """Rows of a venue's plans, valid for one state of the venue."""
 
     state: VenueState
-    rows: Sequence[Row[Any]]
+    rows: PlanList
 
 
 @dataclass(frozen=True, eq=False)
 class _Indexed:
-    """Index of plans, and the numbers of these plans among the requested ones."""
+    """Index of plans, and the keys of their grids (`PlanList.keys`) in its order."""
 
-    place: Int[np.ndarray, "p"]
+    keys: UInt64[np.ndarray, "p"]
     index: PlanIndex
+
+    def numbers(self, plans: PlanList) -> Int[np.ndarray, "q"]:
+        """Return the number of each plan in the index; -1 for plans that are not in it."""
+        order = np.argsort(self.keys)
+        place = np.minimum(np.searchsorted(self.keys, plans.keys, sorter=order), len(order) - 1)
+        return np.where(self.keys[order[place]] == plans.keys, order[place], -1)
+
+
+class _NotInFileError(Exception):
+    """The prototype file has no room for all plans of an index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +102,9 @@ class ChosenPlans:
 class VenuePlans:
     """Reader of a venue's plans, which chooses among them by an index of their prototypes.
 
-    Prototypes lie in a file of this replica, filled from the database on demand. The rows of a venue's plans and the
-    places of their prototypes stay in memory until the state of the venue changes.
+    Prototypes lie in a file of this replica, filled from the database on demand. The rows of a venue's plans and their
+    index stay in memory. When plans of the venue change, their rows are read again, and a new index takes the others
+    from the old one.
     """
 
     def __init__(
@@ -124,16 +137,18 @@ class VenuePlans:
         self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: _ROW_BYTES * len(venue.rows))
         # Keys are digests of the plans' grids in order.
         self._indices: BoundedCache[bytes, _Indexed] = BoundedCache(
-            limit_bytes, lambda indexed: indexed.place.nbytes + indexed.index.nbytes
+            limit_bytes, lambda indexed: indexed.keys.nbytes + indexed.index.nbytes
         )
+        # Keys of the last index of all plans of a venue that are ready, which the next one begins with.
+        self._latest: LRUCache[str, bytes] = LRUCache(_MAX_LATEST)
         self._file: PrototypeFile | None = None
         self._building = threading.Lock()
 
-    async def members(self, tenant: str, venue_id: str) -> Sequence[Row[Any]]:
+    async def members(self, tenant: str, venue_id: str) -> PlanList:
         """Return the current row of every plan of a venue."""
-        return await self._reads.run(tenant, self._members, venue_id)
+        return await self._reads.run(tenant, self._members, tenant, venue_id)
 
-    async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
+    async def near(self, tenant: str, place: EarthPoint, within_m: float) -> PlanList:
         """Return rows of the tenant's anchored plans within `within_m` of a place, nearest first."""
         latitude, longitude = place.latitude, place.longitude
         reach_m = within_m + _MAX_REACH_M
@@ -141,16 +156,15 @@ class VenuePlans:
         rows = await self._reads.run(tenant, near, tenant, latitude, longitude, reach_m, *self._grids.model)
         distance_m = distances_m(rows, None, latitude, longitude)
         order = np.argsort(distance_m, kind="stable")
-        unique = {rows[int(k)].plan_id: rows[int(k)] for k in order if distance_m[k] <= within_m}
-        return list(unique.values())[:_MAX_NEAR]
+        return PlanList(PlanList.of([rows[int(k)] for k in order if distance_m[k] <= within_m])[:_MAX_NEAR])
 
-    def needs_choice(self, ready: Sequence[Row[Any]], query: Query) -> bool:
+    def needs_choice(self, ready: PlanList, query: Query) -> bool:
         """Tell whether the plans are too many, or too large, to search all of them in full."""
-        return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > most_poses(query, self._max_poses)
+        return len(ready) > MAX_SEARCHED or int(ready.poses.sum()) > most_poses(query, self._max_poses)
 
     async def index(
-        self, tenant: str, ready: Sequence[Row[Any]], compute: Compute
-    ) -> tuple[Sequence[Row[Any]], PlanIndex]:
+        self, tenant: str, ready: PlanList, compute: Compute, *, venue_id: str | None = None
+    ) -> tuple[PlanList, PlanIndex]:
         """Return the index of plans that are ready, and their rows in its order, without plans whose grid was deleted.
 
         Prototypes that are missing, or of an earlier format, are made and stored.
@@ -159,29 +173,29 @@ class VenuePlans:
             tenant: their owner.
             ready: rows of the plans.
             compute: runs CPU work.
+            venue_id: id of the venue, if these are all of its plans that are ready.
         """
-        digest = hashlib.sha256("".join(f"{row.grid_id} {row.grid_sha256} " for row in ready).encode()).digest()
+        digest = hashlib.sha256(ready.keys.tobytes()).digest()
         indexed = self._indices.get(digest)
         if indexed is None:
-            found = await compute(partial(self._in_file, ready))
-            fresh = await self._fetched(tenant, [row for row in ready if _key(row) not in found])
-            place = np.array([k for k, row in enumerate(ready) if _key(row) in found or _key(row) in fresh], np.intp)
-            if not len(place):
-                # All were deleted or replaced just now; a retry finds the current ones.
-                raise StoreUnavailableError
-            there = [ready[int(k)] for k in place]
-            index = await compute(partial(self._indexed, there, fresh))
-            if index is None:
-                # The file has no room for all of them, so this index keeps them in memory.
-                fresh |= await self._fetched(tenant, [row for row in there if _key(row) not in fresh])
-                index = await compute(partial(self._in_memory, there, fresh))
-            indexed = _Indexed(place, index)
+            latest = None if venue_id is None else self._latest.get(venue_id)
+            base = None if latest is None else self._indices.get(latest)
+            if base is not None and 2 * int((base.numbers(ready) >= 0).sum()) < max(len(ready), len(base.keys)):
+                base = None
+            indexed = await self._make_index(tenant, ready, compute, base)
+            if base is not None and latest != digest:
+                # Queries in progress keep it; most of its memory is in the new one as well.
+                self._indices.drop(lambda key, _: key == latest)
             self._indices.put(digest, indexed)
-        return [ready[int(k)] for k in indexed.place], indexed.index
+        if venue_id is not None:
+            self._latest[venue_id] = digest
+        if len(indexed.keys) == len(ready):
+            return ready, indexed.index
+        return ready.chosen(np.isin(ready.keys, indexed.keys)), indexed.index
 
     def choose(
         self,
-        known: Sequence[Row[Any]],
+        known: PlanList,
         index: PlanIndex,
         query: Query,
         weights: MatchingWeights,
@@ -199,38 +213,85 @@ class VenuePlans:
             favour: (p,) log factors by which plans are preferred in the choice alone.
         """
         log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
-        poses = np.array([row.poses for row in known])
         ranked = log_mass if favour is None else log_mass + favour
-        chosen = most_probable(ranked, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses))
+        chosen = most_probable(
+            ranked, known.poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses)
+        )
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
         """Return chosen plans with their pose grids, without those that were deleted or replaced meanwhile."""
-        loaded = []
-        for row in members:
-            plans = self._store.plans
-            found = await self._reads.run(tenant, plans.find, tenant, row.plan_id, row.revision_id)
-            record = await parsed(found, plans, self._reads)
-            key = self._grids.key(row.revision_id, row.camera_height_m)
-            grid = self._grids.cached(key) or await self._reads.run(tenant, self._grids.find, key)
-            if record is not None and grid is not None:
-                loaded.append((row, record, grid))
-        return loaded
+        keys = {row.revision_id: self._grids.key(row.revision_id, row.camera_height_m) for row in members}
+        plans = self._store.plans
+        found = await self._reads.run(tenant, plans.find_revisions, tenant, list(keys))
+
+        def parsed() -> dict[str, PlanRecord]:
+            return {revision_id: plans.record(plan) for revision_id, plan in found.items()}
+
+        in_memory = all(plan.is_parsed for plan in found.values())
+        records = parsed() if in_memory else await self._reads.process(tenant, parsed)
+        grids = {key: grid for key in keys.values() if (grid := self._grids.cached(key)) is not None}
+        if len(grids) < len(keys):
+            missing = [key for key in keys.values() if key not in grids]
+            grids |= await self._reads.run(tenant, self._grids.find_all, missing)
+        return [
+            (row, records[row.revision_id], grids[keys[row.revision_id]])
+            for row in members
+            if row.revision_id in records and keys[row.revision_id] in grids
+        ]
 
     def close(self) -> None:
         """Release the prototype file for other processes."""
         if self._file is not None:
             self._file.close()
 
-    def _members(self, venue_id: str) -> Sequence[Row[Any]]:
-        # State before rows: a change in between makes the next query read the rows again.
-        state = self._store.venues.state(venue_id, *self._grids.model)
+    def _members(self, tenant: str, venue_id: str) -> PlanList:
+        # State before rows: a change in between makes the next query read the changed rows again.
+        state = self._store.venues.state(venue_id)
         venue = self._venues.get(venue_id)
         if venue is None or venue.state != state:
-            rows = self._store.venues.searchable_plans(venue_id, *self._grids.model)
-            venue = _Venue(state, list({row.plan_id: row for row in rows}.values()))
+            rows = None if venue is None else self._changed(tenant, venue_id, venue, state)
+            if rows is None:
+                rows = PlanList.of(self._store.venues.searchable_plans(venue_id, *self._grids.model))
+            venue = _Venue(state, rows)
             self._venues.put(venue_id, venue)
         return venue.rows
+
+    def _changed(self, tenant: str, venue_id: str, venue: _Venue, state: VenueState) -> PlanList | None:
+        """Return the rows of a venue after a change, most of them from before; None to read all of them."""
+        if not state.shows_changes_since(venue.state):
+            return None
+        store, before = self._store.venues, set(venue.rows.members)
+        after, changed = before, set(store.changed_plans(tenant, venue.state.changes))
+        if state.revision_id != venue.state.revision_id:
+            after = set(map(tuple, store.members(venue_id)))
+        left = {member for member in before & after if member[1] not in changed}
+        read = [plan_id for _, plan_id, _ in after - left]
+        if 2 * len(read) > len(after):
+            return None
+        fresh = PlanList.of(store.searchable_plans(venue_id, *self._grids.model, read) if read else [])
+        return venue.rows.updated({plan_id for _, plan_id, _ in before - left}, fresh)
+
+    async def _make_index(self, tenant: str, ready: PlanList, compute: Compute, base: _Indexed | None) -> _Indexed:
+        """Return the index of plans, beginning with that of most of them if there is one."""
+        is_known = np.zeros(len(ready), bool) if base is None else base.numbers(ready) >= 0
+        unknown = [ready[k] for k in np.flatnonzero(~is_known).tolist()]
+        found = await compute(partial(self._in_file, unknown))
+        fresh = await self._fetched(tenant, [row for row in unknown if _key(row) not in found])
+        is_found = np.array([_key(row) in found or _key(row) in fresh for row in unknown], bool)
+        there = ready.chosen(np.isin(np.arange(len(ready)), np.flatnonzero(~is_known)[~is_found], invert=True))
+        if not there:
+            # All were deleted or replaced just now; a retry finds the current ones.
+            raise StoreUnavailableError
+        try:
+            index = await compute(partial(self._indexed, there, fresh, base))
+        except _NotInFileError:
+            if base is not None:
+                return await self._make_index(tenant, ready, compute, None)
+            # The file has no room for all of them, so this index keeps them in memory.
+            fresh |= await self._fetched(tenant, [row for row in there if _key(row) not in fresh])
+            index = await compute(partial(self._in_memory, there, fresh))
+        return _Indexed(there.keys, index)
 
     def _in_file(self, ready: Sequence[Row[Any]]) -> dict[BlockKey, tuple[int, int]]:
         with self._building:
@@ -251,9 +312,12 @@ class VenuePlans:
                     fetched[_key(row)] = prototypes
         return fetched
 
-    def _indexed(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex | None:
-        """Add prototypes to the file and index it; None if it has no room for all plans."""
-        keys = [_key(row) for row in known]
+    def _indexed(self, known: PlanList, fresh: Mapping[BlockKey, SortedPrototypes], base: _Indexed | None) -> PlanIndex:
+        """Add prototypes to the file and index it.
+
+        Raises:
+            _NotInFileError: the file has no room for all plans.
+        """
         with self._building:
             file = self._opened()
             there = file.find(fresh)
@@ -261,10 +325,22 @@ class VenuePlans:
                 file.add({key: prototypes.in_shipped_cells() for key, prototypes in fresh.items() if key not in there})
             except OSError as error:
                 logging.getLogger(LOGGER_NAME).warning("cannot write the prototype file: %s", error)
-            rows, found = file.rows(), file.find(keys)
-        if not all(key in found for key in keys):
-            return None
-        begin, count = np.array([found[key] for key in keys], np.int64).T
+
+        def located(numbers: Int[np.ndarray, "p"]) -> tuple[np.ndarray, Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
+            keys = [_key(known[k]) for k in numbers.tolist()]
+            with self._building:
+                rows, found = file.rows(), file.find(keys)
+            if not all(key in found for key in keys):
+                raise _NotInFileError
+            begin, count = np.array([found[key] for key in keys], np.int64).T
+            return rows, begin, count
+
+        if base is not None:
+            number = base.numbers(known)
+            place = np.full(len(base.keys), -1)
+            place[number[number >= 0]] = np.flatnonzero(number >= 0)
+            return base.index.updated(place, np.flatnonzero(number < 0), located)
+        rows, begin, count = located(np.arange(len(known)))
         return PlanIndex.build(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
 
     def _in_memory(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex:
@@ -291,28 +367,25 @@ def most_poses(query: Query, max_poses: int) -> int:
     return min(max_poses, _MAX_COMPARISONS // (len(query.roll) * len(query.camera_height.offsets)))
 
 
-def not_excluded(ready: Sequence[Row[Any]], log_prior: Float[np.ndarray, "p"]) -> Sequence[Row[Any]]:
+def not_excluded(ready: PlanList, log_prior: Float[np.ndarray, "p"]) -> PlanList:
     """Return the plans with a finite log prior.
 
     Raises:
         InvalidHintError: there is none.
     """
     possible = np.isfinite(log_prior)
-    if possible.all():
-        return ready
     if not possible.any():
         raise InvalidHintError("strict", f"none of the {len(ready)} floor plans that are ready matches all hints")
-    return [ready[k] for k in np.flatnonzero(possible).tolist()]
+    return ready.chosen(possible)
 
 
-def venue_height(form: CameraFields, ready: Sequence[Row[Any]]) -> CameraHeight:
+def venue_height(form: CameraFields, ready: PlanList) -> CameraHeight:
     """Return the camera height in the request, else the one that all plans of a venue share, else an unknown one."""
     if form.camera_height_m is not None:
         std_m = DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m
         return CameraHeight(form.camera_height_m, std_m)
-    heights = Counter((row.camera_height_m, row.camera_height_std_m) for row in ready)
-    (height_m, std_m), _ = heights.most_common(1)[0]
-    if len(heights) > 1 or std_m is None:
+    height_m, std_m, is_shared = ready.most_common_height
+    if not is_shared or std_m is None:
         std_m = math.inf
     return CameraHeight(height_m, std_m if form.camera_height_std_m is None else form.camera_height_std_m)
 

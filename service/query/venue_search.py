@@ -26,6 +26,7 @@ from service.grids import check_height_m
 from service.http.admission_control import Slots
 from service.query.answers import Place
 from service.query.geopose import plan_anchor
+from service.query.plan_list import PlanList
 from service.query.queries import QueryContext
 from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, not_excluded
@@ -35,7 +36,7 @@ from service.storage.records import PlanRecord, VenueRecord
 # Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
 # Function that reads the current rows of the plans to search.
-ReadPlans = Callable[[], Awaitable[Sequence[Row[Any]]]]
+ReadPlans = Callable[[], Awaitable[PlanList]]
 # Function that returns a log factor for each row of a plan.
 Favour = Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]]
 
@@ -93,7 +94,7 @@ class VenueSearch:
 
     async def ready(
         self, venue: VenueRecord, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
-    ) -> tuple[Sequence[Row[Any]], list[str]]:
+    ) -> tuple[PlanList, list[str]]:
         """Wait for a plan to be ready; return the plans that are ready, and warnings about the others.
 
         Raises:
@@ -106,28 +107,27 @@ class VenueSearch:
             members = await read_plans()
             if members:
                 hints.check(members)
-            ready = [row for row in members if row.grid_id is not None]
-            failed = [row for row in members if row.grid_id is None and row.failure is not None]
+            ready, failed = members.ready, members.failed
             if ready:
                 break
-            if len(failed) == len(members):
+            if failed == len(members):
                 raise VenueUnsearchableError(venue.id, len(members))
             if context.left_s <= _POLL_INTERVAL_S:
                 raise VenueNotReadyError(venue.id, len(members), monotonic() - begin)
             with self._queries.released(context.client):
                 await asyncio.sleep(_POLL_INTERVAL_S)
-        waiting = len(members) - len(ready) - len(failed)
+        waiting = len(members) - len(ready) - failed
         warnings = []
         if waiting:
             warnings.append(f"{waiting} of the venue's {len(members)} floor plans are preparing and were not searched")
         if failed:
-            warnings.append(f"{len(failed)} of the venue's {len(members)} floor plans failed and were not searched")
+            warnings.append(f"{failed} of the venue's {len(members)} floor plans failed and were not searched")
         return ready, warnings
 
     async def searched(
         self,
         venue: VenueRecord,
-        ready: Sequence[Row[Any]],
+        ready: PlanList,
         query: Query,
         *,
         form: CameraFields,
@@ -157,7 +157,8 @@ class VenueSearch:
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
-            known, plan_index = await self._plans.index(venue.tenant, possible, compute)
+            whole_venue = venue.id if possible is ready else None
+            known, plan_index = await self._plans.index(venue.tenant, possible, compute, venue_id=whole_venue)
             weights = self._encoder.networks.manifest.evidence_for(view=query.is_view)
             log_prior = hints.log_prior(known, shares)
             preferred = None if favour is None else favour(known)
@@ -186,7 +187,7 @@ class VenueSearch:
             grids=grids,
             merged=merged,
             log_mass=log_mass,
-            area_share=sum(row.area_m2 for row in searched_rows) / sum(row.area_m2 for row in ready),
+            area_share=sum(row.area_m2 for row in searched_rows) / float(ready.area_m2.sum()),
             index=[index_of[row.plan_id] for row in searched_rows],
             warnings=warnings,
             anchor=venue.anchor,

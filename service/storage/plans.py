@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -23,11 +23,14 @@ from service.storage.plan_rows import (
     revision_values,
 )
 from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
-from service.storage.statements import damaged, newest_first, select_summaries
+from service.storage.statements import damaged, lock_plan_of, newest_first, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
 from service.stored_plan import PlanDocument, StoredPlan
+
+# Ids per statement.
+_BATCH_SIZE = 500
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ class Plans:
             self._quota.check(connection, tenant, change.total + later_bytes)
             insert_revision(connection, record, content)
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**revision_values(record)))
-            self._quota.settle(connection, tenant, change)
+            self._quota.settle(connection, tenant, change, changed_plan=plan_id)
         self._cache.put(record)
         return record
 
@@ -181,6 +184,30 @@ class Plans:
         if found is None:
             self._cache.forget(tenant, plan_id)
         return found
+
+    def find_revisions(self, tenant: str, revision_ids: Sequence[str]) -> dict[str, FoundPlan]:
+        """Return plans at revisions for `record`, by revision; those that were deleted are left out."""
+        rows = dict[str, tuple[Row[Any], bool]]()
+        documents = dict[str, PlanDocument]()
+        columns = REVISIONS.c
+        with self._database.reading() as connection:
+            for first in range(0, len(revision_ids), _BATCH_SIZE):
+                part = revision_ids[first : first + _BATCH_SIZE]
+                for current in (False, True):
+                    own = FLOORPLANS.c.tenant == tenant, columns.id.in_(part)
+                    found = connection.execute(_select_heads(current=current).where(*own))
+                    rows |= {row.revision_id: (row, current) for row in found}
+            plans = {key: self._cache.plan(tenant, row.id, key) for key, (row, _) in rows.items()}
+            unknown = [revision_id for revision_id, plan in plans.items() if plan is None]
+            for first in range(0, len(unknown), _BATCH_SIZE):
+                query = select(columns.id, columns.document, columns.document_sha256, columns.warnings)
+                for row in connection.execute(query.where(columns.id.in_(unknown[first : first + _BATCH_SIZE]))):
+                    documents[row.id] = PlanDocument(row.document, row.document_sha256, row.warnings)
+        return {
+            revision_id: FoundPlan(row, plan, current)
+            for revision_id, (row, current) in rows.items()
+            if (plan := plans[revision_id] or documents.get(revision_id)) is not None
+        }
 
     def record(self, found: FoundPlan) -> PlanRecord:
         """Parse a plan unless it is in memory. This is slow for large plans, and does not touch the database.
@@ -282,19 +309,27 @@ class Plans:
 
     def set_failure(self, revision_id: str, reason: str) -> None:
         """Store the error of the computation of a revision's own grid."""
-        with self._database.writing() as connection:
-            connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
+        self._set_failure(revision_id, reason)
 
     def clear_failures(self) -> None:
         """Delete all stored errors, so that these grids are computed again."""
-        with self._database.writing() as connection:
-            connection.execute(update(REVISIONS).where(REVISIONS.c.failure.is_not(None)).values(failure=None))
+        with self._database.reading() as connection:
+            failed = connection.scalars(select(REVISIONS.c.id).where(REVISIONS.c.failure.is_not(None))).all()
+        for revision_id in failed:
+            self._set_failure(revision_id, None)
 
     def current_revisions(self, revision_ids: Collection[str]) -> set[str]:
         """Return the revisions among `revision_ids` that are the current ones of their plans."""
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
             return set(connection.scalars(query))
+
+    def _set_failure(self, revision_id: str, reason: str | None) -> None:
+        with self._database.writing() as connection:
+            plan = lock_plan_of(connection, revision_id)
+            if plan is not None:
+                connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
+                self._quota.settle(connection, plan.tenant, StoredBytes(), refuse=False, changed_plan=plan.id)
 
     def _delete(self, connection: Connection, tenant: str, plan_id: str, expected: str | None) -> bool:
         mine = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)

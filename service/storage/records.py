@@ -148,26 +148,22 @@ class VenueCounts:
 
 @dataclass(frozen=True)
 class VenueState:
-    """Fingerprint of the plans of a venue as queries see them.
-
-    Plans come and go with the venue's revision, and replacing a plan increases the sum of revision numbers. With both
-    unchanged, grids can only have come or gone.
+    """State of a venue; an equal one shows that queries read the same rows of plans.
 
     Attributes:
-        revision_id: revision of the venue; None without a venue.
-        plans: number of plans.
-        ready: number of plans that are ready.
-        failed: number of plans that failed.
-        revisions: sum of the numbers of the plans' revisions.
-        grids: sum of the ids of the grids of plans that are ready.
+        revision_id: revision of the venue, which changes with its members; None without a venue.
+        changes: number of changes of its tenant's plans and grids.
+        uncounted_bytes: stored bytes of the tenant beyond these changes; another number shows that an earlier version
+            of the service, running beside, wrote plans or grids without numbers.
     """
 
     revision_id: str | None
-    plans: int
-    ready: int
-    failed: int
-    revisions: int
-    grids: int
+    changes: int
+    uncounted_bytes: int
+
+    def shows_changes_since(self, earlier: VenueState) -> bool:
+        """Tell whether the plans that changed since an earlier state are those with numbers after it."""
+        return self.uncounted_bytes == earlier.uncounted_bytes and self.changes >= earlier.changes
 
 
 @dataclass(frozen=True)

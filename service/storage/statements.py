@@ -100,6 +100,13 @@ def select_summaries(*, current: bool = True) -> Any:
     ).join_from(FLOORPLANS, REVISIONS, link)
 
 
+def lock_plan_of(connection: Connection, revision_id: str) -> Any:
+    """Lock the plan of a revision until the transaction ends; return its id and tenant, None if it was deleted."""
+    plan_id = select(REVISIONS.c.plan_id).where(REVISIONS.c.id == revision_id).scalar_subquery()
+    query = select(FLOORPLANS.c.id, FLOORPLANS.c.tenant).where(FLOORPLANS.c.id == plan_id)
+    return connection.execute(query.with_for_update(key_share=True)).one_or_none()
+
+
 def is_complete_grid() -> ColumnElement[bool]:
     """Return the condition that a grid has a digest; earlier versions of the service, running beside, write none."""
     return LATENT_GRIDS.c.sha256.is_not(None)

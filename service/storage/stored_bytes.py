@@ -113,14 +113,25 @@ class StorageQuota:
         """
         self._find(connection, tenant).check(growth)
 
-    def settle(self, connection: Connection, tenant: str, change: StoredBytes, *, refuse: bool = True) -> Account:
-        """Count a change; the last statement of its transaction.
+    def settle(
+        self,
+        connection: Connection,
+        tenant: str,
+        change: StoredBytes,
+        *,
+        refuse: bool = True,
+        changed_plan: str | None = None,
+    ) -> Account:
+        """Count a change; the last call of its transaction.
 
         Args:
             connection: the transaction.
             tenant: the tenant.
             change: the change.
             refuse: refuse a growth beyond the limit; the transaction is then rolled back.
+            changed_plan: id of a plan whose row the transaction has locked, and whose revision, grid or failure it
+                changed: the plan gets the number of this change. Numbers rise in the order of the commits, as the
+                tenant's row stays locked until then.
 
         Returns:
             The tenant's account after the change.
@@ -129,13 +140,20 @@ class StorageQuota:
             StorageQuotaError: the change exceeds the limit.
         """
         counted = {_column(name): value for name, value in asdict(change).items() if value}
+        searched_bytes = change.plans + change.grids + change.venues
+        if changed_plan is not None or change.plans or change.grids or change.venues:
+            counted |= {"changes": 1, "counted_bytes": searched_bytes}
         statement = self._database.insert(TENANTS).values(tenant=tenant, **counted)
         sums = {name: TENANTS.c[name] + value for name, value in counted.items()}
         # The tenant's name among the values, because PostgreSQL refuses an empty list.
         statement = statement.on_conflict_do_update(index_elements=["tenant"], set_=sums | {"tenant": tenant})
-        account = self._account(connection.execute(statement.returning(TENANTS)).one())
+        row = connection.execute(statement.returning(TENANTS)).one()
+        account = self._account(row)
         if refuse:
             replace(account, used=account.used - change).check(change.total)
+        if changed_plan is not None:
+            own = update(FLOORPLANS).where(FLOORPLANS.c.id == changed_plan)
+            connection.execute(own.values(changed=row.changes))
         return account
 
     def purge(self, kind: str, table: Table, condition: ColumnElement[bool]) -> int:

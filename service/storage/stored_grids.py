@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, or_, select, update
@@ -22,9 +22,11 @@ from service.storage.grid_format import (
 )
 from service.storage.records import GridKey, PlanSummary
 from service.storage.statements import (
+    CHUNK_BYTES,
     is_complete_grid,
     is_own_grid,
     is_own_height,
+    lock_plan_of,
     read_exactly,
     select_summaries,
     write_chunks,
@@ -55,13 +57,36 @@ class StoredGrids:
             if row is None:
                 return None
             content = read_exactly(connection, GRID_CHUNKS, {"grid_id": row.id}, row.size_bytes)
-        grid = None
-        if content is not None and digest_of(content) == row.sha256:
-            grid = unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
-        if grid is None:
-            fields = {"revision": key.revision_id, "camera_height_mm": key.camera_height_mm}
-            logging.getLogger(LOGGER_NAME).error("a stored pose grid is damaged", extra={"fields": fields})
-        return grid
+        return _unpacked(key, content, row.sha256)
+
+    def get_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
+        """Return the grids among `keys` that are stored and not damaged, as `get` does; keys are of one model."""
+        left, found, columns = list(keys), dict[GridKey, PoseGrid](), LATENT_GRIDS.c
+        for first in range(0, len(left), _BATCH_SIZE):
+            part = {(key.revision_id, key.camera_height_mm): key for key in left[first : first + _BATCH_SIZE]}
+            query = select(
+                columns.id, columns.revision_id, columns.camera_height_mm, columns.size_bytes, columns.sha256
+            )
+            same_model = columns.model_sha256 == left[0].model_sha256, columns.step_m == left[0].step_m
+            query = query.where(columns.revision_id.in_({name for name, _ in part}), *same_model, is_complete_grid())
+            with self._database.reading() as connection:
+                rows = [row for row in connection.execute(query) if (row.revision_id, row.camera_height_mm) in part]
+                small = [row for row in rows if row.size_bytes <= CHUNK_BYTES]
+                chunks = select(GRID_CHUNKS.c.grid_id, GRID_CHUNKS.c.content)
+                ids = [row.id for row in small]
+                contents = {
+                    row.grid_id: row.content for row in connection.execute(chunks.where(GRID_CHUNKS.c.grid_id.in_(ids)))
+                }
+            for row in small:
+                key, content = part[row.revision_id, row.camera_height_mm], contents.get(row.id, b"")
+                if (grid := _unpacked(key, content, row.sha256)) is not None:
+                    found[key] = grid
+            # Large grids are few, and assembled in place.
+            for row in rows:
+                key = part[row.revision_id, row.camera_height_mm]
+                if row.size_bytes > CHUNK_BYTES and (grid := self.get(key)) is not None:
+                    found[key] = grid
+        return found
 
     def prototypes(self, grid_ids: Sequence[int]) -> dict[int, SortedPrototypes]:
         """Return the stored prototypes by the ids of their grids."""
@@ -142,24 +167,21 @@ class StoredGrids:
             StorageQuotaError: the tenant would store too many bytes.
         """
         packed = pack(grid, prototypes)
-        owner = (
-            select(FLOORPLANS.c.tenant)
-            .join_from(REVISIONS, FLOORPLANS, FLOORPLANS.c.id == REVISIONS.c.plan_id)
-            .where(REVISIONS.c.id == key.revision_id)
-        )
+        revision = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id)
         with self._database.writing(grows_by=grid_bytes(packed)) as connection:
-            # Replicas that store grids of one revision take turns.
-            tenant = connection.scalar(owner.with_for_update(key_share=True, of=REVISIONS))
-            if tenant is None:
+            # Replicas that store grids of one plan take turns. Plans are locked before revisions, as in their deletion,
+            # to avoid a deadlock.
+            plan = lock_plan_of(connection, key.revision_id)
+            if plan is None or connection.scalar(revision.with_for_update(key_share=True)) is None:
                 return False
             connection.execute(delete(GRID_LEASES).where(*_where(GRID_LEASES, key)))
             freed = deleted_bytes(connection, delete(LATENT_GRIDS).where(*_where(LATENT_GRIDS, key)))
             freed += _drop_older_models(connection, key)
             freed += _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
             change = StoredBytes(grids=grid_bytes(packed) - freed)
-            self._quota.check(connection, tenant, change.total)
+            self._quota.check(connection, plan.tenant, change.total)
             insert_grid(connection, key, packed)
-            self._quota.settle(connection, tenant, change)
+            self._quota.settle(connection, plan.tenant, change, changed_plan=plan.id)
         return True
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
@@ -256,6 +278,17 @@ def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> Non
     }
     grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
     write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
+
+
+def _unpacked(key: GridKey, content: bytes | bytearray | None, sha256: str) -> PoseGrid | None:
+    """Return the grid in a blob; None, with an entry in the log, if it is damaged."""
+    grid = None
+    if content is not None and digest_of(content) == sha256:
+        grid = unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
+    if grid is None:
+        fields = {"revision": key.revision_id, "camera_height_mm": key.camera_height_mm}
+        logging.getLogger(LOGGER_NAME).error("a stored pose grid is damaged", extra={"fields": fields})
+    return grid
 
 
 def _columns(key: GridKey) -> dict[str, Any]:

@@ -71,9 +71,13 @@ FLOORPLANS = Table(
     # Centre of the circle on Earth; NULL for a plan without an anchor.
     Column("latitude", Double),
     Column("longitude", Double),
+    # Number of the tenant's change (`tenants.changes`) that last changed what queries of venues read of this plan; 0
+    # before the first one.
+    Column("changed", BigInteger, nullable=False, server_default="0"),
     Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
     Index("floorplans_by_place", "tenant", "latitude"),
     Index("floorplans_by_revision", "revision_id"),
+    Index("floorplans_by_change", "tenant", "changed"),
 )
 
 REVISIONS = Table(
@@ -198,6 +202,10 @@ TENANTS = Table(
         Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
         for kind in ("plans", "grids", "venues", "answers", "sessions", "idempotency")
     ),
+    # Number of changes of plans, grids and venues, and the stored bytes that these changes added. Earlier versions of
+    # the service, running beside, count their bytes alone.
+    Column("changes", BigInteger, nullable=False, server_default="0"),
+    Column("counted_bytes", BigInteger, nullable=False, server_default="0"),
 )
 
 API_KEYS = Table(

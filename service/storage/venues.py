@@ -39,7 +39,7 @@ from service.storage.records import (
 )
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, VENUE_PLANS, VENUES
+from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES
 from service.storage.venue_rows import (
     check_count,
     find_venue,
@@ -226,32 +226,53 @@ class Venues:
         with self._database.reading() as connection:
             return VenueCounts(*connection.execute(query).one())
 
-    def state(self, venue_id: str, model_sha256: str, step_m: float) -> VenueState:
-        """Return the fingerprint of `searchable_plans`, from indices only."""
-        grid, own_revision = LATENT_GRIDS.c.id, VENUES.c.revision_id
-        failed = case((and_(grid.is_(None), REVISIONS.c.failure.is_not(None)), 1))
-        sums = (func.coalesce(func.sum(summed), 0) for summed in (REVISIONS.c.number, grid))
-        counts = select(func.count(), func.count(grid), func.count(failed), *sums)
-        query = _in_venue(counts, venue_id, model_sha256, step_m)
+    def state(self, venue_id: str) -> VenueState:
+        """Return the state of a venue, from two rows."""
+        counted = (TENANTS.c.plans_bytes, TENANTS.c.grids_bytes, TENANTS.c.venues_bytes)
+        numbers = (func.coalesce(number, 0) for number in (TENANTS.c.changes, sum(counted) - TENANTS.c.counted_bytes))
+        tenants = VENUES.outerjoin(TENANTS, TENANTS.c.tenant == VENUES.c.tenant)
+        query = select(VENUES.c.revision_id, *numbers).select_from(tenants)
         with self._database.reading() as connection:
-            revision_id = connection.scalar(select(own_revision).where(VENUES.c.id == venue_id))
-            counted = connection.execute(query).one()
-        # PostgreSQL returns sums as decimals.
-        return VenueState(revision_id, *map(int, counted))
+            row = connection.execute(query.where(VENUES.c.id == venue_id)).one_or_none()
+        return VenueState(None, 0, 0) if row is None else VenueState(*row)
 
-    def searchable_plans(self, venue_id: str, model_sha256: str, step_m: float) -> Sequence[Row[Any]]:
+    def members(self, venue_id: str) -> Sequence[Any]:
+        """Return `level`, `plan_id` and `name`, None for the plan's own one, of every plan of a venue."""
+        columns = VENUE_PLANS.c
+        query = select(columns.level, columns.plan_id, columns.name).where(columns.venue_id == venue_id)
+        with self._database.reading() as connection:
+            return connection.execute(query).all()
+
+    def changed_plans(self, tenant: str, after: int) -> Sequence[str]:
+        """Return the ids of a tenant's plans that changed after the change with a number, see `VenueState`."""
+        query = select(FLOORPLANS.c.id).where(FLOORPLANS.c.tenant == tenant, FLOORPLANS.c.changed > after)
+        with self._database.reading() as connection:
+            return connection.scalars(query).all()
+
+    def searchable_plans(
+        self, venue_id: str, model_sha256: str, step_m: float, plan_ids: Sequence[str] | None = None
+    ) -> list[Row[Any]]:
         """Return a row for every plan of a venue, regardless of tenant. Callers check access first.
 
+        Args:
+            venue_id: id of the venue.
+            model_sha256: digest of the model.
+            step_m: grid step (m).
+            plan_ids: ids of the plans, of which those in the venue are read; None for all.
+
         Returns:
-            Rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`,
-            `area_m2`, the columns of `plan_places`, and `grid_id`, `grid_sha256` and `poses` of the plan's own grid,
-            None without it.
+            Rows of `plan_id`, `revision_id`, `level`, `name`, `name_in_venue`, `camera_height_m`,
+            `camera_height_std_m`, `failure`, `area_m2`, the columns of `plan_places`, and `grid_id`, `grid_sha256` and
+            `poses` of the plan's own grid, None without it; by level and id.
         """
+        name_in_venue = VENUE_PLANS.c.name.label("name_in_venue")
         name = func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name")
-        columns = (VENUE_PLANS.c.level, name, *_SEARCH_COLUMNS)
+        columns = (VENUE_PLANS.c.level, name, name_in_venue, *_SEARCH_COLUMNS)
         query = _in_venue(select(*columns), venue_id, model_sha256, step_m)
+        query = query.order_by(VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id)
+        parts = [query] if plan_ids is None else [query.where(VENUE_PLANS.c.plan_id.in_(p)) for p in _parts(plan_ids)]
         with self._database.reading() as connection:
-            return connection.execute(query.order_by(VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id)).all()
+            return [row for part in parts for row in connection.execute(part)]
 
     def searchable_plans_near(
         self, tenant: str, latitude: float, longitude: float, within_m: float, model_sha256: str, step_m: float

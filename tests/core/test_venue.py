@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -277,6 +278,52 @@ def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]
         masses = index.log_masses(query, WEIGHTS, CONFIG, compared=compared, scanned=scanned)
         assert np.isfinite(masses[3])
         np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
+
+
+def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> None:
+    """Plans come and go one by one and many at once, in any order, with copies of each other in several segments."""
+    rng, cells = np.random.default_rng(12), shipped_cells()
+    rows = joined(prototype_sets).rows.copy()
+    rows["cell"] = cells.assign(rows)
+    count = np.array([len(part) for part in prototype_sets])
+    begin = np.cumsum(count) - count
+    queries = [query_at(prototype_sets[number], 1, rng, hypotheses=8) for number in (0, 3, 19)]
+
+    def located(plans: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return rows, begin[plans], count[plans]
+
+    plans = list(range(12))
+    index = PlanIndex.build(*located(plans), step_m=STEP_M, cells=cells)
+    # Number 40 + k is a copy of plan k: another plan with equal prototypes.
+    for wanted in (
+        [*range(12), 12],
+        [13, *range(13)],
+        [13, *range(3), *range(4, 13)],
+        [43, 13, *range(13)],
+        [43, 13, *range(12, -1, -1), *range(14, 20)],
+        [43, 53, 3, 13, 19],
+        [19],
+        [*range(20), 59],
+    ):
+        place = np.array([wanted.index(plan) if plan in wanted else -1 for plan in plans])
+        added = np.array([number for number, plan in enumerate(wanted) if plan not in plans], int)
+        index = index.updated(place, added, lambda numbers, wanted=wanted: located([wanted[n] % 40 for n in numbers]))
+        fresh = PlanIndex.build(*located([plan % 40 for plan in wanted]), step_m=STEP_M, cells=cells)
+        sizes = [part.plans for part in index.parts]
+        assert sum(sizes) == index.plan_count == len(wanted)
+        assert all(before >= 2 * after for before, after in pairwise(sizes))
+        for query in queries:
+            for compared, scanned in ((10**9, 1), (400, 10**9)):
+                limits = {"compared": compared, "scanned": scanned}
+                masses = index.log_masses(query, WEIGHTS, CONFIG, **limits)
+                expected = fresh.log_masses(query, WEIGHTS, CONFIG, **limits)
+                compares_copies_twice = compared < 10**9 and max(wanted) > 40
+                if not compares_copies_twice:
+                    np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
+                assert masses.argmax() == expected.argmax()
+                for copy in (number for number, plan in enumerate(wanted) if plan >= 40 and plan - 40 in wanted):
+                    assert masses[copy] == pytest.approx(masses[wanted.index(wanted[copy] - 40)], abs=1e-9)
+        plans = wanted
 
 
 def test_plans_with_and_without_openings_are_found() -> None:

@@ -800,13 +800,15 @@ _OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m",
 
 
 def _undo_tenants(connection: Connection) -> None:
-    """Undo the migrations 0007 to 0011."""
+    """Undo the migrations 0007 to 0012."""
     connection.exec_driver_sql("DROP TABLE audit_log")
     if connection.dialect.name == "postgresql":
         connection.exec_driver_sql("DROP FUNCTION audit_log_refuse_update")
     connection.exec_driver_sql("DROP INDEX api_keys_by_age")
     for column in _OF_KEYS:
         connection.exec_driver_sql(f"ALTER TABLE api_keys DROP COLUMN {column}")
+    connection.exec_driver_sql("DROP INDEX floorplans_by_change")
+    connection.exec_driver_sql("ALTER TABLE floorplans DROP COLUMN changed")
     connection.exec_driver_sql("DROP TABLE sessions")
     connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
     connection.exec_driver_sql("DROP TABLE tenants")

@@ -173,7 +173,7 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
     choose = venue_plans.VenuePlans.choose
 
     def noted(self: venue_plans.VenuePlans, known: Any, index: Any, *arguments: Any) -> Any:
-        indexed.append(len(index.row))
+        indexed.append(len(index))
         return choose(self, known, index, *arguments)
 
     monkeypatch.setattr(venue_plans.VenuePlans, "choose", noted)

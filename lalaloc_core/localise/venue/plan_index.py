@@ -11,58 +11,100 @@ prototype and a hypothesis of the heading and the camera height. Three stages, e
    masses of their plans. All other pairs count as zero.
 
 Small indexes skip stages: if the query has at most `scanned` pairs all cells are probed, and if it has at most
-`compared` pairs all are compared exactly, so that the masses are exact. Equal prototypes are stored and compared once,
-for all plans that own them, so copies of a plan have equal masses.
+`compared` pairs all are compared exactly, so that the masses are exact. Equal prototypes of a segment are stored and
+compared once, for all plans that own them. Pairs of equal cost are kept or left out together, so copies of a plan have
+equal masses.
+
+An index never changes, so queries need no lock. `PlanIndex.updated` returns a new one that shares the segments of the
+old one: plans that were added are in a new segment, plans that were removed are left out of the sums. Segments are
+merged so that each has at least twice as many plans as the next (the logarithmic method of Bentley and Saxe,
+*Decomposable searching problems*, 1980): a query searches few segments, and a plan is sorted again seldom.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt64
+from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of
-from lalaloc_core.localise.venue.prototype_codes import BYTES_PER_CODE, CodeScan, lookup_tables, product_codes
+from lalaloc_core.localise.venue.prototype_codes import lookup_tables
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, joined
+from lalaloc_core.localise.venue.prototypes import Prototypes, joined
+from lalaloc_core.localise.venue.segment import Segment, by_family
 
 # Default numbers of pairs per query in the code scan and in the exact comparison.
 SCANNED, COMPARED = 40_000_000, 20_000
 # The scan returns this multiple of each hypothesis's share, as the best pairs are spread unevenly over hypotheses.
 _OVERFETCH = 6
-# Pairs compared, and rows read, at a time, to bound memory.
+# Pairs compared at a time, to bound memory.
 _BATCH_SIZE = 65_536
-# Sort keys have the cell in the upper 16 bits and a hash of the row in the lower 48.
-_CELL_SHIFT = np.uint64(48)
+
+# Returns records that include the prototypes of some plans, each plan's first record and its number of records.
+Locate = Callable[[Int[np.ndarray, "p"]], tuple[np.ndarray, Int[np.ndarray, "p"], Int[np.ndarray, "p"]]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Segment of an index.
+
+    Attributes:
+        segment: the segment.
+        plan: (p,) number in the index of each of the segment's plans; -1 for plans that were removed.
+        dead: distinct prototypes of removed plans alone, rising.
+    """
+
+    segment: Segment
+    plan: Int[np.ndarray, "p"]
+    dead: Int[np.ndarray, "d"]
+
+    @property
+    def plans(self) -> int:
+        """Number of plans that were not removed."""
+        return int((self.plan >= 0).sum())
+
+    @property
+    def cell_sizes(self) -> Int[np.ndarray, "v"]:
+        """Number of distinct prototypes of each cell that plans own."""
+        sizes = self.segment.cell_sizes
+        if not len(self.dead):
+            return sizes
+        return sizes - np.bincount(self.segment.cell_of(self.dead), minlength=len(sizes))
+
+    def renumbered(self, place: Int[np.ndarray, "p"]) -> _Part:
+        """Return the part with other numbers of the index's plans; -1 for those that are removed."""
+        plan = np.where(self.plan >= 0, place[self.plan], -1)
+        lost = ((plan < 0) & (self.plan >= 0)).any()
+        return _Part(self.segment, plan, self.segment.owned_by_none(plan >= 0) if lost else self.dead)
+
+    def alive(self, prototype: Int[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+        """Tell which distinct prototypes a plan owns."""
+        if not len(self.dead):
+            return np.ones(len(prototype), bool)
+        place = np.minimum(np.searchsorted(self.dead, prototype), len(self.dead) - 1)
+        return self.dead[place] != prototype
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanIndex:
-    """Inverted file of the u distinct ones among the n prototypes of some plans.
+    """Index of the prototypes of some plans, in one or more segments.
 
     Attributes:
-        rows: records of type `prototypes.ROW` that include the plans' prototypes; can be a memory-mapped file.
+        step_m: grid step (m) of the plans.
+        cells: the coarse quantiser.
         plan_count: number of plans, p.
-        row: (u,) number in `rows` of each distinct prototype, ordered by cell.
-        owner: (n,) plans that own the distinct prototypes, grouped by prototype.
-        owner_begin: (u + 1,) where the group of each distinct prototype begins in `owner`.
-        cell_begin: (v + 1,) where the inverted list of each of v cells begins in `row`.
+        parts: the segments, the largest first.
     """
 
-    rows: np.ndarray
     step_m: float
     cells: Cells
     plan_count: int
-    row: Int[np.ndarray, "u"]
-    owner: Int[np.ndarray, "n"]
-    owner_begin: Int[np.ndarray, "w"]
-    cell_begin: Int[np.ndarray, "v"]
+    parts: tuple[_Part, ...]
 
     @classmethod
     def build(
@@ -79,28 +121,8 @@ class PlanIndex:
         `rows` are records of type `prototypes.ROW` with the cells that `cells`, the coarse quantiser, assigned; `begin`
         and `count` are the number of each plan's first record and the number of its records.
         """
-        owner = np.repeat(np.arange(len(count), dtype=np.int32), count)
-        ends = np.cumsum(count)
-        row = np.arange(len(owner)) + np.repeat(begin - (ends - count), count)
-        key = _sort_keys(rows, row)
-        # A stable sort keeps equal prototypes in the order of their plans.
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        owner_begin = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-        cell = (key[owner_begin] >> _CELL_SHIFT).astype(np.intp)
-        cell_begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=len(cells)))])
-        smallest_type = np.int32 if len(rows) < 2**31 else np.int64
-        owner_begin = np.append(owner_begin, len(owner))
-        return cls(
-            rows=rows,
-            step_m=step_m,
-            cells=cells,
-            plan_count=len(count),
-            row=row[order[owner_begin[:-1]]].astype(smallest_type),
-            owner=owner[order],
-            owner_begin=owner_begin.astype(smallest_type),
-            cell_begin=cell_begin,
-        )
+        part = _part(rows, begin, count, np.arange(len(count)), cells)
+        return cls(step_m=step_m, cells=cells, plan_count=len(count), parts=(part,))
 
     @classmethod
     def from_prototypes(cls, parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
@@ -110,16 +132,42 @@ class PlanIndex:
         count = np.array([len(part) for part in parts])
         return cls.build(rows, np.cumsum(count) - count, count, step_m=parts[0].step_m, cells=cells)
 
+    def updated(self, place: Int[np.ndarray, "p"], added: Int[np.ndarray, "a"], locate: Locate) -> PlanIndex:
+        """Return the index of other plans, of which most are in this one.
+
+        Args:
+            place: number in the new index of each plan of this one; -1 for plans that are removed.
+            added: numbers in the new index of plans that are not in this one.
+            locate: returns the prototypes of plans by their numbers in the new index.
+        """
+        plans, parts, fresh = int((place >= 0).sum()) + len(added), list[_Part](), [added]
+        for part in (part.renumbered(place) for part in self.parts):
+            # A segment that lost most of its plans is no longer worth its memory.
+            if 2 * part.plans >= len(part.plan):
+                parts.append(part)
+            else:
+                fresh.append(part.plan[part.plan >= 0])
+        while parts and parts[-1].plans < 2 * sum(map(len, fresh)):
+            plan = parts.pop().plan
+            fresh.append(plan[plan >= 0])
+        numbers = np.sort(np.concatenate(fresh)).astype(np.intp)
+        if len(numbers):
+            parts.append(_part(*locate(numbers), numbers, self.cells))
+        return PlanIndex(step_m=self.step_m, cells=self.cells, plan_count=plans, parts=tuple(parts))
+
+    def __len__(self) -> int:
+        """Return the number of distinct prototypes of each segment, added up."""
+        return sum(len(part.segment) for part in self.parts)
+
     @property
     def nbytes(self) -> int:
         """Bytes in memory, including the product codes; memory-mapped rows count as 0."""
-        rows = 0 if isinstance(self.rows, np.memmap) else self.rows.nbytes
-        lists = self.row.nbytes + self.owner.nbytes + self.owner_begin.nbytes + self.cell_begin.nbytes
-        return rows + lists + BYTES_PER_CODE * len(self.row)
+        return sum(part.segment.nbytes + part.plan.nbytes + part.dead.nbytes for part in self.parts)
 
     def prepare(self) -> None:
         """Compute the product codes now; otherwise the first query that needs them does."""
-        _ = self._scans
+        for part in self.parts:
+            part.segment.prepare()
 
     def log_masses(
         self,
@@ -132,137 +180,90 @@ class PlanIndex:
     ) -> Float[np.ndarray, "p"]:
         """Return the log of each plan's mass (see `prototypes`); -inf if none of its prototypes was compared exactly.
 
-        At most `compared` pairs are compared exactly. About `scanned` pairs are in the code scan, as the last probed
-        cell is scanned whole.
+        About `compared` pairs are compared exactly, as pairs of equal cost are kept together. About `scanned` pairs are
+        in the code scan, as the last probed cell is scanned whole.
         """
         costs = PrototypeCosts(query, self.step_m, weights, config)
         k, j = costs.shape
-        compares_all = len(self.row) * k * j <= compared
+        compares_all = len(self) * k * j <= compared
         pairs = self._all_pairs(k, j) if compares_all else self._best_pairs(costs, compared, scanned)
         mass, lowest = np.zeros(self.plan_count), np.inf
-        for prototype, hypothesis, offset in pairs:
-            rows = self._raw[self.row[prototype]].view(ROW)
+        for part, prototype, hypothesis, offset in pairs:
+            rows = part.segment.records(prototype)
             cost = costs.pairs(rows, hypothesis, offset)
             # Masses are relative to the lowest cost so far, so that relevant ones do not underflow.
             new_lowest = min(lowest, float(cost.min()))
             mass *= np.exp(-weights.temperature * (lowest - new_lowest)) if np.isfinite(lowest) else 1.0
             lowest = new_lowest
             weight = np.exp(rows["log_area"] - weights.temperature * (cost.astype(np.float64) - lowest))
-            begin, count = self.owner_begin[prototype], self.owner_begin[prototype + 1] - self.owner_begin[prototype]
-            within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-            owner = self.owner[np.repeat(begin, count) + within]
-            mass += np.bincount(owner, np.repeat(weight, count), minlength=self.plan_count)
+            count, owner = part.segment.owners(prototype)
+            plan, each = part.plan[owner], np.repeat(weight, count)
+            if len(part.dead):
+                plan, each = plan[plan >= 0], each[plan >= 0]
+            mass += np.bincount(plan, each, minlength=self.plan_count)
         with np.errstate(divide="ignore"):
             return np.log(mass) - weights.temperature * lowest
 
-    def _all_pairs(self, k: int, j: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def _all_pairs(self, k: int, j: int) -> Iterator[tuple[_Part, np.ndarray, np.ndarray, np.ndarray]]:
         """Yield all pairs in batches: distinct prototypes, heading hypotheses and height hypotheses, by number."""
-        shape = len(self.row), k, j
-        for begin in range(0, len(self.row) * k * j, _BATCH_SIZE):
-            pair = np.arange(begin, min(begin + _BATCH_SIZE, len(self.row) * k * j))
-            prototype, hypothesis, offset = np.unravel_index(pair, shape)
-            yield prototype, hypothesis, offset
+        for part in self.parts:
+            number = np.arange(len(part.segment))
+            number = number[part.alive(number)]
+            for begin in range(0, len(number) * k * j, _BATCH_SIZE):
+                pair = np.arange(begin, min(begin + _BATCH_SIZE, len(number) * k * j))
+                place, hypothesis, offset = np.unravel_index(pair, (len(number), k, j))
+                yield part, number[place], hypothesis, offset
 
     def _best_pairs(
         self, costs: PrototypeCosts, compared: int, scanned: int
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield the `compared` pairs that are cheapest by their codes, in batches as `_all_pairs` does."""
+    ) -> Iterator[tuple[_Part, np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield about the `compared` pairs that are cheapest by their codes, in batches as `_all_pairs` does."""
         k, j = costs.shape
         probed = self._probed_cells(costs, scanned)
+        families = {family for part in self.parts for family in part.segment.nonempty_cells}
+        tables = {family: lookup_tables(costs, claims_of(family)).reshape(k * j, -1) for family in families}
         per_hypothesis = min(compared, -(-_OVERFETCH * compared // (k * j)))
-        parts = []
-        for family, (first, scan) in self._scans.items():
-            tables = lookup_tables(costs, claims_of(family)).reshape(k * j, -1)
-            number, cost = scan.search(tables, probed[family].reshape(-1, k * j).T, per_hypothesis)
-            joint = np.broadcast_to(np.arange(k * j)[:, None], number.shape)
-            is_found = number >= 0
-            parts.append((number[is_found] + first, joint[is_found], cost[is_found]))
-        prototype, joint, cost = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        if len(cost) > compared:
-            kept = np.argpartition(cost, compared - 1)[:compared]
-            prototype, joint = prototype[kept], joint[kept]
-        # Rows are read fastest in the order of memory.
-        order = np.argsort(prototype, kind="stable")
-        prototype, joint = prototype[order], joint[order]
-        hypothesis, offset = np.divmod(joint, j)
-        for begin in range(0, len(prototype), _BATCH_SIZE):
-            part = slice(begin, begin + _BATCH_SIZE)
-            yield prototype[part], hypothesis[part], offset[part]
+        found = []
+        for part in self.parts:
+            prototype, joint, cost = part.segment.search(tables, probed, per_hypothesis)
+            alive = part.alive(prototype)
+            found.append((prototype[alive], joint[alive], cost[alive]))
+        cost = np.concatenate([cost for *_, cost in found])
+        highest = np.partition(cost, compared - 1)[compared - 1] if len(cost) > compared else np.inf
+        for part, (prototype, joint, cost) in zip(self.parts, found, strict=True):
+            prototype, joint = prototype[cost <= highest], joint[cost <= highest]
+            # Rows are read fastest in the order of memory.
+            order = np.argsort(prototype, kind="stable")
+            prototype, (hypothesis, offset) = prototype[order], np.divmod(joint[order], j)
+            for begin in range(0, len(prototype), _BATCH_SIZE):
+                batch = slice(begin, begin + _BATCH_SIZE)
+                yield part, prototype[batch], hypothesis[batch], offset[batch]
 
-    def _probed_cells(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l k j"]]:
-        """Return for each family which of its l non-empty cells are probed under which hypotheses."""
-        k, j = costs.shape
-        nonempty = self._nonempty_cells
-        if len(self.row) * k * j <= scanned:
-            return {family: np.ones((len(cell), k, j), bool) for family, cell in nonempty.items()}
-        by_family = self.cells.costs(costs, nonempty)
-        cost = np.concatenate(
-            [by_family[family][cell % self._cells_per_family].ravel() for family, cell in nonempty.items()]
-        )
-        size = np.concatenate([np.repeat(self._cell_sizes[cell], k * j) for cell in nonempty.values()])
+    def _probed_cells(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l q"]] | None:
+        """Return for each family which of its cells are probed under which hypotheses; None for all."""
+        (k, j), per_family = costs.shape, len(self.cells) // FAMILIES
+        if len(self) * k * j <= scanned:
+            return None
+        sizes = np.sum([part.cell_sizes for part in self.parts], axis=0)
+        nonempty = by_family(np.flatnonzero(sizes), per_family)
+        costs_of = self.cells.costs(costs, nonempty)
+        cost = np.concatenate([costs_of[family][cell % per_family].ravel() for family, cell in nonempty.items()])
+        size = np.concatenate([np.repeat(sizes[cell], k * j) for cell in nonempty.values()])
         # Costs are rounded to 16 bits, which numpy sorts twenty times as fast.
         lowest = float(cost.min())
         rounded = ((cost - lowest) * (65535.0 / max(float(cost.max()) - lowest, 1e-9))).astype(np.uint16)
         order = np.argsort(rounded, kind="stable")
         fits = np.cumsum(size[order]) <= scanned
-        probed = np.zeros(len(cost), bool)
-        probed[order[: int(fits.sum()) + 1]] = True
+        chosen = np.zeros(len(cost), bool)
+        chosen[order[: int(fits.sum()) + 1]] = True
         ends = np.cumsum([len(cell) * k * j for cell in nonempty.values()])
-        parts = np.split(probed, ends[:-1])
-        return {family: part.reshape(-1, k, j) for family, part in zip(nonempty, parts, strict=True)}
-
-    @cached_property
-    def _scans(self) -> dict[int, tuple[int, CodeScan]]:
-        """Code scan of each family, with a list for each non-empty cell, and the family's first distinct prototype."""
-        scans = {}
-        for family, cell in self._nonempty_cells.items():
-            first, end = int(self.cell_begin[cell[0]]), int(self.cell_begin[cell[-1] + 1])
-            batches = (self.row[begin : min(begin + _BATCH_SIZE, end)] for begin in range(first, end, _BATCH_SIZE))
-            code = np.concatenate([product_codes(self._raw[row].view(ROW)) for row in batches])
-            scans[family] = first, CodeScan(code, np.append(self.cell_begin[cell], end) - first)
-        return scans
-
-    @cached_property
-    def _raw(self) -> np.ndarray:
-        """The rows as bytes, which numpy copies ten times as fast as records."""
-        return _as_bytes(self.rows)
-
-    @property
-    def _cells_per_family(self) -> int:
-        return len(self.cells) // FAMILIES
-
-    @cached_property
-    def _cell_sizes(self) -> Int[np.ndarray, "v"]:
-        return np.diff(self.cell_begin)
-
-    @cached_property
-    def _nonempty_cells(self) -> dict[int, Int[np.ndarray, "l"]]:
-        """Cells with prototypes, by family; families without prototypes are left out."""
-        cell = np.flatnonzero(self._cell_sizes)
-        family = cell // self._cells_per_family
-        return {int(number): cell[family == number] for number in np.unique(family)}
+        # Cells without a living prototype are in no list of `nonempty`, and are not probed.
+        families = {family for part in self.parts for family in part.segment.nonempty_cells}
+        probed = {family: np.zeros((per_family, k * j), bool) for family in families}
+        for (family, cell), part in zip(nonempty.items(), np.split(chosen, ends[:-1]), strict=True):
+            probed[family][cell % per_family] = part.reshape(-1, k * j)
+        return probed
 
 
-def _as_bytes(rows: np.ndarray) -> np.ndarray:
-    return rows.view(np.dtype((np.void, ROW.itemsize)))
-
-
-def _sort_keys(rows: np.ndarray, row: Int[np.ndarray, "n"]) -> UInt64[np.ndarray, "n"]:
-    """Return keys that sort prototypes by cell, then by a hash of the record (multilinear, modulo 2^64).
-
-    Different prototypes of one cell share a key with a chance of 2^-48; they would be compared as if they were equal.
-    """
-    key, raw = np.empty(len(row), np.uint64), _as_bytes(rows)
-    words = -(-ROW.itemsize // 8)
-    # Multilinear hashing needs odd random factors; a fixed seed keeps the order of prototypes the same.
-    factor = np.random.default_rng(0).integers(2**62, size=words, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
-    for begin in range(0, len(row), _BATCH_SIZE):
-        part = raw[row[begin : begin + _BATCH_SIZE]]
-        content = np.zeros((len(part), 8 * words), np.uint8)
-        content[:, : ROW.itemsize] = part.view(np.uint8).reshape(len(part), -1)
-        hashed = (content.view(np.uint64) * factor).sum(axis=1, dtype=np.uint64)
-        # The upper bits of a product are well mixed, so multiply once more before keeping 48 of them.
-        hashed = (hashed ^ hashed >> np.uint64(29)) * factor[0]
-        cell = part.view(ROW)["cell"].astype(np.uint64)
-        key[begin : begin + len(part)] = cell << _CELL_SHIFT | hashed >> np.uint64(64 - 48)
-    return key
+def _part(rows: np.ndarray, begin: np.ndarray, count: np.ndarray, numbers: Int[np.ndarray, "p"], cells: Cells) -> _Part:
+    return _Part(Segment.build(rows, begin, count, cells), numbers, np.empty(0, np.intp))

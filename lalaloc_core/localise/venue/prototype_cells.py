@@ -13,7 +13,7 @@ there is a *family* of cells for every set of claimed classes. All families shar
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -48,6 +48,7 @@ class Cells:
     log_profile: Float[np.ndarray, "v a"]
     share: Float[np.ndarray, "v a c"]
     version: int
+    _centroids: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         """Return the number of cells of all families."""
@@ -55,12 +56,20 @@ class Cells:
 
     def assign(self, rows: np.ndarray) -> UInt16[np.ndarray, "n"]:
         """Return the cell of each prototype: its family's, with the nearest centroid."""
-        feature, centroid = features(rows), _features(self.log_profile, self.share)
-        family, cell = family_of(rows["claims"]), np.empty(len(rows), np.uint16)
+        feature, family = features(rows), family_of(rows["claims"])
+        cell = np.empty(len(rows), np.uint16)
         for number in np.unique(family).tolist():
             row, column = family == number, _claimed_features(number)
-            cell[row] = number * len(centroid) + nearest(feature[np.ix_(row, column)], centroid[:, column])
+            own = nearest(feature[np.ix_(row, column)], *self._claimed_centroids(number))
+            cell[row] = number * len(self.log_profile) + own
         return cell
+
+    def _claimed_centroids(self, family: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the centroids in the features that a family is assigned by, and half their squared norms."""
+        if family not in self._centroids:
+            centroid = np.ascontiguousarray(_features(self.log_profile, self.share)[:, _claimed_features(family)])
+            self._centroids[family] = centroid, half_norms(centroid)
+        return self._centroids[family]
 
     def costs(self, query_costs: PrototypeCosts, families: Iterable[int]) -> dict[int, Float[np.ndarray, "v k j"]]:
         """Return the approximate mean cost of each cell's prototypes under every hypothesis, for some families.
@@ -122,9 +131,16 @@ def _features(log_profile: np.ndarray, share: np.ndarray) -> Float[np.ndarray, "
     return np.concatenate([_LOG_SCALE * log_profile.astype(np.float32), _CLASS_SCALE * openings.reshape(n, -1)], axis=1)
 
 
-def nearest(feature: Float[np.ndarray, "n f"], centroid: Float[np.ndarray, "v f"]) -> Int[np.ndarray, "n"]:
+def half_norms(centroid: Float[np.ndarray, "v f"]) -> Float[np.ndarray, "v"]:
+    """Return half the squared norm of each centroid."""
+    return 0.5 * np.square(centroid).sum(axis=1)
+
+
+def nearest(
+    feature: Float[np.ndarray, "n f"], centroid: Float[np.ndarray, "v f"], half_norm: Float[np.ndarray, "v"]
+) -> Int[np.ndarray, "n"]:
     """Return the number of the nearest centroid of each row of features."""
-    number, half_norm = np.empty(len(feature), np.intp), 0.5 * np.square(centroid).sum(axis=1)
+    number = np.empty(len(feature), np.intp)
     for begin in range(0, len(feature), _CHUNK):
         part = slice(begin, begin + _CHUNK)
         number[part] = (half_norm - feature[part] @ centroid.T).argmin(axis=1)

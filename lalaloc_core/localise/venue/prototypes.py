@@ -70,9 +70,13 @@ def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
     rows, floor_m2 = np.zeros(len(chosen), ROW), grid.step_m**2 * np.bincount(pose_room)
     columns, room = azimuths(grid.profile_m.shape[1]), pose_room[chosen]
     rows["log_profile"] = np.log(grid.profile_m[chosen][:, columns])
-    # Openings are rendered for the prototypes alone; for all other poses when the plan is searched.
-    poses, width = PoseSet(grid.poses.position_m[chosen], room), grid.profile_m.shape[1]
-    kind = layouts_at(plan, poses, np.zeros(len(chosen)), width).kind if plan.opening_faces else None
+    width, kind = grid.profile_m.shape[1], None
+    if plan.opening_faces and grid.is_rendered:
+        known = grid.layouts(plan).kind
+        kind = None if known is None else known[chosen]
+    elif plan.opening_faces:
+        # Openings are rendered for the prototypes alone; for all other poses when the plan is searched.
+        kind = layouts_at(plan, PoseSet(grid.poses.position_m[chosen], room), np.zeros(len(chosen)), width).kind
     kind = np.full((len(chosen), width), WALL_CODE, np.uint8) if kind is None else kind
     rows["openings"] = packed_openings(kind[:, columns])
     rows["log_area"] = np.log(floor_m2[room] / np.bincount(room)[room])
