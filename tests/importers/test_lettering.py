@@ -29,7 +29,7 @@ AREAS_M2 = {"Wohnzimmer": 23.4, "Küche": 13.92, "Bedroom": 13.92}
 
 
 @dataclass
-class Page:
+class PrintedPlan:
     """Picture of a flat of 9.3 m by 6.4 m with three rooms, names, areas and six dimensions."""
 
     px_per_m: float = 70.0
@@ -113,11 +113,11 @@ def check_flat(plan: ImportedPlan, pixels_per_metre: float | None = None) -> Non
 
 @pytest.mark.parametrize(("px_per_m", "text_px"), [(40.0, 13), (110.0, 30)])
 def test_printed_names_and_dimensions_of_a_picture_are_read(px_per_m: float, text_px: int):
-    check_flat(import_plan(Page(px_per_m, text_px).file(), limits=LIMITS), px_per_m)
+    check_flat(import_plan(PrintedPlan(px_per_m, text_px).file(), limits=LIMITS), px_per_m)
 
 
 def test_printed_names_and_dimensions_of_a_scan_are_read():
-    page = Page()
+    page = PrintedPlan()
     page.picture = page.picture.rotate(1.5, expand=True, fillcolor=255, resample=Image.Resampling.BICUBIC)
     plan = import_plan(page.file("PDF", resolution=100.0), limits=LIMITS)
     check_flat(plan, page.px_per_m * 72.0 / 100.0)
@@ -125,7 +125,7 @@ def test_printed_names_and_dimensions_of_a_scan_are_read():
 
 
 def test_scale_that_contradicts_the_texts_gives_warnings():
-    plan = import_plan(Page().file(), ImportOptions(metres_per_pixel=0.02), LIMITS)
+    plan = import_plan(PrintedPlan().file(), ImportOptions(metres_per_pixel=0.02), LIMITS)
     assert plan.report.metres_per_unit == 0.02
     written, areas = plan.report.warnings
     assert "dimensions written in the drawing give 0.0142" in written or "give 0.0143" in written
@@ -134,14 +134,14 @@ def test_scale_that_contradicts_the_texts_gives_warnings():
 
 
 def test_two_names_in_a_room_are_reported():
-    page = Page(dimensions=False)
+    page = PrintedPlan(dimensions=False)
     page._box((4.3, 3.1, 9.1, 3.3), 255)
     plan = import_plan(page.file(), ImportOptions(metres_per_pixel=1.0 / page.px_per_m), LIMITS)
     assert any("'Bedroom' is written in room 'Küche' too" in guess for guess in plan.report.unsure)
 
 
 def test_without_the_extra_texts_are_not_read(monkeypatch: pytest.MonkeyPatch):
-    page = Page()
+    page = PrintedPlan()
     monkeypatch.setattr(lettering, "find_spec", lambda name: None)
     with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
         import_plan(page.file())
@@ -156,7 +156,7 @@ def test_models_are_not_downloaded(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     lettering._reader.cache_clear()
-    texts = read_texts(np.asarray(Page().picture), ReportBuilder(), Budget(LIMITS))
+    texts = read_texts(np.asarray(PrintedPlan().picture), ReportBuilder(), Budget(LIMITS))
     assert {"Küche", "9.30"} <= {text.text for text in texts.drawing.letterings}
 
 
@@ -176,7 +176,7 @@ def test_reading_texts_ends_with_its_share_of_the_time():
 
 
 def test_lack_of_memory_leaves_the_rooms_without_names(tmp_path: Path):
-    page = Page()
+    page = PrintedPlan()
     (tmp_path / "plan.png").write_bytes(page.file())
     program = f"""
 from lalaloc_core.importers import ImportOptions, import_plan
