@@ -331,6 +331,8 @@ class SequencePose:
     view: View | None = None
     probability_elsewhere: float | None = None
     camera_height_m: float | None = None
+    floorplan_id: str | None = None
+    level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -354,6 +356,7 @@ class SequenceLocalisation:
     camera_height_m: float
     timings_ms: Mapping[str, float]
     model: Model
+    venue_id: str | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 python="${PYTHON:-python3}"
 venv="${VENV:-.venv}"
-extras="train,service,ray,oracle,plans,ifc,docs,dev"
+extras="train,service,ray,oracle,plans,ifc,ocr,docs,dev"
 is_recent='import sys; sys.exit(sys.version_info < (3, 11))'
 
 fail() {

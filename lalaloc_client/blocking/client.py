@@ -431,9 +431,10 @@ class Client(Transport):
 
     def localise_sequence(
         self,
-        floorplan_id: str,
+        floorplan_id: str | None,
         panoramas: Sequence[Photograph],
         *,
+        venue_id: str | None = None,
         motion: Literal["walk", "turn"] | None = None,
         relative_heading_deg: Sequence[float | None] | None = None,
         relative_heading_std_deg: float | None = None,
@@ -451,8 +452,9 @@ class Client(Transport):
         """Localise several photographs of one visit jointly.
 
         Args:
-            floorplan_id: id of the plan.
+            floorplan_id: id of the plan; None with `venue_id`.
             panoramas: photographs in the order in which they were taken, each as for `localise`.
+            venue_id: id of a venue, to search all its plans; poses have `floorplan_id` and `level`.
             motion: `turn` for photographs from one spot, else `walk`, the default.
             relative_heading_deg: for `turn`, headings relative to each other, clockwise, None where unknown. Default:
                 searched.
@@ -473,6 +475,7 @@ class Client(Transport):
         """
         values = {
             "floorplan_id": floorplan_id,
+            "venue_id": venue_id,
             "motion": motion,
             "relative_heading_deg": relative_heading_deg,
             "relative_heading_std_deg": relative_heading_std_deg,

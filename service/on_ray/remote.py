@@ -211,6 +211,12 @@ class RemoteVenueLocaliser(_SearchCaller):
         self._observe(found)
         return found
 
+    async def localise_sequence(self, venue: VenueRecord, query: SequenceQuery) -> SequenceAnswer:
+        """See `VenueLocaliser.localise_sequence`."""
+        found = await self._call("localise_sequence_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
+        self._observe(found)
+        return found
+
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:

@@ -108,6 +108,11 @@ class SearchReplica:
         return await self._runtime.venue_localiser.localise(await self._venue(tenant, venue_id), query)
 
     @returning_failures
+    async def localise_sequence_in_venue(self, tenant: str, venue_id: str, query: SequenceQuery) -> SequenceAnswer:
+        """See `VenueLocaliser.localise_sequence`."""
+        return await self._runtime.venue_localiser.localise_sequence(await self._venue(tenant, venue_id), query)
+
+    @returning_failures
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:

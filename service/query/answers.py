@@ -168,6 +168,7 @@ def compose_sequence_answer(
     found: SequenceLocalisation,
     motions: Sequence[Motion],
     manifest: Manifest,
+    share: float = 1.0,
 ) -> SequenceAnswer:
     """Compose the answer to a query about several photographs.
 
@@ -176,6 +177,7 @@ def compose_sequence_answer(
         found: result of the joint search.
         motions: the stated motions between the photographs.
         manifest: of the model.
+        share: lowest probability that a photograph is of a searched plan.
     """
     first = answers[0]
     return SequenceAnswer(
@@ -185,7 +187,7 @@ def compose_sequence_answer(
             SequencePoseAnswer(**{name: getattr(answer, name) for name in SequencePoseAnswer.model_fields})
             for answer in answers
         ],
-        confidence=found.confidence(manifest),
+        confidence=found.confidence(manifest, share),
         warnings=[_motion_warning(index, motions[index]) for index in found.motions_contradicted],
         stage=found.stage,
         camera_height_m=found.camera_height_m,

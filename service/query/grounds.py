@@ -147,7 +147,7 @@ class Grounds:
         searched = await self._search.searched(
             venue,
             ready.rows,
-            encoded,
+            [encoded],
             form=query.document,
             hints=ready.hints,
             warnings=ready.warnings,

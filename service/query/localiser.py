@@ -4,32 +4,28 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from time import monotonic
 from typing import TypeVar
 
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
-from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
+from lalaloc_core.localise.pipeline import Localisation, localise_steps
 from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
-from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import SequenceJob
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
-from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.photograph import View
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
-from service.query.answers import compose_answer, compose_sequence_answer, locate_in, posterior_answer
+from service.query.answers import compose_answer, locate_in, posterior_answer
 from service.query.decoding import Decoder
 from service.query.photographs import Photograph, encode, view_answer
 from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
 from service.query.search_steps import SearchSteps, StepRunner, completed
+from service.query.sequences import SequenceGround, SequenceSearch
 from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.settings import Settings, work_factor
@@ -40,9 +36,6 @@ from service.threads import BoundedReads, Threads
 
 # LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
 _RESERVED_S = 0.25
-
-# Photographs from one spot with known angles are one search, whose stages are those of a sequence.
-_TURN_CONFIG = LocaliseConfig(vdr_candidates=0)
 
 # Names of the heading's sources in pictures.
 _SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
@@ -90,6 +83,7 @@ class Localiser:
         self._threads = Threads(
             "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, permits
         )
+        self.sequences = SequenceSearch(self, settings=settings, bundle=bundle, encoder=encoder, decoder=decoder)
 
     @property
     def model(self) -> ModelAnswer:
@@ -179,117 +173,13 @@ class Localiser:
         return await self.run_search(completed(steps, compose), context)
 
     async def _localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
-        form, context, clock = query.form, query.context, query.context.clock
-        heights, plan = stated_heights(form, record, len(query.contents)), record.plan
-        if form.camera_heights_m is not None and not self._encoder.networks.predicts_profile:
-            raise InvalidPoseError(
-                "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
-                "give camera_height_m"
-            )
-        compass_deg = self._settings.panoramas.compass_tolerance_deg
-        # Decode one photograph at a time, so that a query occupies one decoder.
-        with clock.stage("decode"):
-            views = [
-                await self._decoder.decode(content, form.stated_view, context.deadline, context.client)
-                for content in query.contents
-            ]
-        known = [
-            known_heading(form.heading_of(index), plan.north, view, compass_deg) for index, view in enumerate(views)
-        ]
-        # A sphere shows all that other photographs from its spot could add.
-        one_query = form.motion == "turn" and not any(view.is_sphere for view in views)
-        turns = form.known_turns
-        if one_query and turns is not None:
-            grid, joint = await self._search_turn(record, query, views, known, turns, heights[0])
-            found = localised_turn(joint, turns)
-        else:
-            grid, found = await self._search_sequence(record, query, views, known, heights)
-            if one_query:
-                grid, joint = await self._search_turn(record, query, views, known, found_turns(found), heights[0])
-                found = judged_turn(found, joint)
-        timings_ms = self.observe(context, found.stage)
+        plan, heights = record.plan, stated_heights(query.form, record, len(query.contents))
 
-        def compose() -> SequenceAnswer:
-            answers = [
-                compose_answer(
-                    picture,
-                    locate=locate_in(record),
-                    known=heading,
-                    timings_ms=timings_ms,
-                    bundle=self._bundle,
-                    view=partial(view_answer, photograph, plan=plan, grid=grid),
-                )
-                for heading, picture, photograph in zip(
-                    known, found.pictures, _photographs(views, found, one_spot=form.motion == "turn"), strict=True
-                )
-            ]
-            return compose_sequence_answer(answers, found, form.steps(len(views)), self._bundle.manifest)
+        async def ground(_: Sequence[Query]) -> SequenceGround:
+            grid = await self.grid(record, heights[0], query.context)
+            return SequenceGround(plan, grid, locate_in(record))
 
-        return await self.compute(context, compose)
-
-    async def _search_sequence(
-        self,
-        record: PlanRecord,
-        query: SequenceQuery,
-        views: Sequence[View],
-        known: Sequence[KnownHeading],
-        heights: Sequence[CameraHeight],
-    ) -> tuple[PoseGrid, SequenceLocalisation]:
-        """Search the places of photographs that are linked by motions; return the pose grid, too."""
-        form, context, clock = query.form, query.context, query.context.clock
-        encoded: list[Query] = []
-        # One at a time, so that queries of others come in between.
-        with clock.stage("encode"):
-            for view, heading, height in zip(views, known, heights, strict=True):
-                one = partial(encode, self._encoder, [Photograph(view)], [heading], height, StageClock())
-                encoded += await self.compute(context, one)
-        grid = await self.grid(record, heights[0], context)
-        steps = localise_sequence_steps(
-            record.plan,
-            grid,
-            self._encoder.networks,
-            encoded,
-            form.steps(len(views)),
-            refine=form.refine,
-            top_k=form.top_k,
-            clock=clock,
-        )
-        return grid, await self.run_search(steps, context)
-
-    async def _search_turn(
-        self,
-        record: PlanRecord,
-        query: SequenceQuery,
-        views: Sequence[View],
-        known: Sequence[KnownHeading],
-        turns: Sequence[float],
-        height: CameraHeight,
-    ) -> tuple[PoseGrid, Localisation]:
-        """Search the place of photographs from one spot with known headings (radians) minus that of the first.
-
-        They are one query that sees more azimuths, so that overlapping parts count once.
-        """
-        form, context, clock = query.form, query.context, query.context.clock
-        photograph = Photograph(views[0], list(zip(views[1:], turns[1:], strict=True)))
-        stated = (
-            replace(heading, heading=heading.heading - turn)
-            for heading, turn in zip(known, turns, strict=True)
-            if heading.heading is not None
-        )
-        first = [next(stated, known[0])]
-        encoded = await self.compute(context, partial(encode, self._encoder, [photograph], first, height, clock))
-        grid = await self.grid(record, height, context)
-        steps = localise_steps(
-            record.plan,
-            grid,
-            self._encoder.networks,
-            encoded[0],
-            refine=form.refine,
-            top_k=form.top_k,
-            config=_TURN_CONFIG,
-            clock=clock,
-        )
-        return grid, await self.run_search(steps, context)
+        return await self.sequences.answer(query, await self.sequences.views(query), heights, plan.north, ground)
 
     async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline."""
@@ -379,17 +269,3 @@ class Localiser:
             self._telemetry.stage_seconds.labels(name).observe(duration_ms / 1e3)
         self._telemetry.answers.labels(stage).inc()
         return timings_ms
-
-
-def _photographs(views: Sequence[View], found: SequenceLocalisation, *, one_spot: bool) -> list[Photograph]:
-    """Return each photograph of a sequence, together with all others from its spot."""
-    if not one_spot:
-        return [Photograph(view) for view in views]
-    headings = [panorama_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
-    return [
-        Photograph(
-            view,
-            [(other, heading - headings[index]) for other, heading in zip(views, headings, strict=True)],
-        )
-        for index, view in enumerate(views)
-    ]

@@ -194,6 +194,10 @@ class VenueLocaliserBackend(Protocol):
         """See `VenueLocaliser.localise`."""
         ...
 
+    async def localise_sequence(self, venue: VenueRecord, query: SequenceQuery) -> SequenceAnswer:
+        """See `VenueLocaliser.localise_sequence`."""
+        ...
+
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:

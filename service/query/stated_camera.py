@@ -55,19 +55,29 @@ def stated_heights(form: SequenceForm, record: PlanRecord, photographs: int) -> 
     Raises:
         InvalidPoseError: a requested height is impossible in the plan, or the common height is needed and unknown.
     """
-    common = stated_height(form, record)
+    for height_m in form.camera_heights_m or []:
+        if height_m is not None:
+            check_height_m(record, height_m)
+    return heights_of(form, stated_height(form, record), photographs)
+
+
+def heights_of(form: SequenceForm, common: CameraHeight, photographs: int) -> list[CameraHeight]:
+    """Return the camera height of each photograph of a sequence, `common` where the request states none.
+
+    Raises:
+        InvalidPoseError: the common height is needed and unknown.
+    """
     if form.camera_heights_m is None:
         return photographs * [common]
     if common.is_unknown:
         known_m = [height_m for height_m in form.camera_heights_m if height_m is not None]
         if len(known_m) < photographs:
             raise InvalidPoseError(
-                "camera_heights_m has null, and the plan states no camera height: give all heights, or camera_height_m"
+                "camera_heights_m has null, and no camera height of the plan is known: give all heights, or "
+                "camera_height_m"
             )
-        common = stated_camera.stated_height(record.plan, known_m[0], form.camera_height_std_m)
-    for height_m in form.camera_heights_m:
-        if height_m is not None:
-            check_height_m(record, height_m)
+        std_m = stated_camera.DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m
+        common = CameraHeight(known_m[0], std_m)
     return [common if height_m is None else common.at(height_m) for height_m in form.camera_heights_m]
 
 

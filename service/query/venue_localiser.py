@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 
@@ -12,19 +14,23 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.sequence import Motion
+from lalaloc_core.localise.venue.merged_plans import GAP_M
 from service.errors import NoPlanNearbyError
 from service.http.admission_control import Slots
 from service.query.answers import compose_answer
 from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.photographs import Photograph, encode, view_answer
-from service.query.queries import PanoramaQuery
+from service.query.queries import PanoramaQuery, SequenceQuery
 from service.query.search_steps import completed
-from service.query.stated_camera import known_heading
+from service.query.sequences import SequenceGround
+from service.query.stated_camera import heights_of, known_heading
 from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, venue_height
 from service.query.venue_search import ReadPlans, SearchedPlans, VenueSearch
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability, SequenceAnswer
 from service.settings import Settings
 from service.storage.records import VenueRecord
 
@@ -32,6 +38,8 @@ from service.storage.records import VenueRecord
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # Plans whose probabilities differ by less than this are a tie.
 _TIED = 1e-9
+# Photographs of a sequence that plans are chosen by, and the deviations of a motion that are possible.
+_CHOOSING, _REACH_STD = 8, 5.0
 
 
 class VenueLocaliser:
@@ -67,6 +75,44 @@ class VenueLocaliser:
             LaLaLocError: see `Localiser.localise`.
         """
         return await self._localise(venue, query, partial(self._plans.members, venue.tenant, venue.id))
+
+    async def localise_sequence(self, venue: VenueRecord, query: SequenceQuery) -> SequenceAnswer:
+        """Localise several photographs of one visit jointly in the plans of a venue; raises as `localise` does."""
+        form, context, count = query.form, query.context, len(query.contents)
+        hints = VenueHints(anchor=venue.anchor)
+        read_plans = partial(self._plans.members, venue.tenant, venue.id)
+        async with self._queries.wait_and_hold(context.client, context.deadline):
+            # Decode first, so that an unreadable picture is refused without waiting for the plans.
+            views = await self._localiser.sequences.views(query)
+            with context.clock.stage("wait"):
+                ready, warnings = await self._search.ready(venue, read_plans, hints, context)
+
+            async def ground(encoded: Sequence[Query]) -> SequenceGround:
+                with context.clock.stage("shortlist"):
+                    searched = await self._search.searched(
+                        venue,
+                        ready,
+                        _spread(encoded),
+                        form=form,
+                        hints=hints,
+                        warnings=warnings,
+                        compute=partial(self._localiser.compute, context),
+                        # Measured motions must not lead from one plan to its neighbour.
+                        gap_m=GAP_M + max(map(_reach_m, form.steps(count))),
+                    )
+                return SequenceGround(
+                    plan=searched.merged.plan,
+                    grid=searched.merged.grid,
+                    locate=searched.place,
+                    share=lambda found: searched.shares(found)[0],
+                    warnings=searched.warnings,
+                    turn_config=replace(VENUE_CONFIG, vdr_candidates=0),
+                )
+
+            north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
+            heights = heights_of(form, venue_height(form, ready), count)
+            answer = await self._localiser.sequences.answer(query, views, heights, north, ground)
+        return answer.model_copy(update={"venue_id": venue.id})
 
     async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
@@ -123,7 +169,7 @@ class VenueLocaliser:
         encoded = (await compute(partial(encode, self._encoder, [photograph], [known], height, clock)))[0]
         with clock.stage("shortlist"):
             searched = await self._search.searched(
-                venue, ready, encoded, form=form, hints=hints, warnings=warnings, compute=compute
+                venue, ready, [encoded], form=form, hints=hints, warnings=warnings, compute=compute
             )
         steps = localise_steps(
             searched.merged.plan,
@@ -169,6 +215,17 @@ class VenueLocaliser:
             )
             for number in _by_probability(probability, np.array(searched.index))
         ]
+
+
+def _reach_m(motion: Motion) -> float:
+    """Return the distance that a measured motion hardly exceeds."""
+    return 0.0 if motion.distance_m is None else motion.distance_m + _REACH_STD * motion.distance_std_m
+
+
+def _spread(encoded: Sequence[Query]) -> list[Query]:
+    """Return photographs at even intervals, few enough to choose plans by each."""
+    index = np.unique(np.linspace(0, len(encoded) - 1, _CHOOSING).round().astype(int))
+    return [encoded[int(k)] for k in index]
 
 
 def _by_probability(probability: Float[np.ndarray, "m"], index: Int[np.ndarray, "m"]) -> list[int]:

@@ -197,26 +197,27 @@ class VenuePlans:
         self,
         known: PlanList,
         index: PlanIndex,
-        query: Query,
-        weights: MatchingWeights,
+        choosing: Sequence[tuple[Query, MatchingWeights]],
         log_prior: Float[np.ndarray, "p"],
         favour: Float[np.ndarray, "p"] | None = None,
     ) -> ChosenPlans:
-        """Return the most probable plans of an index.
+        """Return the most probable plans of an index, those that are probable for any of the photographs.
 
         Args:
             known: rows of the index's plans.
             index: the index.
-            query: the encoded panorama.
-            weights: weights of the matching cost.
+            choosing: the encoded photographs, each with the weights of its matching cost.
             log_prior: (p,) log prior of the plans.
             favour: (p,) log factors by which plans are preferred in the choice alone.
         """
-        log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
+        masses = [index.log_masses(query, weights, MatchingConfig()) + log_prior for query, weights in choosing]
+        log_mass = masses[0]
+        if len(masses) > 1:
+            shares = [mass - np.logaddexp.reduce(mass) for mass in masses]
+            log_mass = np.logaddexp.reduce(shares) - math.log(len(shares))
         ranked = log_mass if favour is None else log_mass + favour
-        chosen = most_probable(
-            ranked, known.poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, self._max_poses)
-        )
+        max_poses = min(most_poses(query, self._max_poses) for query, _ in choosing)
+        chosen = most_probable(ranked, known.poses, max_plans=MAX_SEARCHED, max_poses=max_poses)
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:

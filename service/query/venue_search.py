@@ -19,7 +19,7 @@ from lalaloc_core.localise.hints import Hints
 from lalaloc_core.localise.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.venue.merged_plans import GAP_M, MergedPlans
 from lalaloc_core.localise.venue.prototypes import share_searched
 from service.errors import VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
@@ -128,41 +128,45 @@ class VenueSearch:
         self,
         venue: VenueRecord,
         ready: PlanList,
-        query: Query,
+        queries: Sequence[Query],
         *,
         form: CameraFields,
         hints: VenueHints,
         warnings: list[str],
         compute: Callable[..., Any],
         favour: Favour | None = None,
+        gap_m: float = GAP_M,
     ) -> SearchedPlans:
         """Choose the plans to search in full: all of them if they are few, otherwise the most probable ones.
 
         Args:
             venue: the venue.
             ready: rows of its plans that are ready.
-            query: the encoded photograph.
+            queries: the encoded photographs, each of which chooses plans.
             form: the stated camera height.
             hints: the hints.
             warnings: warnings so far.
             compute: runs CPU work.
             favour: log factors by which plans are preferred in the choice alone.
+            gap_m: distance between the plans in the merged frame.
 
         Raises:
             InvalidHintError: strict hints exclude every plan, or no searched plan has a room.
             InvalidPoseError: the camera height is above all ceilings.
             VenueNotReadyError: all plans were deleted meanwhile.
         """
+        query = max(queries, key=lambda one: len(one.roll))
         rows, log_mass, index = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
             whole_venue = venue.id if possible is ready else None
             known, plan_index = await self._plans.index(venue.tenant, possible, compute, venue_id=whole_venue)
-            weights = self._encoder.networks.manifest.evidence_for(view=query.is_view)
+            manifest = self._encoder.networks.manifest
+            choosing = [(one, manifest.evidence_for(view=one.is_view)) for one in queries]
             log_prior = hints.log_prior(known, shares)
             preferred = None if favour is None else favour(known)
-            chosen = await compute(partial(self._plans.choose, known, plan_index, query, weights, log_prior, preferred))
+            chosen = await compute(partial(self._plans.choose, known, plan_index, choosing, log_prior, preferred))
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
                 warnings.append(
@@ -180,7 +184,7 @@ class VenueSearch:
         index_of = {row.plan_id: position for row, position in zip(rows, index, strict=True)}
         searched_rows, records = [row for row, _, _ in kept], [record for _, record, _ in kept]
         plans, grids = [record.plan for record in records], [grid for _, _, grid in kept]
-        merged = await compute(partial(MergedPlans.of, plans, grids, query.camera_height.height_m))
+        merged = await compute(partial(MergedPlans.of, plans, grids, query.camera_height.height_m, gap_m))
         return SearchedPlans(
             rows=searched_rows,
             records=records,

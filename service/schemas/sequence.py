@@ -16,7 +16,7 @@ from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD,
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import ViewAnswer, ViewFields
-from service.schemas.query_fields import CameraFields
+from service.schemas.query_fields import CameraFields, check_plan_or_venue
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
 AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
@@ -93,7 +93,17 @@ class SequenceForm(CameraFields, ViewFields):
     The fields about the camera hold for all photographs.
     """
 
-    floorplan_id: str = Field(min_length=1, description="Id of the floor plan.")
+    venue_id: str | None = Field(
+        None,
+        min_length=1,
+        description="Id of a venue, to search all its plans. A measured motion links places of one plan.",
+    )
+    floorplan_id: str | None = Field(
+        None,
+        min_length=1,
+        description="Id of the floor plan. Either this or `venue_id` is required.",
+        validate_default=True,
+    )
     motion: Literal["walk", "turn"] = Field(
         "walk",
         description="`walk`: each photograph has a place of its own, see `motions`. `turn`: all were taken from one "
@@ -130,6 +140,13 @@ class SequenceForm(CameraFields, ViewFields):
     refine: Literal["none", "lpo"] = Field(
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
     )
+
+    @field_validator("floorplan_id")
+    @classmethod
+    def _check_place(cls, value: str | None, given: ValidationInfo) -> str | None:
+        if "venue_id" in given.data:
+            check_plan_or_venue(value, given.data["venue_id"])
+        return value
 
     @field_validator("motions", "headings_deg", "relative_heading_deg", "camera_heights_m", mode="before")
     @classmethod
@@ -227,6 +244,8 @@ class SequenceForm(CameraFields, ViewFields):
 class SequencePoseAnswer(ResponseModel):
     """Pose of one photograph, from all photographs together; fields as in the answer of `POST /localise`."""
 
+    floorplan_id: str
+    level: float | None = Field(default=None, description="Level of the plan in the venue; null outside of venues.")
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360)
     heading_source: Literal["given", "panorama", "searched"]
@@ -251,15 +270,17 @@ class SequencePoseAnswer(ResponseModel):
 class SequenceAnswer(ResponseModel):
     """Poses of the photographs of one visit."""
 
-    floorplan_id: str
-    floorplan_revision: str = Field(description="Revision of the plan that was searched.")
+    floorplan_id: str = Field(description="Plan of the first pose.")
+    floorplan_revision: str = Field(description="Revision of that plan.")
+    venue_id: str | None = Field(default=None, description="Venue in the request; null for a query about one plan.")
     poses: list[SequencePoseAnswer] = Field(description="Poses, one per photograph, in the order sent.")
     confidence: Share | None = Field(
         description="Probability that all positions are right within 1 m: the probability of the path among all paths, "
         "times the lowest probability that a photograph shows this plan. Null for a model without confidence."
     )
     warnings: list[str] = Field(
-        description="Motions in the request that were ignored, because the photographs contradict them."
+        description="Motions in the request that were ignored, because the photographs contradict them, and plans of a "
+        "venue that were not searched."
     )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
     camera_height_m: Metres = Field(description="Camera height of the first photograph that fits all photographs best.")

@@ -28,7 +28,7 @@ console.log(await findHeading("f".repeat(32), photo, AbortSignal.timeout(60000))
 
 @pytest.mark.skipif(
     shutil.which("node") is None or not (PACKAGE / "node_modules").is_dir(),
-    reason="needs Node and the packages that `make web` installs",
+    reason="needs Node, and `npm ci` in clients/typescript",
 )
 def test_readme_example_works_in_node(start_app: StartApp, tmp_path: Path) -> None:
     def tsc(*arguments: str, cwd: Path) -> None:

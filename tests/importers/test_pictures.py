@@ -127,7 +127,7 @@ def test_picture_is_a_draft_with_its_guesses(drawn: dict[Style, DrawnPlan]):
     assert plan.report.is_draft
     assert plan.report.scale_source == "option metres_per_pixel"
     assert any("ceiling height" in line for line in plan.report.unsure)
-    assert any("text in pictures is not read" in line for line in plan.report.notes)
+    assert any("texts of the picture were read" in line for line in plan.report.notes)
 
 
 def test_draft_claims_no_kind_of_opening(drawn: dict[Style, DrawnPlan]):

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from service.storage.store import Store
+from tests.importers.test_lettering import AREAS_M2, PrintedPlan
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key
 from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
@@ -104,6 +105,18 @@ def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path
     plan = desktop.client.get(f"/floorplans/{listed['id']}").json()["plan"]
     assert plan["opening_kinds"] == ["door"]
     assert [opening["kind"] for opening in plan["openings"]] == ["door"]
+
+
+def test_printed_dimensions_give_the_scale_of_a_picture(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    (tmp_path / "printed.png").write_bytes(PrintedPlan().file())
+    page.locator("#plan-file").set_input_files(tmp_path / "printed.png")
+    page.get_by_role("button", name="Read the picture").click()
+    expect(page.locator("#plan-facts")).to_contain_text("3 rooms, 51.", timeout=120_000)
+    expect(page.locator("#picture-metres-error")).to_be_hidden()
+    (listed,) = desktop.client.get("/floorplans", params={"name": "printed"}).json()["floorplans"]
+    plan = desktop.client.get(f"/floorplans/{listed['id']}").json()["plan"]
+    assert {room["name"] for room in plan["rooms"]} == set(AREAS_M2)
 
 
 def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> None:

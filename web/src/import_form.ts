@@ -73,6 +73,13 @@ export class ImportForm {
     show(byId("import-form"));
   }
 
+  /** Ask for the distance if a picture was refused for want of a scale; return whether it was. */
+  askForScale(error: unknown): boolean {
+    const isAsked = this.file !== null && PICTURES.test(this.file.type) && error instanceof Error && error.message.includes("gives no scale");
+    if (isAsked) this.picture.askForDistance();
+    return isAsked;
+  }
+
   private sendLevel(level: string): void {
     this.inputs.get("level")!.value = level;
     this.send();
@@ -97,10 +104,6 @@ export class ImportForm {
     if (isPicture && distance !== null) values.known_distance = distance;
     // A picture contains no name.
     if (isPicture) values.name = this.file.name.replace(/\.[^.]*$/, "").slice(0, MAX_NAME_LENGTH) || this.file.name;
-    if (isPicture && distance === null && values.metres_per_pixel === undefined && values.scale === undefined) {
-      this.picture.askForDistance();
-      return;
-    }
     this.again(this.file, values);
   }
 }

@@ -24,7 +24,8 @@ export class PictureScale {
   constructor() {
     const drawing = h("div", { class: "drawing" }, this.svg);
     this.element = h("div", { class: "picture-scale" },
-      h("p", { class: "hint" }, "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall."), drawing,
+      h("p", { class: "hint" }, "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall. " +
+        "Without a distance, the dimensions written in the picture are used."), drawing,
       h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres, this.error));
     this.metres.addEventListener("input", () => clearError(this.error, { metres: this.metres }));
     this.svg.append(this.picture, this.overlay);
@@ -69,7 +70,7 @@ export class PictureScale {
 
   /** Ask for the distance that is missing. */
   askForDistance(): void {
-    showFieldError(this.error, this.metres, "Put the ends of the line on two points and enter their distance in metres.");
+    showFieldError(this.error, this.metres, "The picture states no scale: put the ends of the line on two points and enter their distance in metres.");
   }
 
   private draw(): void {

@@ -137,7 +137,7 @@ export class Plans {
     if (plan !== null && plan.status === "preparing") void this.follow(plan);
   }
 
-  /** Pictures do not state their scale, so the form asks for it first. */
+  /** Pictures seldom state their scale, so the form asks for it first. */
   private begin(file: File): void {
     this.actions.started();
     this.discardPending();
@@ -172,7 +172,7 @@ export class Plans {
     } catch (error) {
       const levels = error instanceof ServiceError ? error.levels : [];
       this.importing.ask(file, true, levels);
-      if (levels.length === 0) showError(this.error, error, this.importing.fields);
+      if (levels.length === 0 && !this.importing.askForScale(error)) showError(this.error, error, this.importing.fields);
     } finally {
       if (state.textContent.startsWith("Importing")) state.textContent = "";
     }

@@ -65,6 +65,11 @@ class Budget:
     def __post_init__(self) -> None:
         self.started_s = self.clock()
 
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the start of the import."""
+        return self.clock() - self.started_s
+
     def spend(self, entities: int = 1) -> None:
         """Count entities and check the time.
 
@@ -84,8 +89,7 @@ class Budget:
         Raises:
             InvalidFloorPlanError: the import takes longer than `max_import_s`.
         """
-        elapsed_s = self.clock() - self.started_s
-        if elapsed_s > self.limits.max_import_s:
+        if self.elapsed_s > self.limits.max_import_s:
             raise InvalidFloorPlanError(
                 f"reading the file takes more than {self.limits.max_import_s:g} s (max_import_s); {_REMEDY}"
             )

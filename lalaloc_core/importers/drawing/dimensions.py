@@ -11,6 +11,8 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import SketchedRoom
 from lalaloc_core.importers.drawing.shapes import Drawing
 
 # "4.20", "4,205 m", "420", "4200 mm".
@@ -22,10 +24,16 @@ _SURELY_MM = 1000
 _LENGTH_M = (0.2, 200.0)
 # A dimension is written nearer to its line than this share of the drawing, and away from the ends of the line.
 _NEAR, _ENDS = 0.02, 0.15
+# The distance can also be this multiple of its height.
+_NEAR_HEIGHTS = 1.0
 _MAX_TEXTS, _MAX_LINES_PER_TEXT, _MAX_PIECES = 1000, 12, 60_000
 # Ratios within this share agree. So many dimensions of different lengths must agree, and twice as many as on any other
 # ratio.
 _AGREE, _MIN_AGREEING, _MIN_LENGTHS, _MARGIN = 0.01, 3, 2, 2
+# Area written in a room, and its range (m²). Lengths and areas that differ by larger shares are reported.
+_AREA = re.compile(r"(\d{1,4}(?:[.,]\d{1,2})?)\s*(m²|m2|qm|sqm|sq\.? ?m|sq\.? ?ft|sf)(?![a-z])", re.IGNORECASE)
+_SQUARE_FOOT_M2, _AREA_M2 = 0.3048**2, (0.5, 2000.0)
+_TOLERANCE, _AREA_TOLERANCE = 0.05, 0.25
 # Usual size of a drawing (m).
 _EXTENT_M = (3.0, 300.0)
 
@@ -64,6 +72,52 @@ def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float
     return scale_by_dimensions(_written(drawing, check_time), float(max(x1 - x0, y1 - y0)))
 
 
+def check_scale(
+    metres_per_unit: float, source: str, measured: tuple[float, str] | None, builder: ReportBuilder
+) -> None:
+    """Warn if a scale differs from that of the dimensions that are written in the drawing."""
+    if measured is not None and abs(metres_per_unit / measured[0] - 1.0) > _TOLERANCE:
+        builder.warnings.append(
+            f"{measured[1]} give {measured[0]:.4g} m per unit, and the {source} gives {metres_per_unit:.4g}; check both"
+        )
+
+
+def check_areas(rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], builder: ReportBuilder) -> None:
+    """Compare the areas (m²) of rooms with those written in them, `texts` of every room."""
+    shares: dict[int, float] = {}
+    for index, (room, written) in enumerate(zip(rooms, texts, strict=True)):
+        areas = [area for text in written for area in _areas_m2(text)]
+        # A room with two areas is two rooms, or one of them is the area of the flat.
+        if len(areas) == 1:
+            shares[index] = room.shape.area / areas[0]
+    if len(shares) < _MIN_AGREEING:
+        return
+    middle = float(np.median(list(shares.values())))
+    length = math.sqrt(middle)
+    if abs(length - 1.0) > _TOLERANCE:
+        builder.warnings.append(
+            f"the areas written in {len(shares)} rooms are {1.0 / middle:.2f} times those of the plan; if they are "
+            f"right, all lengths have to be multiplied by {1.0 / length:.3f}: check the scale"
+        )
+        return
+    builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
+    for index, share in shares.items():
+        if abs(share / middle - 1.0) > _AREA_TOLERANCE:
+            room = rooms[index]
+            name = f"room '{room.name}'" if room.name else "a room"
+            builder.unsure.append(
+                f"{name} has {room.shape.area:.1f} m², and {room.shape.area / share:.1f} m² are written in it; check "
+                "its walls"
+            )
+
+
+def _areas_m2(text: str) -> tuple[float, ...]:
+    """Return the areas (m²) that are written in a text."""
+    found = [(float(number.replace(",", ".")), unit) for number, unit in _AREA.findall(text)]
+    areas = [value * (_SQUARE_FOOT_M2 if unit.casefold().endswith(("ft", "sf")) else 1.0) for value, unit in found]
+    return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
+
+
 def _written(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
     texts = [lettering for lettering in drawing.letterings if _values_m(lettering.text)][:_MAX_TEXTS]
@@ -79,7 +133,7 @@ def _written(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension
     for lettering in texts:
         check_time()
         place = shapely.Point(lettering.position)
-        near = tree.query(place, predicate="dwithin", distance=reach)
+        near = tree.query(place, predicate="dwithin", distance=max(reach, _NEAR_HEIGHTS * lettering.height))
         nearest = sorted(near, key=lambda index: pieces[index].distance(place))[:_MAX_LINES_PER_TEXT]
         lengths = [length for index in nearest for length in _lengths_at(place, pieces[index], tree)]
         if lengths:

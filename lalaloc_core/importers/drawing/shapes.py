@@ -70,11 +70,12 @@ class Swing:
 
 @dataclass(frozen=True)
 class Lettering:
-    """Text and its position (its middle or its start)."""
+    """Text, its position (its middle or its start), and its height if that is known."""
 
     text: str
     position: tuple[float, float]
     layer: str = ""
+    height: float = 0.0
 
 
 @dataclass
@@ -100,7 +101,7 @@ class Drawing:
             [replace(area, shape=shape(area.shape)) for area in self.areas],
             [replace(s, line=shape(s.line), width=s.width * factor) for s in self.strokes],
             [replace(s, hinge=point(s.hinge), first=point(s.first), last=point(s.last)) for s in self.swings],
-            [replace(lettering, position=point(lettering.position)) for lettering in self.letterings],
+            [replace(t, position=point(t.position), height=t.height * factor) for t in self.letterings],
         )
 
 

@@ -23,11 +23,14 @@ from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.trace import Trace, TracePart
 from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
+from lalaloc_core.importers.drawing.dimensions import check_areas
 from lalaloc_core.importers.drawing.leaves import LEAF_M, take_leaves
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
 
 _MIN_ROOM_M2 = 0.6
+# Names in a room besides its own that are listed.
+_MAX_OTHERS = 5
 # Largest distance between parts of one symbol (leaf, frame, panes).
 _SYMBOL_M = 0.12
 _OPENING_M = (0.3, 8.0)
@@ -195,7 +198,7 @@ def _sides(shape: BaseGeometry) -> tuple[float, float]:
 
 
 def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Name rooms by the first text inside that is a name, preferably a known room type."""
+    """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written."""
     tree = shapely.STRtree([area.shape for area in shapes])
     texts: dict[int, list[str]] = {}
     for lettering in letterings:
@@ -209,6 +212,11 @@ def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder
         known = [text for text in words if room_type_from_name(text) is not None]
         name = area.name or next(iter(known or words), None)
         rooms.append(SketchedRoom(area.shape, name, room_type_from_name(area.kind) or room_type_from_name(name)))
+        if others := [text for text in dict.fromkeys(known) if text != name]:
+            builder.unsure.append(
+                f"'{', '.join(others[:_MAX_OTHERS])}' is written in room '{name}' too; check that it is one room"
+            )
+    check_areas(rooms, [texts.get(index, []) for index in range(len(rooms))], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pypdfium2
+from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
@@ -20,6 +22,7 @@ from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area
 from lalaloc_core.importers.drawing.sketching import named_rooms, sketch_drawing
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
+from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketching import sketch_picture
 
 _METRES_PER_POINT = 0.0254 / 72.0
@@ -39,7 +42,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     document, page = open_page(content, options.page)
     try:
         found = read_page(page, budget)
-        texts = [lettering.text for lettering in found.drawing.letterings]
+        builder = ReportBuilder()
+        scan = _read_scan(page, found, builder, budget)
+        texts = [lettering.text for lettering in [*found.drawing.letterings, *scan.drawing.letterings]]
         # A unit of a PDF is always a point.
         without_units = replace(options, units=None)
         factor, source = drawing_scale(
@@ -47,14 +52,19 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "the PDF",
             paper_m_per_unit=_METRES_PER_POINT,
             texts=texts,
-            dimensions=lambda: drawn_scale(found.drawing, budget.check_time),
+            dimensions=lambda: (
+                drawn_scale(found.drawing, budget.check_time) or drawn_scale(scan.drawing, budget.check_time)
+            ),
         )
-        builder = ReportBuilder()
+        notes = list(builder.notes)
         sketch = _as_drawing(found, factor, builder, budget)
         if sketch is None or not sketch.rooms:
-            builder = ReportBuilder()
-            builder.notes.append(f"page {options.page} was read as a picture")
+            builder = ReportBuilder(notes=[*notes, f"page {options.page} was read as a picture"])
             sketch = _as_picture(page, found, factor, builder, budget)
+            # Searchable scans contain text over the picture.
+            own = found.drawing.scaled(factor, flip_y=False).letterings
+            rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
+            sketch.rooms = named_rooms(rooms, own or scan.placed(factor), builder)
     finally:
         document.close()
     plan = assemble(
@@ -81,7 +91,9 @@ def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budge
     return sketch_drawing(drawing.scaled(factor, flip_y=False), builder, budget)
 
 
-def _as_picture(page: object, found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch:
+def _as_picture(
+    page: pypdfium2.PdfPage, found: PageContent, factor: float, builder: ReportBuilder, budget: Budget
+) -> Sketch:
     """Render the page and read it as a picture."""
     width, height = found.size_pt
     metres_per_pixel = max(_FINEST_M, factor * 0.25)
@@ -91,10 +103,28 @@ def _as_picture(page: object, found: PageContent, factor: float, builder: Report
             f"the page is {width * factor:.0f} m by {height * factor:.0f} m, {width * height * scale**2:.0f} pixels; "
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
-    bitmap = page.render(scale=scale, grayscale=True)  # type: ignore[attr-defined]
-    gray = np.asarray(bitmap.to_numpy()).reshape(bitmap.height, bitmap.width, -1)[:, :, 0]
-    sketch = sketch_picture(gray, factor / scale, builder, budget)
-    # Searchable scans contain text over the picture.
-    texts = found.drawing.scaled(factor, flip_y=False).letterings
-    sketch.rooms = named_rooms([Area(room.shape, "", "room") for room in sketch.rooms], texts, builder)
-    return sketch
+    gray = _gray(page.render(scale=scale, grayscale=True))  # type: ignore[arg-type]
+    return sketch_picture(gray, factor / scale, builder, budget)
+
+
+def _read_scan(page: pypdfium2.PdfPage, found: PageContent, builder: ReportBuilder, budget: Budget) -> PictureTexts:
+    """Return the texts of a scanned page, in points; letters that are drawn as lines join the texts of the page."""
+    is_scan = found.picture_share > _MOSTLY
+    if found.drawing.letterings and not is_scan:
+        return PictureTexts()
+    width, height = found.size_pt
+    scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)
+    bitmap = page.render(scale=scale, grayscale=True)  # type: ignore[arg-type]
+    # Lines of a drawing are not turned, so its texts must not be.
+    scan = read_texts(_gray(bitmap), builder, budget, straighten=is_scan).scaled(1.0 / scale)
+    if is_scan:
+        return scan
+    to_page = bitmap.get_posconv(page).to_page
+    for lettering in scan.placed(scale):
+        position = to_page(round(lettering.position[0]), bitmap.height - round(lettering.position[1]))
+        found.drawing.letterings.append(replace(lettering, position=position, height=lettering.height / scale))
+    return PictureTexts()
+
+
+def _gray(bitmap: pypdfium2.PdfBitmap) -> UInt8[np.ndarray, "h w"]:
+    return np.asarray(bitmap.to_numpy()).reshape(bitmap.height, bitmap.width, -1)[:, :, 0]

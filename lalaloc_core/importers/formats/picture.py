@@ -15,7 +15,11 @@ from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.drawing.dimensions import check_scale, drawn_scale
 from lalaloc_core.importers.drawing.scale import drawing_scale
+from lalaloc_core.importers.drawing.shapes import Area
+from lalaloc_core.importers.drawing.sketching import named_rooms
+from lalaloc_core.importers.picture.lettering import read_texts
 from lalaloc_core.importers.picture.sketching import sketch_picture
 
 _MIN_SIDE_PX = 64
@@ -30,14 +34,24 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         InvalidFloorPlanError: the picture is invalid, or the options give no scale.
     """
     gray, warmth, paper_m_per_pixel = _open(content, budget)
-    factor, source = drawing_scale(replace(options, units=None), "the picture", paper_m_per_unit=paper_m_per_pixel)
+    builder = ReportBuilder()
+    texts = read_texts(gray, builder, budget)
+    # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
+    measured = drawn_scale(texts.drawing, budget.check_time)
+    factor, source = drawing_scale(
+        replace(options, units=None),
+        "the picture",
+        paper_m_per_unit=paper_m_per_pixel,
+        own=measured,
+        texts=[lettering.text for lettering in texts.drawing.letterings],
+    )
+    check_scale(factor, source, measured, builder)
     rows, columns = gray.shape
     if max(rows, columns) * factor > _MAX_EXTENT_M:
         raise InvalidFloorPlanError(
             f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel; the limit is "
             f"{_MAX_EXTENT_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
-    builder = ReportBuilder()
     sketch = sketch_picture(gray, factor, builder, budget, warmth)
     if not sketch.rooms:
         raise InvalidFloorPlanError(
@@ -45,6 +59,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             f"{rows * factor:.1f} m at {factor:g} m per pixel; check the scale (metres_per_pixel, known_distance or "
             "scale), and that walls are dark or drawn with two lines"
         )
+    rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
+    sketch.rooms = named_rooms(rooms, texts.placed(factor), builder)
     return (
         assemble(
             sketch,

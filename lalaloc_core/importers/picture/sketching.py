@@ -227,7 +227,6 @@ def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: Repor
     builder.notes.append(f"walls are {style}, usually {reading.walls.thickness_m:.2f} m thick")
     if ink.skew_deg:
         builder.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to straighten it")
-    builder.notes.append("text in pictures is not read: name the rooms")
     if metres_per_pixel > _COARSE_M:
         builder.unsure.append(
             f"a pixel is {100 * metres_per_pixel:.1f} cm; above {100 * _COARSE_M:g} cm walls are too thin; "

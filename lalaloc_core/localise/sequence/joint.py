@@ -5,14 +5,15 @@ Levenberg-Marquardt lowers, for every path of a job,
     sum over pictures ½ sum over azimuths log(1 + r²)  +  ½ scale² (sum of the motions' squared residuals)
     +  ½ (stiffness δ)²
 
-by all positions, the unknown headings, and one δ, the log of true over stated camera height. The derivatives are in
-closed form (`render.gradient`), so numpy suffices. Poses stay inside their rooms.
+by all positions, the unknown headings, and one δ, the log of true over stated camera height. The height of a carried
+camera differs from picture to picture by an ε each, which is solved for afterwards, and all poses once more with it.
+The derivatives are in closed form (`render.gradient`), so numpy suffices. Poses stay inside their rooms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,7 +23,7 @@ from lalaloc_core.localise.sequence.motion import Motion
 from lalaloc_core.render.gradient import free_travel_m, log_profile_gradient
 
 _MARGIN_M, _MAX_STEP_M, _MAX_TURN = 0.03, 0.5, 0.2
-_ITERATIONS, _FIRST_DAMPING = 25, 1e-2
+_ITERATIONS, _OWN_ITERATIONS, _FIRST_DAMPING = 25, 8, 1e-2
 # A path has converged if no pose moves farther, or the cost falls by less than this share.
 _SHORT_M, _LITTLE = 1e-3, 1e-4
 # Keeps systems with undetermined unknowns from being singular.
@@ -43,6 +44,7 @@ class SequenceJob:
         height_offset: (m,) start of δ.
         height_free: whether δ is solved for.
         height_stiffness, height_bounds: as in `poses.RefinementJob`.
+        height_apart: standard deviation of ε; 0 if all pictures have the same relative error.
     """
 
     position_m: Float[np.ndarray, "m t 2"]
@@ -59,6 +61,7 @@ class SequenceJob:
     height_free: bool
     height_stiffness: float
     height_bounds: tuple[float, float]
+    height_apart: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,7 @@ class SequenceResult:
 
     Attributes:
         height_offset: (m,) δ.
+        height_own: (m, t) ε of every picture.
         information: for every picture the (m, p, p) information about its position and, if it was searched, heading,
             with all other unknowns integrated out.
     """
@@ -74,11 +78,42 @@ class SequenceResult:
     position_m: Float[np.ndarray, "m t 2"]
     heading: Float[np.ndarray, "m t"]
     height_offset: Float[np.ndarray, "m"]
+    height_own: Float[np.ndarray, "m t"]
     information: list[Float[np.ndarray, "m p p"]]
 
 
 def refine_sequence(job: SequenceJob) -> SequenceResult:
     """Refine every path of a job."""
+    result = _refined(job)
+    if not job.height_free or job.height_apart == 0.0:
+        return result
+    own = _own_heights(job, result)
+    shifted = replace(
+        job,
+        position_m=result.position_m,
+        heading=result.heading,
+        log_profile=job.log_profile + own[:, :, None],
+        height_offset=result.height_offset,
+    )
+    return replace(_refined(shifted), height_own=own)
+
+
+def _own_heights(job: SequenceJob, result: SequenceResult) -> Float[np.ndarray, "m t"]:
+    """Return the ε that fit each picture at its refined pose, by iterated weighted least squares."""
+    count, pictures, columns = job.log_profile.shape
+    walls_m = job.walls_m.reshape(count * pictures, -1, 4)
+    seen = log_profile_gradient(result.position_m.reshape(-1, 2), result.heading.reshape(-1), walls_m, columns)
+    off = seen.log_m.reshape(count, pictures, columns) - job.log_profile - result.height_offset[:, None, None]
+    own = np.zeros((count, pictures))
+    for _ in range(_OWN_ITERATIONS):
+        weight = np.square(job.precision) / (1.0 + np.square((off - own[..., None]) * job.precision))
+        own = (weight * off).sum(axis=2) / (weight.sum(axis=2) + np.square(job.motion_scale / job.height_apart))
+    low, high = job.height_bounds
+    return np.clip(result.height_offset[:, None] + own, low, high) - result.height_offset[:, None]
+
+
+def _refined(job: SequenceJob) -> SequenceResult:
+    """Refine every path with one height for all pictures."""
     count, pictures = job.heading.shape
     unknowns = np.zeros((count, 3 * pictures + 1))
     unknowns[:, -1] = job.height_offset
@@ -104,6 +139,7 @@ def refine_sequence(job: SequenceJob) -> SequenceResult:
         position_m=job.position_m + by_pose[:, :, :2],
         heading=job.heading + by_pose[:, :, 2],
         height_offset=unknowns[:, -1],
+        height_own=np.zeros((count, pictures)),
         information=_information(job, here.curvature),
     )
 

@@ -25,6 +25,8 @@ from lalaloc_core.render.sampling import PoseSet
 
 # Paths that end closer than this (m, radians) in every picture are one.
 _SAME_M, _SAME_TURN = 0.2, math.radians(5.0)
+# Deviation of the log of a carried camera's height from one picture to another.
+_HEIGHT_APART = 0.05
 
 
 def are_alike(
@@ -100,7 +102,14 @@ def sequence_job(
         height_free=not height.is_exact,
         height_stiffness=parts[0].height_stiffness,
         height_bounds=parts[0].height_bounds,
+        height_apart=height_apart(pictures),
     )
+
+
+def height_apart(pictures: Sequence[Observation]) -> float:
+    """Return the deviation of log heights between pictures; 0 if their heights are exact or stated one by one."""
+    heights = {picture.query.camera_height for picture in pictures}
+    return _HEIGHT_APART if len(heights) == 1 and not pictures[0].query.camera_height.is_exact else 0.0
 
 
 def ended_paths(
@@ -129,17 +138,19 @@ def ended_paths(
             information=result.information[t],
             converged=np.ones(len(paths), bool),
             evaluations=np.zeros(len(paths), int),
-            height_offset=result.height_offset,
+            height_offset=result.height_offset + result.height_own[:, t],
         )
         ends.append(refined_candidates(plan, encoders, picture.query, starts, alone, config.matching))
     moved = [replace(path, ends=tuple(candidates[m] for candidates in ends)) for m, path in enumerate(paths)]
     log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
     found = []
-    for path, log_motion in zip(moved, log_motions, strict=True):
-        # Every picture's cost includes the prior of the shared height, which counts once.
-        height = path.ends[0].terms["height"]
+    # Every picture's cost includes the prior of the height, of which the shared part counts once.
+    apart, penalties = height_apart(pictures), pictures[0].query.camera_height.penalty(result.height_offset)
+    if apart:
+        penalties = penalties + 0.5 * np.square(result.height_own / apart).sum(axis=1)
+    for path, log_motion, penalty in zip(moved, log_motions, penalties, strict=True):
         fits = sum(picture.weights.temperature * end.cost for picture, end in zip(pictures, path.ends, strict=True))
-        nll = fits - (len(path.ends) - 1) * height - log_motion.sum()
+        nll = fits - sum(end.terms["height"] for end in path.ends) + penalty - log_motion.sum()
         priors = sum(_log_prior(picture, state) for picture, state in zip(pictures, path.states, strict=True))
         found.append(replace(path, refined_nll=float(nll - priors)))
     kept: list[Path] = []

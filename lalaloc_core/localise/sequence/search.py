@@ -65,9 +65,13 @@ class SequenceLocalisation:
         """Camera height that fits all pictures best."""
         return self.pictures[0].camera_height_m
 
-    def confidence(self, manifest: Manifest) -> float | None:
-        """Return the probability that all pictures are of the plan and all answers right; None as for one picture."""
-        alone = [picture.confidence(manifest.confidence_for(view=picture.query.is_view)) for picture in self.pictures]
+    def confidence(self, manifest: Manifest, share: float = 1.0) -> float | None:
+        """Return the probability that all pictures are of the plan and all answers right; None as for one picture.
+
+        `share` is the lowest probability that a picture is of the plans that were searched.
+        """
+        models = [manifest.confidence_for(view=picture.query.is_view) for picture in self.pictures]
+        alone = [picture.confidence(model, share) for model, picture in zip(models, self.pictures, strict=True)]
         fits = [confidence.fit for confidence in alone if confidence is not None]
         return min(fits) * min(self.path_probability, 1.0) if len(fits) == len(alone) else None
 

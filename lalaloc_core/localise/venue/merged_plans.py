@@ -19,7 +19,7 @@ from lalaloc_core.localise.poses import Candidate, PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 
 # Gap between the bounding boxes of two plans, larger than any distance at which poses count as one place.
-_GAP_M = 10.0
+GAP_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +40,15 @@ class MergedPlans:
     _poses: Int[np.ndarray, "p"] = field(repr=False)
 
     @classmethod
-    def of(cls, plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], camera_height_m: float) -> MergedPlans:
-        """Merge plans, laid out in a square of cells.
+    def of(
+        cls, plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], camera_height_m: float, gap_m: float = GAP_M
+    ) -> MergedPlans:
+        """Merge plans, laid out in a square of cells at least `gap_m` apart.
 
         A single row would be so long that coordinates lose precision in single precision. All grids have the same step
         and are for the same model; the camera height (m) is the query's.
         """
-        shift_m = _shifts(plans)
+        shift_m = _shifts(plans, gap_m)
         plan = FloorPlan(
             name="",
             rooms=tuple(_moved(room, shift) for plan, shift in zip(plans, shift_m, strict=True) for room in plan.rooms),
@@ -87,10 +89,10 @@ def _starts(counts: Sequence[int] | Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
 
 
-def _shifts(plans: Sequence[FloorPlan]) -> Float[np.ndarray, "p 2"]:
+def _shifts(plans: Sequence[FloorPlan], gap_m: float) -> Float[np.ndarray, "p 2"]:
     """Return the translation (m) of each plan into its cell of a square of equal cells."""
     bounds = np.array([plan.bounds_m for plan in plans])
-    cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + _GAP_M
+    cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + gap_m
     columns = int(np.ceil(np.sqrt(len(plans))))
     index = np.arange(len(plans))
     return np.stack([index % columns, index // columns], axis=1) * cell_m - bounds[:, :2]
