@@ -268,14 +268,6 @@ def test_nothing_of_a_photograph_remains(
             service.client.post("/localise", data=fields, files={"photo": photo}, headers=keyed)
         sequence = service.client.post("/localise/sequence", data={"floorplan_id": plan_id}, files=_two(photograph))
         assert sequence.status_code == 200, sequence.text
-        batch = service.client.post("/localise/batch", data={"floorplan_id": plan_id}, files=_two(photograph))
-        assert batch.status_code == 200, batch.text
-        pictured = service.client.post(
-            "/localise", data=fields, files={"photo": photograph}, headers={"Accept": "image/png"}
-        )
-        assert pictured.status_code == 200, pictured.text
-        geopose = service.client.post("/geopose", params={"floorplan_id": plan_id}, json=oscp_request(photograph))
-        assert geopose.status_code < 500, geopose.text
         session = service.client.post("/sessions", json={"floorplan_id": plan_id}).json()["id"]
         tracked = service.client.post(f"/sessions/{session}/photographs", files={"photo": photograph})
         assert tracked.status_code == 200, tracked.text
