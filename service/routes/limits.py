@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 from fastapi import APIRouter
 
@@ -20,7 +21,7 @@ async def get_limits(runtime: Running) -> LimitsAnswer:
     """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
     # Resolved, because 0 leaves these numbers to the service.
-    resolved = {
+    resolved: dict[str, Any] = {
         "max_queries": settings.query_limit,
         "max_queries_per_tenant": max_per_client(settings.query_limit),
         "max_pending_requests": settings.pending_limit,
