@@ -1,4 +1,4 @@
-"""Command line of the service: `lalaloc-service serve`, `keys create|list|revoke` and `tenants list|limit|purge`.
+"""Command line of the service: `lalaloc-service serve`, `keys`, `tenants`, `compact`, `backup` and `restore`.
 
 Keys and tenants are in the database of the settings, so these commands also work while the service runs.
 """
@@ -15,6 +15,7 @@ from datetime import datetime
 
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from lalaloc_core.localise.bundle import Bundle
+from service.backup_commands import add_backup_commands
 from service.command_parts import configured_store, tenant_name, text_table
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
@@ -127,6 +128,7 @@ def build_parser() -> argparse.ArgumentParser:
     revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
     add_tenant_commands(commands)
+    add_backup_commands(commands)
     return parser
 
 
