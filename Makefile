@@ -7,14 +7,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test ray lint openapi docs neighbours site client web clean
+.PHONY: help setup demo serve test ray lint openapi docs neighbours site client web lock notice audit digests clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(STAMP) ## create .venv and install everything
 
-$(STAMP): pyproject.toml constraints.txt scripts/setup.sh scripts/install_torch.py
+$(STAMP): pyproject.toml requirements.lock torch.lock scripts/setup.sh scripts/install_torch.py
 	PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh
 	@touch $@
 
@@ -64,6 +64,30 @@ client: $(STAMP) ## generate lalaloc_client/blocking from lalaloc_client/asynchr
 web: ## build the web pages from web/ into service/web, and clients/typescript (needs node and npm)
 	cd web && npm ci --no-audit --no-fund && npm run types && npm run check && npm run build
 	cd clients/typescript && npm run build
+
+# Programs beside the environment, so that it stays as small as its users need it.
+build/tools/bin/%:
+	$(BIN)/python -m venv build/tools
+	build/tools/bin/python -m pip install --quiet uv==0.13.9 pip-audit==2.10.1
+
+lock: $(STAMP) build/tools/bin/uv ## write requirements.lock and docker/requirements.lock from constraints.txt
+	$(BIN)/python -m scripts.write_locks build/tools/bin/uv
+
+notice: $(STAMP) ## write the licences of all that ships into NOTICE
+	$(BIN)/python -m scripts.write_notice
+
+audit: $(STAMP) build/tools/bin/pip-audit ## look for known vulnerabilities of Python and npm packages (needs the network)
+	build/tools/bin/pip-audit --strict --disable-pip --no-deps -r requirements.lock -r docker/requirements.lock
+	npm --prefix web audit --audit-level=moderate
+	npm --prefix clients/typescript audit --audit-level=moderate
+
+digests: ## write the digests of the base images into docker/images.env (needs docker buildx and the registry)
+	@(while IFS='=' read -r name image; do case "$$name" in \
+		''|'#'*) printf '%s%s\n' "$$name" "$${image:+=$$image}" ;; \
+		*) tag=$${image%@*}; digest=$$(docker buildx imagetools inspect "$$tag" --format '{{.Manifest.Digest}}') || exit 1; \
+			printf '%s=%s@%s\n' "$$name" "$$tag" "$$digest" ;; \
+	esac; done) <docker/images.env >docker/images.env.part || { rm -f docker/images.env.part; exit 1; }
+	@mv docker/images.env.part docker/images.env
 
 clean: ## remove .venv and all build products; keep ./data and ./runs
 	rm -rf $(VENV) web/node_modules clients/typescript/node_modules clients/typescript/dist build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png

@@ -2,7 +2,8 @@
 
 On Linux the plain wheel brings gigabytes of CUDA libraries. The CPU build has the local version `+cpu` and lies in an
 index of its own: pip finds it when it is configured with that index (or with a folder of wheels), or when the
-environment variable TORCH_INDEX names it. Where pip finds none, the plain wheel is installed, and this script says so.
+environment variable TORCH_INDEX names it. torch.lock has the digests of these builds. Another build of the version is
+installed with a warning, unless TORCH_LOCKED=1; where pip finds none, the plain wheel is, and this script says so.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
 from pathlib import Path
 
@@ -28,6 +30,10 @@ def main() -> int:
         return 0
     if wants_cpu:
         print(f"install_torch: no GPU here, looking for the CPU build torch=={version}{_CPU}", flush=True)
+        status = pip_install(f"torch=={version}{_CPU}", locked=True)
+        if status == 0 or os.environ.get("TORCH_LOCKED") == "1":
+            return status
+        print("install_torch: no CPU build with a digest of torch.lock, looking for another one", file=sys.stderr)
         if pip_install(f"torch=={version}{_CPU}") == 0:
             return 0
         print(
@@ -69,13 +75,25 @@ def is_installed(version: str, *, wants_cpu: bool) -> bool:
     return wants_cpu or not installed.endswith(_CPU)
 
 
-def pip_install(requirement: str) -> int:
-    """Install one requirement into the running environment; pip's exit status."""
+def pip_install(requirement: str, *, locked: bool = False) -> int:
+    """Install one requirement into the running environment; pip's exit status.
+
+    Args:
+        requirement: name and version.
+        locked: accept only files with a digest of torch.lock, and install no dependencies, which other locks have.
+    """
     index = os.environ.get("TORCH_INDEX")
     options = ["--extra-index-url", index] if index else []
-    constraints = ["-c", str(ROOT / "constraints.txt")]
-    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", *options, *constraints]
-    return subprocess.run([*command, requirement], check=False).returncode
+    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", *options]
+    if not locked:
+        constraints = ["-c", str(ROOT / "constraints.txt")]
+        return subprocess.run([*command, *constraints, requirement], check=False).returncode
+    lock = (ROOT / "torch.lock").read_text(encoding="utf-8")
+    digests = re.findall(r"^--hash=sha256:[0-9a-f]{64}", lock, re.MULTILINE)
+    with tempfile.NamedTemporaryFile("w", suffix=".txt", encoding="utf-8") as file:
+        file.write(" ".join([requirement, *digests]))
+        file.flush()
+        return subprocess.run([*command, "--no-deps", "--require-hashes", "-r", file.name], check=False).returncode
 
 
 if __name__ == "__main__":

@@ -33,5 +33,7 @@ create_venv() {
 
 create_venv
 "$venv/bin/python" scripts/install_torch.py
-"$venv/bin/python" -m pip install --disable-pip-version-check -c constraints.txt -e ".[$extras]"
+# Every package by its digest, of the lock that `make lock` writes for these extras; so pip has nothing to resolve.
+"$venv/bin/python" -m pip install --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
+"$venv/bin/python" -m pip install --disable-pip-version-check --no-deps --no-build-isolation -e ".[$extras]"
 printf 'setup: done, the environment is in %s\n' "$venv"

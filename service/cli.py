@@ -1,4 +1,4 @@
-"""Command line of the service: `serve`, `keys create|list|rotate|revoke`, `tenants list|limit|purge`, `audit export`.
+"""Command line of the service, `lalaloc-service`: `serve`, `keys`, `tenants`, `audit`, `compact`, `backup` and `restore`.
 
 Keys, tenants and the audit log are in the database of the settings, so these commands also work while the service runs.
 """
@@ -16,6 +16,7 @@ from datetime import datetime, timedelta
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from lalaloc_core.localise.bundle import Bundle
 from service.audit_commands import add_audit_commands
+from service.backup_commands import add_backup_commands
 from service.command_parts import audit, configured_store, duration, tenant_name, text_table
 from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
 from service.security import Permission, check_address
@@ -143,6 +144,7 @@ def build_parser() -> argparse.ArgumentParser:
     revoke.set_defaults(run=_revoke)
     add_tenant_commands(commands)
     add_audit_commands(commands)
+    add_backup_commands(commands)
     return parser
 
 

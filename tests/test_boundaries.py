@@ -103,7 +103,7 @@ SERVICE_LAYERS = (
     "query http.middleware",
     "runtime",
     "routes",
-    "app cli command_parts tenant_commands audit_commands openapi __main__",
+    "app cli command_parts tenant_commands audit_commands backup_commands openapi __main__",
     "on_ray",
 )
 _LOWEST_OF_SERVICE = 20

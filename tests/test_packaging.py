@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
+import subprocess
+import sys
 import tomllib
 from copy import deepcopy
 from fnmatch import fnmatch
@@ -16,7 +19,9 @@ from fastapi.routing import APIRoute
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from lalaloc_core import __version__
 from scripts import install_torch
+from scripts.write_locks import extras_of
 from service.cores import share_cores
 from service.http.admission_control import Admission, AdmissionLimits
 from service.routes import ROUTERS
@@ -29,21 +34,33 @@ REPLICAS = yaml.safe_load((ROOT / "docker" / "compose.replicas.yaml").read_text(
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]["service"]
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 SETTINGS = {PREFIX + name.upper() for name in SETTING_NAMES}
-FOLDER = ROOT / "docker" / "kubernetes"
-KUSTOMIZATION: dict[str, Any] = yaml.safe_load((FOLDER / "kustomization.yaml").read_text(encoding="utf-8"))
-RESOURCES: dict[str, dict[str, Any]] = {
-    name: yaml.safe_load((FOLDER / name).read_text(encoding="utf-8")) for name in KUSTOMIZATION["resources"]
-}
-BY_KIND = {manifest["kind"]: manifest for manifest in RESOURCES.values()}
+OVERLAYS = ("replicas", "single")
 # Oldest supported and newest version at the time of writing.
 VERSIONS = ("1.34", "1.37")
+
+
+def _rendered(overlay: str) -> dict[str, dict[str, Any]]:
+    """Return the manifests of an overlay by kind, as `kubectl apply -k` applies them."""
+    kubectl = Path(sys.executable).with_name("kubectl")
+    folder = ROOT / "docker" / "kubernetes" / overlay
+    done = subprocess.run([kubectl, "kustomize", folder], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    manifests = list(yaml.safe_load_all(done.stdout))
+    by_kind = {manifest["kind"]: manifest for manifest in manifests}
+    assert len(by_kind) == len(manifests)
+    return by_kind
+
+
+RENDERED = {overlay: _rendered(overlay) for overlay in OVERLAYS}
+BY_KIND = RENDERED["replicas"]
 POD: dict[str, Any] = BY_KIND["Deployment"]["spec"]["template"]["spec"]
 CONTAINER: dict[str, Any] = POD["containers"][0]
 LABELS: dict[str, str] = BY_KIND["Deployment"]["spec"]["template"]["metadata"]["labels"]
 CONFIGURED: dict[str, str] = BY_KIND["ConfigMap"]["data"]
 
 
-def _constraints() -> dict[str, str]:
+def pinned_versions() -> dict[str, str]:
+    """Return the versions in constraints.txt by name."""
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = [line.split("==") for line in lines if line and not line.startswith("#")]
     return {canonicalize_name(name): version for name, version in pins}
@@ -59,7 +76,7 @@ def test_direct_requirements_are_pinned() -> None:
     project = tomllib.loads(PYPROJECT)["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     requirements = [Requirement(text) for group in groups for text in group]
-    pins = _constraints()
+    pins = pinned_versions()
     own = {"lalaloc", "torch"}
     for requirement in requirements:
         name = canonicalize_name(requirement.name)
@@ -67,33 +84,36 @@ def test_direct_requirements_are_pinned() -> None:
 
 
 def test_torch_is_pinned_once() -> None:
-    assert "torch" not in _constraints()
+    assert "torch" not in pinned_versions()
     assert re.fullmatch(r"\d+\.\d+\.\d+", install_torch.pinned_version(PYPROJECT))
 
 
 @pytest.mark.parametrize(
-    ("gpu", "found", "expected"),
+    ("gpu", "found", "strict", "expected"),
     [
-        (False, {"2.0.0+cpu"}, ["torch==2.0.0+cpu"]),
-        (False, {"2.0.0"}, ["torch==2.0.0+cpu", "torch==2.0.0"]),
-        (True, {"2.0.0"}, ["torch==2.0.0"]),
+        (False, {"2.0.0+cpu locked"}, "", ["2.0.0+cpu locked"]),
+        (False, {"2.0.0+cpu"}, "", ["2.0.0+cpu locked", "2.0.0+cpu"]),
+        (False, {"2.0.0"}, "", ["2.0.0+cpu locked", "2.0.0+cpu", "2.0.0"]),
+        (False, {"2.0.0+cpu"}, "1", ["2.0.0+cpu locked"]),
+        (True, {"2.0.0"}, "", ["2.0.0"]),
     ],
 )
 def test_cpu_build_is_tried_first_without_a_gpu(
-    monkeypatch: pytest.MonkeyPatch, gpu: bool, found: set[str], expected: list[str]
+    monkeypatch: pytest.MonkeyPatch, gpu: bool, found: set[str], strict: str, expected: list[str]
 ) -> None:
     tried = []
 
-    def pip_install(requirement: str) -> int:
-        tried.append(requirement)
-        return 0 if requirement.removeprefix("torch==") in found else 1
+    def pip_install(requirement: str, *, locked: bool = False) -> int:
+        tried.append(requirement.removeprefix("torch==") + " locked" * locked)
+        return 0 if tried[-1] in found else 1
 
+    monkeypatch.setenv("TORCH_LOCKED", strict)
     monkeypatch.setattr(install_torch.sys, "platform", "linux")
     monkeypatch.setattr(install_torch, "has_gpu", lambda: gpu)
     monkeypatch.setattr(install_torch, "is_installed", lambda version, wants_cpu: False)
     monkeypatch.setattr(install_torch, "pinned_version", lambda pyproject: "2.0.0")
     monkeypatch.setattr(install_torch, "pip_install", pip_install)
-    assert install_torch.main() == 0
+    assert (install_torch.main() == 0) == (tried[-1] in found)
     assert tried == expected
 
 
@@ -141,8 +161,7 @@ def test_compose_publishes_locally_by_default() -> None:
 
 
 def test_image_can_export_spans() -> None:
-    (extras,) = re.findall(r'pip install .* "\.\[(.*)\]"', DOCKERFILE)
-    assert {"service", "lpo", "otel"} <= set(extras.split(","))
+    assert {"service", "lpo", "otel"} <= set(extras_of("docker/requirements.lock"))
 
 
 def test_proxy_and_replicas_match() -> None:
@@ -173,22 +192,23 @@ def test_image_does_not_run_as_root() -> None:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("name", RESOURCES)
-def test_manifests_are_valid(name: str, version: str) -> None:
-    assert kubernetes_validate.validate(RESOURCES[name], version, strict=True) == version
+@pytest.mark.parametrize("overlay", OVERLAYS)
+def test_manifests_are_valid(overlay: str, version: str) -> None:
+    for manifest in RENDERED[overlay].values():
+        assert kubernetes_validate.validate(manifest, version, strict=True) == version
 
 
 @pytest.mark.parametrize(
-    ("name", "path", "value"),
+    ("kind", "path", "value"),
     [
-        ("deployment.yaml", ("spec", "replica"), 2),
-        ("deployment.yaml", ("spec", "template", "spec", "containers", 0, "readinessProbe", "periodSeconds"), "2s"),
-        ("horizontalpodautoscaler.yaml", ("spec", "metrics", 0, "pods", "target", "averageValue"), [3]),
-        ("poddisruptionbudget.yaml", ("spec", "maxUnavailible"), 1),
+        ("Deployment", ("spec", "replica"), 2),
+        ("Deployment", ("spec", "template", "spec", "containers", 0, "readinessProbe", "periodSeconds"), "2s"),
+        ("HorizontalPodAutoscaler", ("spec", "metrics", 0, "pods", "target", "averageValue"), [3]),
+        ("PodDisruptionBudget", ("spec", "maxUnavailible"), 1),
     ],
 )
-def test_validation_notices_a_mistake(name: str, path: tuple[str | int, ...], value: object) -> None:
-    manifest: Any = deepcopy(RESOURCES[name])
+def test_validation_notices_a_mistake(kind: str, path: tuple[str | int, ...], value: object) -> None:
+    manifest: Any = deepcopy(BY_KIND[kind])
     inner = manifest
     for step in path[:-1]:
         inner = inner[step]
@@ -198,10 +218,80 @@ def test_validation_notices_a_mistake(name: str, path: tuple[str | int, ...], va
 
 
 def test_every_manifest_is_applied() -> None:
-    not_resources = {"kustomization.yaml", "prometheus-adapter.yaml"}
-    assert {path.name for path in FOLDER.iterdir()} - not_resources == set(RESOURCES)
-    name, _, tag = CONTAINER["image"].partition(":")
-    assert KUSTOMIZATION["images"] == [{"name": name, "newTag": tag}]
+    folder = ROOT / "docker" / "kubernetes"
+    for part in folder.rglob("*.yaml"):
+        if part.name == "kustomization.yaml" or part.name == "prometheus-adapter.yaml":
+            continue
+        kustomization = yaml.safe_load(part.with_name("kustomization.yaml").read_text(encoding="utf-8"))
+        patches = [patch["path"] for patch in kustomization.get("patches", [])]
+        assert part.name in [*kustomization["resources"], *patches], part
+    for rendered in RENDERED.values():
+        image = rendered["Deployment"]["spec"]["template"]["spec"]["containers"][0]["image"]
+        assert image == COMPOSE["image"] == f"lalaloc:{__version__}"
+
+
+def test_single_pod_keeps_its_data() -> None:
+    """SQLite has one writer: no second pod at any time, and a volume that outlives the pod."""
+    single = RENDERED["single"]
+    spec = single["Deployment"]["spec"]
+    assert (spec["replicas"], spec["strategy"]) == (1, {"type": "Recreate"})
+    assert "HorizontalPodAutoscaler" not in single
+    pod = spec["template"]["spec"]
+    [data] = [volume for volume in pod["volumes"] if volume["name"] == "data"]
+    claim = single["PersistentVolumeClaim"]["metadata"]["name"]
+    assert data == {"name": "data", "persistentVolumeClaim": {"claimName": claim}}
+    assert "env" not in pod["containers"][0]
+    assert single["ConfigMap"] == BY_KIND["ConfigMap"]
+
+
+def test_proxies_are_trusted_by_address() -> None:
+    """No deployment trusts X-Forwarded-For of everybody, and pods admit their proxy by namespace and name."""
+    assert ipaddress.ip_network(CONFIGURED["FORWARDED_ALLOW_IPS"]).prefixlen >= 8
+    for rule in BY_KIND["NetworkPolicy"]["spec"]["ingress"]:
+        for peer in rule["from"]:
+            assert peer["namespaceSelector"]["matchLabels"].keys() == {"kubernetes.io/metadata.name"}
+            assert peer["podSelector"]["matchLabels"]
+    tls = yaml.safe_load((ROOT / "docker" / "compose.tls.yaml").read_text(encoding="utf-8"))
+    replicas = yaml.safe_load((ROOT / "docker" / "compose.replicas.yaml").read_text(encoding="utf-8"))
+    for compose, behind in ((tls, "service"), (replicas, "replica-1")):
+        services = compose["services"]
+        address = services["proxy"]["networks"]["front"]["ipv4_address"]
+        assert services[behind]["environment"]["FORWARDED_ALLOW_IPS"] == address
+        [subnet] = compose["networks"]["front"]["ipam"]["config"]
+        assert ipaddress.ip_address(address) in ipaddress.ip_network(subnet["subnet"])
+    assert replicas["networks"]["database"] == {"internal": True}
+    assert replicas["services"]["database"]["networks"] == ["database"]
+
+
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.replicas.yaml", "compose.tls.yaml"])
+def test_compose_files_are_valid_and_bounded(name: str) -> None:
+    file = ROOT / "docker" / name
+    check_schema("vendor.compose-spec", file)
+    for service in yaml.safe_load(file.read_text(encoding="utf-8"))["services"].values():
+        # An override leaves the rest to the file that it extends.
+        if "image" not in service:
+            continue
+        assert {"mem_limit", "pids_limit"} <= service.keys()
+        assert service["read_only"]
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+
+
+def test_base_images_can_be_pinned_by_digest() -> None:
+    lines = (ROOT / "docker" / "images.env").read_text(encoding="utf-8").splitlines()
+    images = dict(line.split("=") for line in lines if not line.startswith("#"))
+    text = DOCKERFILE + "".join(file.read_text(encoding="utf-8") for file in (ROOT / "docker").glob("compose*.yaml"))
+    used = dict(re.findall(r"\b([A-Z]+_IMAGE)(?::-|=)([\w.:/-]+)", text))
+    # A digest in the file is not in the defaults.
+    assert {name: image.partition("@")[0] for name, image in images.items()} == used
+    assert set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) == {"${PYTHON_IMAGE}"}
+
+
+def check_schema(schema: str, file: Path) -> None:
+    """Check a file against a schema that check-jsonschema brings along."""
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", schema, file]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 def test_manifests_select_the_same_pods() -> None:
@@ -213,7 +303,7 @@ def test_manifests_select_the_same_pods() -> None:
     assert [rule["labelSelector"]["matchLabels"] for rule in POD["topologySpreadConstraints"]] == [LABELS]
     scaled = spec["HorizontalPodAutoscaler"]["scaleTargetRef"]
     assert (scaled["kind"], scaled["name"]) == ("Deployment", BY_KIND["Deployment"]["metadata"]["name"])
-    # A replica count would override the autoscaler on every deployment.
+    # A number of replicas would override the autoscaler on every deployment.
     assert "replicas" not in spec["Deployment"]
     assert POD["serviceAccountName"] == BY_KIND["ServiceAccount"]["metadata"]["name"]
     assert [source["configMapRef"]["name"] for source in CONTAINER["envFrom"]] == [
@@ -274,7 +364,8 @@ def test_autoscaler_uses_an_existing_metric() -> None:
         metric for metric in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if metric["type"] == "Pods"
     ]
     metric = by_requests["pods"]["metric"]["name"]
-    adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
+    file = ROOT / "docker" / "kubernetes" / "replicas" / "prometheus-adapter.yaml"
+    adapter = yaml.safe_load(file.read_text(encoding="utf-8"))
     assert [rule["seriesQuery"].partition("{")[0] for rule in adapter["rules"]["custom"]] == [metric]
     telemetry = Telemetry()
     Admission(AdmissionLimits.from_settings(Settings()), telemetry)

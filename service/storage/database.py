@@ -1,8 +1,7 @@
 """Connections and transactions: SQLite with a write-ahead log, or PostgreSQL through psycopg.
 
-Durability: a committed transaction survives the end of the process. On SQLite (`synchronous=NORMAL`) a power failure or
-a crash of the operating system can undo the last transactions as a whole; the file stays consistent. PostgreSQL keeps
-them, unless it is configured otherwise.
+Durability: a committed transaction survives the end of the process, a crash of the system and a power failure.
+SQLite writes its log to the disk with every commit (`synchronous=FULL`); PostgreSQL does so by default.
 """
 
 from __future__ import annotations
@@ -291,7 +290,7 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
         _WRITE_AHEAD,
         f"journal_size_limit={LOG_BYTES}",
         "foreign_keys=ON",
-        "synchronous=NORMAL",
+        "synchronous=FULL",
         "secure_delete=FAST",
     )
     for pragma in pragmas:

@@ -10,11 +10,14 @@ import subprocess
 import uuid
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
+from service.cli import main as lalaloc_service
 from service.settings import SETTING_NAMES
+from service.storage import Store
 from tests.service.conftest import StartApp, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -30,25 +33,125 @@ def stored(client: httpx.Client, panorama: bytes) -> tuple[list[dict[str, object
     return plans, answer.json()["position"]
 
 
-def test_sqlite_backup_restores_everything(start_app: StartApp, panorama: bytes, tmp_path: Path) -> None:
-    data, backup = tmp_path / "data", tmp_path / "backup.sqlite3"
-    own = {"database_url": f"sqlite:///{data / 'lalaloc.sqlite3'}"}
-    data.mkdir()
-    with start_app(data, **own) as client:
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the data folder that the commands use."""
+    monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+def on_sqlite(data: Path) -> dict[str, Any]:
+    """Return the arguments of an app on SQLite, as `TEST_DATABASE` changes the default."""
+    data.mkdir(exist_ok=True)
+    return {"data_dir": data, "database_url": f"sqlite:///{data / 'lalaloc.sqlite3'}"}
+
+
+def test_sqlite_backup_restores_everything(
+    start_app: StartApp, panorama: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backup = str(tmp_path / "backup.sqlite3")
+    with start_app(**on_sqlite(data)) as client:
         upload(client)
         before = stored(client, panorama)
-        # Same as `sqlite3 FILE ".backup COPY"`.
-        with (
-            closing(sqlite3.connect(data / "lalaloc.sqlite3")) as database,
-            closing(sqlite3.connect(backup)) as copy,
-        ):
-            database.backup(copy)
-        upload(client)
-    shutil.copy(backup, data / "lalaloc.sqlite3")
-    for name in ("lalaloc.sqlite3-wal", "lalaloc.sqlite3-shm"):
-        (data / name).unlink(missing_ok=True)
-    with start_app(data, **own) as client:
+        assert lalaloc_service(["backup", backup]) == 0
+        later = upload(client)
+        # A running service would go on in the file before.
+        assert lalaloc_service(["restore", backup, "--yes"]) == 1
+        assert "stop the service first" in capsys.readouterr().err
+        assert client.get(f"/floorplans/{later}").status_code == 200
+    assert lalaloc_service(["restore", backup, "--yes"]) == 0
+    earlier = re.search(r"is '(.*)'; delete it", capsys.readouterr().out)
+    assert earlier is not None
+    with start_app(**on_sqlite(data)) as client:
         assert stored(client, panorama) == before
+        assert client.get(f"/floorplans/{later}").status_code == 404
+    # The database before is a backup as well.
+    assert lalaloc_service(["restore", earlier[1], "--yes"]) == 0
+    with start_app(**on_sqlite(data)) as client:
+        assert client.get(f"/floorplans/{later}").status_code == 200
+
+
+def test_lost_or_damaged_database_is_restored(
+    start_app: StartApp, panorama: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backup, database = str(tmp_path / "backup.sqlite3"), data / "lalaloc.sqlite3"
+    with start_app(**on_sqlite(data)) as client:
+        upload(client)
+        before = stored(client, panorama)
+        assert lalaloc_service(["backup", backup]) == 0
+    for content in (None, b"no database" * 1000):
+        shutil.rmtree(data)
+        if content is not None:
+            data.mkdir()
+            database.write_bytes(content)
+            database.with_name("lalaloc.sqlite3-wal").write_bytes(content)
+        assert lalaloc_service(["restore", backup, "--yes"]) == 0
+        assert ("the database before" in capsys.readouterr().out) == (content is not None)
+        with start_app(**on_sqlite(data)) as client:
+            assert stored(client, panorama) == before
+
+
+def broken(backup: Path, change: str) -> None:
+    """Break a backup in one of several ways."""
+    if change == "missing":
+        backup.unlink()
+    elif change == "text":
+        backup.write_text("no database")
+    elif change == "truncated":
+        backup.write_bytes(backup.read_bytes()[:-8192])
+    else:
+        with closing(sqlite3.connect(backup)) as copy:
+            copy.executescript(change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("missing", "there is no file"),
+        ("text", "is not an SQLite file, or damaged"),
+        ("truncated", "damaged|malformed"),
+        ("DROP TABLE floorplans", "no table of floor plans"),
+        ("UPDATE alembic_version SET version_num = '9999'", "9999"),
+    ],
+)
+def test_unusable_backup_changes_nothing(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, message: str
+) -> None:
+    database, backup = data / "lalaloc.sqlite3", tmp_path / "backup.sqlite3"
+    data.mkdir()
+    Store(f"sqlite:///{database}").close()
+    assert lalaloc_service(["backup", str(backup)]) == 0
+    before, files = database.read_bytes(), {path.name for path in data.iterdir()}
+    broken(backup, change)
+    assert lalaloc_service(["restore", str(backup), "--yes"]) == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert database.read_bytes() == before
+    assert {path.name for path in data.iterdir()} == files
+
+
+def test_backup_overwrites_nothing(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    backup = tmp_path / "backup.sqlite3"
+    assert lalaloc_service(["backup", str(backup)]) == 1
+    assert "there is no database" in capsys.readouterr().err
+    assert not data.exists()
+    data.mkdir()
+    Store(f"sqlite:///{data / 'lalaloc.sqlite3'}").close()
+    backup.write_text("mine")
+    assert lalaloc_service(["backup", str(backup)]) == 1
+    assert "exists; name a new file" in capsys.readouterr().err
+    assert lalaloc_service(["backup", str(tmp_path / "no" / "folder")]) == 1
+    assert "does not exist" in capsys.readouterr().err
+    assert backup.read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "backup.sqlite3"}
+
+
+def test_backup_of_postgresql_names_its_programs(
+    data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LALALOC_DATABASE_URL", "postgresql://host/lalaloc")
+    for command in (["backup", "x"], ["restore", "x", "--yes"]):
+        assert lalaloc_service(command) == 1
+        assert "use pg_dump and pg_restore" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("with_grids", [True, False])

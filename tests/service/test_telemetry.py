@@ -19,6 +19,7 @@ from typing import Any
 
 import httpx
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
@@ -256,7 +257,12 @@ def test_metric_labels_are_bounded(client: httpx.Client) -> None:
 
 def test_dashboard_uses_existing_metrics(client: httpx.Client) -> None:
     dashboard = json.loads((ROOT / "docker" / "grafana" / "lalaloc.json").read_text(encoding="utf-8"))
+    groups = yaml.safe_load((ROOT / "docker" / "grafana" / "alerts.yaml").read_text(encoding="utf-8"))["groups"]
+    rules = [rule for group in groups for rule in group["rules"]]
     expressions = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
+    expressions += [rule["expr"] for rule in rules]
+    recorded = {rule["record"] for rule in rules if "record" in rule}
+    assert {name for text in expressions for name in re.findall(r"\blalaloc:[\w:]+", text)} <= recorded
     queried = {name for text in expressions for name in re.findall(r"\b(?:lalaloc|process)_\w+", text)}
     kinds = dict(re.findall(r"^# TYPE (\S+) (\S+)$", client.get("/metrics").text, re.MULTILINE))
     buckets = {f"{name}_bucket" for name, kind in kinds.items() if kind == "histogram"}

@@ -1,0 +1,128 @@
+"""The service behind the Caddy of docker/Caddyfile, with TLS by Caddy's own authority."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import ssl
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from tests.service.conftest import StartApp, localise, upload, wait_for
+
+CONFIGURATION = Path(__file__).parents[2] / "docker" / "Caddyfile"
+
+
+@dataclass(frozen=True)
+class Proxy:
+    """Running Caddy: a client that trusts its authority, and the port without TLS."""
+
+    client: httpx.Client
+    plain_port: int
+
+
+@contextmanager
+def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
+    """Run Caddy as configured, but for its ports."""
+    program = shutil.which("caddy")
+    if program is None:
+        pytest.skip("Caddy is not installed; on Debian and Ubuntu the package is caddy")
+    plain, secure = _free_ports(2)
+    environment = os.environ | {
+        "XDG_DATA_HOME": str(folder),
+        "XDG_CONFIG_HOME": str(folder),
+        "LALALOC_HOST": "localhost",
+        "LALALOC_UPSTREAM": upstream,
+        "LALALOC_HTTP_PORT": str(plain),
+        "LALALOC_HTTPS_PORT": str(secure),
+    }
+    log = folder / "caddy.log"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [program, "run", "--config", str(CONFIGURATION), "--adapter", "caddyfile"],
+            env=environment,
+            stdout=output,
+            stderr=output,
+        )
+    root = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
+    try:
+        wait_for(lambda: process.poll() is not None or (root.exists() and _listens(secure)))
+        assert process.poll() is None, log.read_text(encoding="utf-8")
+        context = ssl.create_default_context(cafile=str(root))
+        with httpx.Client(base_url=f"https://localhost:{secure}", verify=context, timeout=30.0) as client:
+            yield Proxy(client, plain)
+    finally:
+        process.terminate()
+        process.wait(30.0)
+
+
+def _free_ports(count: int) -> list[int]:
+    listeners = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [listener.getsockname()[1] for listener in listeners]
+    for listener in listeners:
+        listener.close()
+    return ports
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.mark.one_replica
+def test_service_answers_over_tls(start_app: StartApp, panorama: bytes, tmp_path: Path) -> None:
+    with start_app(tmp_path / "data") as app, caddy(tmp_path, urlsplit(str(app.base_url)).netloc) as proxy:
+        plan_id = upload(proxy.client)
+        answer = localise(proxy.client, plan_id, panorama, heading_deg=0)
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["strict-transport-security"] == "max-age=31536000"
+        assert "caddy" not in answer.headers.get("server", "").lower()
+        # Metrics stay inside; everything else is the service's, with its own problems.
+        assert app.get("/metrics").status_code == 200
+        assert proxy.client.get("/metrics").status_code == 404
+        assert proxy.client.get(f"/floorplans/{'0' * 32}").json()["type"] == "urn:lalaloc:problem:unknown-floorplan"
+        # Without TLS there is only a redirect.
+        redirect = httpx.get(f"http://localhost:{proxy.plain_port}/floorplans")
+        assert redirect.status_code == 308
+        assert redirect.headers["location"].startswith("https://localhost")
+
+
+def test_client_cannot_state_its_address(tmp_path: Path) -> None:
+    received: list[str] = []
+
+    class Upstream(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            received.extend(self.headers.get_all("X-Forwarded-For") or [])
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_arguments: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Upstream) as upstream:
+        threading.Thread(target=upstream.serve_forever, daemon=True).start()
+        with caddy(tmp_path, f"127.0.0.1:{upstream.server_address[1]}") as proxy:
+            assert proxy.client.get("/", headers={"X-Forwarded-For": "203.0.113.7"}).status_code == 204
+        upstream.shutdown()
+    assert len(received) == 1
+    assert received[0] in ("127.0.0.1", "::1")
+
+
+def test_proxy_without_service_answers_with_a_problem(tmp_path: Path) -> None:
+    (port,) = _free_ports(1)
+    with caddy(tmp_path, f"127.0.0.1:{port}") as proxy:
+        answer = proxy.client.get("/floorplans")
+    assert answer.status_code == 502
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert json.loads(answer.text)["status"] == 502

@@ -1,0 +1,132 @@
+"""Upgrades from every released version, of databases that its own code wrote (`released/`)."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.operations import Operations
+from alembic.script import ScriptDirectory
+
+from service.storage import Store, migrations
+from service.storage.tables import METADATA
+from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.postgres import PostgresServer
+
+RELEASED = Path(__file__).parent / "released"
+VERSIONS = sorted(path.stem for path in RELEASED.glob("*.sql"))
+# PostgreSQL came with 0.2.0.
+CASES = [("sqlite", version) for version in VERSIONS] + [("postgresql", version) for version in VERSIONS[1:]]
+CHANGELOG = Path(__file__).parents[2] / "CHANGELOG.md"
+
+
+def test_every_released_version_is_tested() -> None:
+    assert (
+        sorted(re.findall(r"^## \[(\d+\.\d+\.\d+)\]", CHANGELOG.read_text(encoding="utf-8"), re.MULTILINE)) == VERSIONS
+    )
+
+
+@pytest.fixture
+def script(request: pytest.FixtureRequest) -> str:
+    return (RELEASED / f"{request.getfixturevalue('version')}.sql").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def url(kind: str, script: str, tmp_path: Path, request: pytest.FixtureRequest) -> str:
+    """Return the URL of the released database."""
+    file = tmp_path / "lalaloc.sqlite3"
+    with closing(sqlite3.connect(file)) as database:
+        # As its service left it.
+        database.execute("PRAGMA journal_mode=WAL").fetchall()
+        database.executescript(script)
+    if kind == "sqlite":
+        return f"sqlite:///{file}"
+    postgres: PostgresServer = request.getfixturevalue("postgres")
+    url = postgres.new_database()
+    _copy(sa.create_engine(f"sqlite:///{file}"), sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:")))
+    return url
+
+
+def _copy(source: sa.Engine, target: sa.Engine) -> None:
+    """Migrate an empty PostgreSQL database to the revision of an SQLite file, and copy its rows."""
+    scripts = ScriptDirectory(str(Path(migrations.__file__).parent))
+    with source.connect() as reading, target.begin() as writing:
+        revision = MigrationContext.configure(reading).get_current_revision()
+        assert revision is not None
+        context = MigrationContext.configure(writing)
+        with Operations.context(context):
+            for step in reversed(list(scripts.iterate_revisions(revision, "base"))):
+                step.module.upgrade()
+                context.stamp(scripts, step.revision)
+        # The types of SQLite, so that times and bytes are converted.
+        tables = sa.MetaData()
+        tables.reflect(reading)
+        for table in tables.sorted_tables:
+            rows: list[Any] = [dict(row._mapping) for row in reading.execute(sa.select(table))]
+            if rows and table.name != "alembic_version":
+                writing.execute(sa.insert(table), rows)
+        writing.exec_driver_sql("SELECT setval('latent_grids_id_seq', (SELECT max(id) FROM latent_grids))")
+    source.dispose()
+    target.dispose()
+
+
+def _rows(url: str) -> dict[str, int]:
+    engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, METADATA) == []
+        counts = {
+            table.name: connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
+            for table in METADATA.sorted_tables
+        }
+    engine.dispose()
+    return counts
+
+
+@pytest.mark.one_replica
+@pytest.mark.parametrize(("kind", "version"), CASES)
+def test_data_of_a_released_version_is_kept(
+    kind: str, version: str, script: str, url: str, start_app: StartApp, panorama: bytes, tmp_path: Path
+) -> None:
+    Store(url).close()
+    counts, inserted = _rows(url), re.findall(r'^INSERT INTO "(\w+)"', script, re.MULTILINE)
+    # Grids without a digest are computed again; the others are kept, even if this model does not use them.
+    for table in sorted(set(inserted) - {"alembic_version", "originals", "latent_grids_2"}):
+        lost = version == "0.2.0" and table in ("latent_grids", "grid_chunks")
+        assert counts[table] == (0 if lost else inserted.count(table)), table
+    key = re.search(r"^-- key (\S+)$", script, re.MULTILINE)
+    with start_app(tmp_path, database_url=url, api_keys=key is not None) as client:
+        if key is not None:
+            client.headers["Authorization"] = f"Bearer {key[1]}"
+        _assert_works(client, version, script, panorama)
+
+
+def _assert_works(client: httpx.Client, version: str, script: str, panorama: bytes) -> None:
+    [plan] = client.get("/floorplans").json()["floorplans"]
+    assert plan["name"] == (f"Renamed in {version}" if version > "0.1.0" else f"Flat of {version}")
+    address = f"/floorplans/{plan['id']}"
+    wait_for(lambda: client.get(address).json()["status"] == "ready")
+    original = client.get(f"{address}/original")
+    assert original.json()["name"] == plan["name"]
+    if version > "0.1.0":
+        first = re.search(r"^INSERT INTO \"revisions\" VALUES\('(\w+)','\w+',1,", script, re.MULTILINE)
+        assert first is not None
+        assert client.get(f"{address}?revision={first[1]}").json()["name"] == f"Flat of {version}"
+    answer = localise(client, plan["id"], panorama, heading_deg=0)
+    assert answer.status_code == 200, answer.text
+    if version >= "0.3.0":
+        [venue] = client.get("/venues").json()["venues"]
+        answer = client.post("/localise", data={"venue_id": venue["id"], "heading_deg": 0}, files={"photo": panorama})
+        assert answer.json()["floorplan_id"] == plan["id"]
+    # Tables that were moved take new rows, and rows are deleted with their plan.
+    upload(client)
+    assert client.delete(address).status_code == 204
+    assert [found["name"] for found in client.get("/floorplans").json()["floorplans"]] == ["Flat 3"]
