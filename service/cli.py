@@ -1,4 +1,4 @@
-"""Command line of the service, `lalaloc-service`: `serve`, `keys`, `tenants`, `audit`, `compact`, `backup` and `restore`.
+"""Command line of the service: `serve`, `keys`, `tenants`, `audit`, `compact`, `backup` and `restore`.
 
 Keys, tenants and the audit log are in the database of the settings, so these commands also work while the service runs.
 """
