@@ -28,7 +28,12 @@ _MAX_NAME = 60
 
 def packages() -> dict[str, str]:
     """Return name and version of the packages in the image; torch has a lock of its own."""
-    locked = {name: re.split(r"[ \\]", block.split("==")[1])[0] for name, block in blocks(LOCK.read_text()).items()}
+    locked = {
+        name: re.split(r"[ \\]", block.split("==")[1])[0]
+        for name, block in blocks(LOCK.read_text()).items()
+        # The image runs on Linux.
+        if "sys_platform == 'win32'" not in block
+    }
     (torch,) = set(re.findall(r'"torch==([\w.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8")))
     return dict(sorted((locked | {"torch": torch}).items()))
 
