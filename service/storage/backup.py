@@ -90,7 +90,6 @@ def restore(backup: Path, database: Path) -> Path | None:
         raise ConfigError(f"there is no file '{backup}'")
     if backup.resolve() == database.resolve():
         raise ConfigError(f"'{backup}' is the database itself; name a backup")
-    _check_kind(backup)
     with _file_errors(database):
         database.absolute().parent.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(database.absolute().parent).free < backup.stat().st_size:
@@ -99,6 +98,10 @@ def restore(backup: Path, database: Path) -> Path | None:
         try:
             _remove(new)
             shutil.copyfile(backup, new)
+            # Of a database that was copied or moved by hand, the log has the last commits.
+            if (log := Path(f"{backup}-wal")).exists():
+                shutil.copyfile(log, f"{new}-wal")
+            _check_kind(new, backup)
             # Opening migrates a backup of an earlier version, and refuses one of a newer version.
             Store(f"sqlite:///{new.absolute()}", connections=1).close()
             with closing(sqlite3.connect(new)) as copy:
@@ -118,14 +121,14 @@ def _uri(file: Path) -> str:
     return f"{file.absolute().as_uri()}?mode=rw"
 
 
-def _check_kind(backup: Path) -> None:
-    """Check that a file is a database of the service, which opening would otherwise create in it.
+def _check_kind(copy: Path, backup: Path) -> None:
+    """Check that a copy is a database of the service; opening it as one would create the tables.
 
     Raises:
         ConfigError: it is not.
     """
     try:
-        with closing(sqlite3.connect(f"{backup.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as connection:
+        with closing(sqlite3.connect(_uri(copy), uri=True)) as connection:
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.DatabaseError as error:
         raise ConfigError(f"'{backup}' is not an SQLite file, or damaged: {error}") from error

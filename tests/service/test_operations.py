@@ -91,6 +91,20 @@ def test_lost_or_damaged_database_is_restored(
             assert stored(client, panorama) == before
 
 
+def test_commits_in_the_log_of_a_copy_are_restored(data: Path, tmp_path: Path) -> None:
+    data.mkdir()
+    store, copy = Store(f"sqlite:///{data / 'lalaloc.sqlite3'}"), tmp_path / "copy.sqlite3"
+    store.tenants.change_limits("acme", cpu_share=2.0)
+    for suffix in ("", "-wal"):
+        shutil.copy(f"{data / 'lalaloc.sqlite3'}{suffix}", f"{copy}{suffix}")
+    store.close()
+    shutil.rmtree(data)
+    assert lalaloc_service(["restore", str(copy), "--yes"]) == 0
+    restored = Store(f"sqlite:///{data / 'lalaloc.sqlite3'}")
+    assert restored.tenants.limits()["acme"].cpu_share == 2.0
+    restored.close()
+
+
 def broken(backup: Path, change: str) -> None:
     """Break a backup in one of several ways."""
     if change == "missing":
@@ -197,8 +211,8 @@ def test_documented_settings_exist() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in GUIDES.glob("*.md"))
     named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", text))
     known = {name.upper() for name in SETTING_NAMES}
-    # Variables of the compose files.
-    assert named - known == {"DATABASE_PASSWORD", "PUBLISH"}
+    # Variables of the compose files and of Caddy.
+    assert named - known == {"DATABASE_PASSWORD", "HOST", "MEMORY", "PUBLISH", "UPSTREAM"}
 
 
 def own_database(postgres: PostgresServer) -> str:

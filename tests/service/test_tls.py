@@ -57,7 +57,7 @@ def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
         )
     root = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
     try:
-        wait_for(lambda: process.poll() is not None or (root.exists() and _listens(secure)))
+        wait_for(lambda: process.poll() is not None or (root.exists() and _has_certificate(secure, root)))
         assert process.poll() is None, log.read_text(encoding="utf-8")
         context = ssl.create_default_context(cafile=str(root))
         with httpx.Client(base_url=f"https://localhost:{secure}", verify=context, timeout=30.0) as client:
@@ -75,9 +75,15 @@ def _free_ports(count: int) -> list[int]:
     return ports
 
 
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+def _has_certificate(port: int, root: Path) -> bool:
+    """Tell whether Caddy completes a handshake; it listens before it has signed a certificate."""
+    try:
+        context = ssl.create_default_context(cafile=str(root))
+        with socket.create_connection(("127.0.0.1", port), timeout=5.0) as connection:
+            context.wrap_socket(connection, server_hostname="localhost").close()
+    except OSError:
+        return False
+    return True
 
 
 @pytest.mark.one_replica
