@@ -320,8 +320,21 @@ class TestSearch:
         # Distances that are predicted 12 % too small mean a camera 12 % higher.
         queries = [query.scaled(-math.log(1.12)) for query in queries_along(encoders, plan, WALK, stated)]
         found = search(queries, motions_along(WALK), refiner=refine_sequence)
-        assert len({picture.candidates[0].height_offset for picture in found.pictures}) == 1
+        offsets = [picture.candidates[0].height_offset for picture in found.pictures]
+        assert offsets == pytest.approx([math.log(1.12)] * len(WALK), abs=0.01)
         assert found.camera_height_m == pytest.approx(1.12 * CAMERA_M, rel=0.01)
+        for (place, _, _), picture in zip(WALK, found.pictures, strict=True):
+            assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
+
+    def test_heights_differ_between_photographs(self, plan: FloorPlan, encoders: Encoders, search: Search) -> None:
+        factors = np.linspace(0.95, 1.05, len(WALK))
+        queries = [
+            query.scaled(-math.log(factor))
+            for factor, query in zip(factors, queries_along(encoders, plan, WALK, CameraHeight(CAMERA_M)), strict=True)
+        ]
+        found = search(queries, motions_along(WALK), refiner=refine_sequence)
+        offsets = [picture.candidates[0].height_offset for picture in found.pictures]
+        assert offsets == pytest.approx(np.log(factors), abs=0.03)
         for (place, _, _), picture in zip(WALK, found.pictures, strict=True):
             assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
 
