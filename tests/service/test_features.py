@@ -140,6 +140,12 @@ def test_sequences_venues_and_sessions_take_features(client: httpx.Client, home:
     for content in features:
         tracked = client.post(f"/sessions/{session}/photographs", files={"features": content})
         assert tracked.status_code == 200, tracked.text
+        others = [
+            service.client.post("/localise/batch", data={"floorplan_id": plan_id}, files=_two(photograph)),
+            service.client.post("/localise", data=fields, files={"photo": photograph}, headers={"Accept": "image/png"}),
+            service.client.post("/geopose", params={"floorplan_id": plan_id}, json=oscp_request(photograph)),
+        ]
+        assert [answer.status_code for answer in others] == [200, 200, 200]
     assert tracked.json()["photographs"] == 2
 
 
@@ -271,6 +277,12 @@ def test_nothing_of_a_photograph_remains(
         session = service.client.post("/sessions", json={"floorplan_id": plan_id}).json()["id"]
         tracked = service.client.post(f"/sessions/{session}/photographs", files={"photo": photograph})
         assert tracked.status_code == 200, tracked.text
+        others = [
+            service.client.post("/localise/batch", data={"floorplan_id": plan_id}, files=_two(photograph)),
+            service.client.post("/localise", data=fields, files={"photo": photograph}, headers={"Accept": "image/png"}),
+            service.client.post("/geopose", params={"floorplan_id": plan_id}, json=oscp_request(photograph)),
+        ]
+        assert [answer.status_code for answer in others] == [200, 200, 200]
         assert service.client.post("/localise", data={"nothing": "1"}, files={"photo": photograph}).status_code == 422
         wait_for(lambda: len(spans) > 10, 20.0)
         traces = [span.SerializeToString() for span in spans]
