@@ -113,7 +113,7 @@ def test_each_photograph_counts_for_the_rate_limit(
         assert "8 requests per minute" in problem["detail"]
         client.headers.update(bearer(make_key(store)))
         problem = assert_problem(ask(client, plan_id, 9 * [panorama]), 422, "invalid-request")
-        assert "the rate limit of the key is 8 per minute" in problem["errors"][0]["message"]
+        assert "the rate limit is 8 per minute" in problem["errors"][0]["message"]
         store.close()
 
 
