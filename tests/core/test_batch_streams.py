@@ -160,6 +160,7 @@ def deferrable_batches(
 
 
 @pytest.mark.parametrize(("uses", "neighbours", "workers"), [(1, False, 0), (3, False, 1), (3, True, 0)])
+@pytest.mark.slow
 def test_deferred_batches_equal_rendered_ones(uses: int, neighbours: bool, workers: int) -> None:
     rendered = deferrable_batches(uses, deferred=False, neighbours=neighbours, workers=workers)
     deferred = deferrable_batches(uses, deferred=True, neighbours=neighbours, workers=workers)
@@ -196,6 +197,7 @@ def test_batches_rotate_like_single_pictures(shift: int, mirrored: bool) -> None
     assert np.array_equal(found.numpy(), np.stack(expected))
 
 
+@pytest.mark.slow
 def test_training_does_not_depend_on_the_rendering_place(tmp_path: Path) -> None:
     common = ["--preset", "tiny", "--workers", "0", "--steps", "3", "--validation-homes", "1"]
     weights = []

@@ -272,7 +272,7 @@ class TestIdentity:
         assert Bundle.open(bundle_copy).sha256 == replaced.sha256
         Encoders(replaced)
 
-    @pytest.mark.parametrize("architecture", ["ring", "trunk"])
+    @pytest.mark.parametrize("architecture", ["ring", pytest.param("trunk", marks=pytest.mark.slow)])
     def test_reexport_rebuilds_networks_from_weights(self, tmp_path: Path, architecture: str) -> None:
         before = exported_bundle(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])
         manifest = Bundle.open(tmp_path).manifest

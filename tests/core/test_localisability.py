@@ -95,6 +95,7 @@ def test_larger_errors_find_fewer_photographs(manifest: Manifest) -> None:
     assert shares[0] > shares[1] + 0.1
 
 
+@pytest.mark.slow
 def test_report_has_every_room_and_is_reproducible(manifest: Manifest) -> None:
     plan = _rooms((0.0, 4.0, 3.0), (10.0, 5.0, 3.5))
     found = localisability(plan, manifest)
@@ -117,6 +118,7 @@ def test_model_without_measured_errors_is_refused(manifest: Manifest) -> None:
         localisability(_rooms((0.0, 4.0, 3.0)), replace(manifest, errors=None))
 
 
+@pytest.mark.slow
 def test_large_plan_is_predicted_on_a_coarser_grid(manifest: Manifest) -> None:
     plan = _rooms((0.0, 200.0, 200.0), (210.0, 6.0, 5.0))
     found = localisability(plan, manifest)

@@ -150,6 +150,7 @@ class TestCommand:
         printed = capsys.readouterr().out
         assert all(f"{table.name} " in printed for table in TABLES)
 
+    @pytest.mark.slow
     def test_tables_share_runs(self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
         data, out = str(tmp_path / "scenes"), tmp_path / "out"
         for split in ("validation", "test"):
@@ -249,6 +250,7 @@ def written(folder: Path) -> dict[str, int]:
 
 @pytest.mark.usefixtures("brief")
 class TestTraining:
+    @pytest.mark.slow
     def test_image_variants_share_stage_one(self, tmp_path: Path) -> None:
         first = train("image-l2-kd", tmp_path)
         assert first.folder == tmp_path / "image-l2-kd" / "bundle"
@@ -263,6 +265,7 @@ class TestTraining:
         assert train("image-l2-kd", tmp_path).sha256 == first.sha256
         assert written(tmp_path) == before
 
+    @pytest.mark.slow
     def test_layout_variant_has_no_image_encoder(self, tmp_path: Path) -> None:
         bundle = train("layout-log-ratio", tmp_path)
         assert not {IMAGE_ONNX, DECODER_WEIGHTS} & set(bundle.manifest.files)

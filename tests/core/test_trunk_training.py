@@ -251,6 +251,7 @@ def trained(folder: Path, init_from: Path, config: TrainConfig = SHORT_RING) -> 
 
 
 class TestWarmStart:
+    @pytest.mark.slow
     def test_manifest_records_the_ancestry(self, tiny_bundle: Path, tmp_path: Path) -> None:
         parent = Bundle.open(tiny_bundle)
         run = tmp_path / "run"
@@ -322,6 +323,7 @@ class TestWarmStart:
             trained(tmp_path / "run", tmp_path)
         assert not (tmp_path / "layout.pt").exists()
 
+    @pytest.mark.slow
     def test_command_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
         words = ["train", "image", "--preset", "tiny", "--workers", "0", "--device", "cpu", "--out", str(tmp_path)]
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_panorama=2", "--set", "image.batch=4"]
@@ -384,6 +386,7 @@ class TestBest:
         self.best_of(tmp_path, 0.9)
         assert self.best_of(tmp_path, 0.1, 0.2).step == 2
 
+    @pytest.mark.slow
     def test_export_uses_the_best_or_the_last(self, tiny_bundle: Path, tmp_path: Path) -> None:
         run = tmp_path / "run"
         shutil.copytree(tiny_bundle.parent, run, ignore=shutil.ignore_patterns("bundle"))
