@@ -243,6 +243,8 @@ def test_page_says_which_photographs_it_cannot_encode(browser: Browser, service:
         # A photograph of a session stays as well.
         page.locator("#follow").evaluate("(fold) => { fold.open = true; }")
         page.locator("#session-start").click()
+        # Files that are chosen before the session exists are not sent.
+        expect(page.locator("#session-stop")).to_be_visible(timeout=SLOW_MS)
         with page.expect_request("**/photographs", timeout=SLOW_MS) as asked:
             file: Any = {"name": "kitchen.jpg", "mimeType": "image/jpeg", "buffer": KITCHEN}
             page.locator("#session-file").set_input_files(file)
