@@ -99,6 +99,7 @@ _UNINFORMATIVE_ROWS = {
 _SPEED_ROWS = {
     "known_heading": "sphere, known heading",
     "unknown_heading": "sphere, unknown heading",
+    "without_openings": "sphere, unknown heading, plan without openings",
     "phone": "photograph of 80° and 12 megapixels, unknown heading",
 }
 

@@ -22,6 +22,7 @@ from PIL import Image
 
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.synthetic.foreign import without_openings
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
@@ -43,7 +44,7 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
     images = PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()
     pictures = [_jpeg(image) for image in images]
     with running_service(bundle.folder) as (client, process):
-        plan_id = _upload(client, home.plan)
+        plan_id, bare_id = _upload(client, home.plan), _upload(client, without_openings(home.plan))
         report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
         heights = [{"camera_height_m": f"{shot.home.plan.camera_height_m}"} for shot in shots]
         headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
@@ -53,12 +54,13 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
             ],
             "unknown_heading": list(zip(pictures, heights, strict=True)),
         }
+        rows["without_openings"] = rows["unknown_heading"]
         if bundle.manifest.view is not None:
             views = [_phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
             lens = {"hfov_deg": f"{_PHONE_FIELD_DEG:g}"}
             rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]
         for name, requests in rows.items():
-            report[name] = _latency(client, plan_id, requests)
+            report[name] = _latency(client, bare_id if name == "without_openings" else plan_id, requests)
         report["service_resident_mb"] = resident_mb(process.pid)
         sizes = [resident_mb(pid) for pid in children_of(process.pid)]
         # The smaller child is Python's resource tracker.
