@@ -304,6 +304,9 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
         [43, 53, 3, 13, 19],
         [19],
         [*range(20), 59],
+        # Copies in one segment, of which one is removed: no prototype is without an owner.
+        [3, 43, 5, 45],
+        [3, 5, 45],
     ):
         place = np.array([wanted.index(plan) if plan in wanted else -1 for plan in plans])
         added = np.array([number for number, plan in enumerate(wanted) if plan not in plans], int)

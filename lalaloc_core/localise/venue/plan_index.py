@@ -198,8 +198,10 @@ class PlanIndex:
             weight = np.exp(rows["log_area"] - weights.temperature * (cost.astype(np.float64) - lowest))
             count, owner = part.segment.owners(prototype)
             plan, each = part.plan[owner], np.repeat(weight, count)
-            if len(part.dead):
-                plan, each = plan[plan >= 0], each[plan >= 0]
+            # Removed plans can share prototypes with those that are left.
+            left = plan >= 0
+            if not left.all():
+                plan, each = plan[left], each[left]
             mass += np.bincount(plan, each, minlength=self.plan_count)
         with np.errstate(divide="ignore"):
             return np.log(mass) - weights.temperature * lowest
