@@ -175,7 +175,7 @@ def _put_aside(database: Path) -> Path | None:
     if not database.is_file():
         _remove(database)
         return None
-    earlier = database.with_name(f"{database.name}-before-{datetime.now():%Y%m%dT%H%M%S}")
+    earlier = database.with_name(f"{database.name}-before-{datetime.now():%Y%m%dT%H%M%S.%f}")
     os.link(database, earlier)
     for suffix in _LOG_FILES:
         with suppress(FileNotFoundError):
