@@ -237,12 +237,13 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _panorama(), **fie
     return work
 
 
-def _sequence(*, padded: bool) -> Work:
-    """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
+def _sequence(*, padded: bool, venue: bool = False) -> Work:
+    """Return the work of a sequence in a plan or venue, `padded` to `size` tenths of a megabyte in total."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
         files = _PANORAMAS * (("panorama", _padded_picture(size * 10**5 // _PANORAMAS if padded else 0)),)
-        caller.send("POST", "/localise/sequence", *form((("floorplan_id", stored.plan_id),), files))
+        place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
+        caller.send("POST", "/localise/sequence", *form((place,), files))
 
     return work
 
@@ -430,6 +431,7 @@ LOADS = (
     ),
     Load(("POST /localise/batch",), f"10 panoramas, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
+    Load(("POST /localise/sequence",), "10 panoramas, {homes} homes", _sequence(padded=False, venue=True)),
     Load(
         ("POST /localise/sequence",),
         "10 panoramas of {sequence_mb} MB in total",

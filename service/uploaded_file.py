@@ -37,6 +37,9 @@ class UploadedFile:
     def read(self) -> bytes:
         """Return the content."""
         with self._lock:
+            # The end first, which empties the buffer: its bytes would be joined to the rest, a copy of the whole file
+            # that keeps the interpreter's lock.
+            self._file.seek(0, io.SEEK_END)
             self._file.seek(0)
             return self._file.read()
 

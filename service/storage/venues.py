@@ -6,10 +6,12 @@ not change when a plan of it gets a new revision.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from cachetools import LRUCache
 from sqlalchemy import (
     Connection,
     FromClause,
@@ -52,6 +54,8 @@ from service.storage.venue_rows import (
 
 # Ids per statement.
 _BATCH_SIZE = 1000
+# Venues whose plans are not counted anew for every reader.
+_COUNTED = 1000
 # Ids listed in an error message.
 _NAMED = 5
 # Columns of a plan that a query needs, besides level and name.
@@ -79,6 +83,8 @@ class Venues:
     def __init__(self, database: Database, quota: StorageQuota) -> None:
         self._database = database
         self._quota = quota
+        self._counts: LRUCache[tuple[str, str, float], tuple[VenueState, VenueCounts]] = LRUCache(_COUNTED)
+        self._lock = threading.Lock()
 
     def add(
         self,
@@ -217,7 +223,18 @@ class Venues:
             return [VenueMember(**row._mapping) for row in rows]
 
     def counts(self, venue_id: str, model_sha256: str, step_m: float) -> VenueCounts:
-        """Return the numbers of a venue's plans, for a model and a grid step."""
+        """Return the numbers of a venue's plans, for a model and a grid step; they are counted once per state."""
+        # State before counts: a change in between makes the next call count again.
+        state, key = self.state(venue_id), (venue_id, model_sha256, step_m)
+        with self._lock:
+            counted = self._counts.get(key)
+        if counted is None or counted[0] != state:
+            counted = state, self._count(venue_id, model_sha256, step_m)
+            with self._lock:
+                self._counts[key] = counted
+        return counted[1]
+
+    def _count(self, venue_id: str, model_sha256: str, step_m: float) -> VenueCounts:
         plan, grid, failure = VENUE_PLANS.c.plan_id, LATENT_GRIDS.c.id, REVISIONS.c.failure
         ready = case((grid.is_not(None), plan))
         failed = case((and_(grid.is_(None), failure.is_not(None)), plan))
