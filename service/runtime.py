@@ -123,12 +123,12 @@ class Backends:
     """Builders of the components that can run in other processes.
 
     Attributes:
-        optimiser: builds the pool of LPO workers.
+        optimiser: builds the pool of LPO workers; the last argument tells whether poses are refined by latents.
         encoder: loads the networks and warms them up.
         localisers: builds the localisers; None: this process computes answers.
     """
 
-    optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore], OptimiserBackend]
+    optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore, bool], OptimiserBackend]
     encoder: Callable[[Bundle, Settings], PhotographEncoder]
     localisers: Callable[[ModelAnswer, Settings, Telemetry], Localisers] | None = None
 
@@ -265,12 +265,12 @@ class _QueryComponents:
         cores = settings.cores
         count = cores.compute_threads + cores.workers + settings.decode.workers
         permits = FairSemaphore(with_headroom(count), telemetry.cpu_accounts, cores=usable_cores())
-        # Start the workers first: they load torch while this process loads the model.
-        optimiser = backends.optimiser(bundle, settings, telemetry, permits)
-        _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry, permits))
         decoder.start()
         encoder = backends.encoder(bundle, settings)
+        by_latents = not encoder.networks.predicts_profile
+        optimiser = backends.optimiser(bundle, settings, telemetry, permits, by_latents)
+        _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         return cls(
             settings=settings,
             telemetry=telemetry,

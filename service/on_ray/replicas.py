@@ -79,7 +79,7 @@ class SearchReplica:
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
         backends = Backends(
-            optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(lpo, telemetry),
+            optimiser=lambda _bundle, _settings, telemetry, *_: RemoteOptimiser(lpo, telemetry),
             encoder=lambda bundle, settings: RemotePhotographEncoder(bundle, settings, encoder),
         )
         self._cleanup = ExitStack()
@@ -182,7 +182,7 @@ class IngressReplica:
             )
 
         backends = Backends(
-            optimiser=lambda _bundle, _settings, telemetry, _permits: RemoteOptimiser(self._lpo, telemetry),
+            optimiser=lambda _bundle, _settings, telemetry, *_: RemoteOptimiser(self._lpo, telemetry),
             encoder=warm_encoder,
             localisers=localisers,
         )

@@ -20,13 +20,29 @@ _START_S, _MAX_START_S = 5.0, 120.0
 class LpoPool:
     """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
 
-    def __init__(self, bundle: Bundle, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
+    def __init__(
+        self,
+        bundle: Bundle,
+        settings: Settings,
+        telemetry: Telemetry,
+        permits: FairSemaphore,
+        by_latents: bool = True,
+    ) -> None:
+        """Create a pool, which `start` starts.
+
+        Args:
+            bundle: the model.
+            settings: the settings.
+            telemetry: metrics.
+            permits: permits to compute.
+            by_latents: whether the model's poses are refined by latents; else workers load no torch.
+        """
         self._telemetry = telemetry
         cores = settings.cores
         spec = WorkerSpec(
             name="lpo",
             target=run_worker,
-            arguments=(str(bundle.folder.resolve()), bundle.sha256, cores.worker_threads),
+            arguments=(str(bundle.folder.resolve()), bundle.sha256, cores.worker_threads, by_latents),
             stall_s=settings.lpo.stall_s,
             start_s=_START_S,
             max_start_s=_MAX_START_S,

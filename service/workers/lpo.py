@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import cache
 from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,36 +21,53 @@ from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
+if TYPE_CHECKING:
+    from lalaloc_core.localise.optimise import PoseRefiner
 
-def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int) -> None:
-    """Load and warm up the refiner, then run jobs until the pipe closes."""
+
+def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int, by_latents: bool) -> None:
+    """Load the refiner, see `load_refiner`, then run jobs until the pipe closes."""
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(threads)
-    serve_jobs(connection, lambda: load_refiner(Path(bundle_folder), model_sha256, threads))
+    serve_jobs(connection, lambda: load_refiner(Path(bundle_folder), model_sha256, threads, by_latents=by_latents))
 
 
 def load_refiner(
-    bundle_folder: Path, model_sha256: str, threads: int
+    bundle_folder: Path, model_sha256: str, threads: int, *, by_latents: bool = True
 ) -> Callable[[RefinementJob | SequenceJob], RefinementResult | SequenceResult]:
-    """Load the refiner, warm it up, and return the function from job to result.
+    """Return the function from job to result.
+
+    Args:
+        bundle_folder: folder of the model.
+        model_sha256: digest of the model.
+        threads: threads of torch.
+        by_latents: whether the model's poses are refined by latents. If so, torch is loaded and warmed up now, else
+            with the first job that needs it: poses refined by walls need none, and torch takes a quarter of a gigabyte.
 
     Raises:
         RuntimeError: the bundle on disk has another digest.
     """
-    import torch
-
-    from lalaloc_core.localise.optimise import PoseRefiner
-
-    torch.set_num_threads(threads)
     bundle = Bundle.open(bundle_folder)
     if bundle.sha256 != model_sha256:
         raise RuntimeError(f"the bundle in {bundle_folder} changed to {bundle.sha256}: restart the service")
-    refiner = PoseRefiner.from_bundle(bundle)
-    for optimise_heading, by_profile in product((False, True), repeat=2):
-        refiner.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
+
+    @cache
+    def refiner() -> PoseRefiner:
+        import torch
+
+        from lalaloc_core.localise.optimise import PoseRefiner
+
+        torch.set_num_threads(threads)
+        loaded = PoseRefiner.from_bundle(bundle)
+        for optimise_heading, by_profile in product((False, True), repeat=2):
+            loaded.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
+        return loaded
+
+    if by_latents:
+        refiner()
 
     def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
-        return refine_sequence(job) if isinstance(job, SequenceJob) else refiner.refine(job)
+        return refine_sequence(job) if isinstance(job, SequenceJob) else refiner().refine(job)
 
     return refine
 

@@ -16,6 +16,7 @@ from time import sleep
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
@@ -35,8 +36,8 @@ _LONG_S = 120.0
 
 
 @contextmanager
-def _pool(bundle: Bundle, **overrides: Any) -> Iterator[LpoPool]:
-    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()))
+def _pool(bundle: Bundle, *, by_latents: bool = True, **overrides: Any) -> Iterator[LpoPool]:
+    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()), by_latents)
     pool.start()
     try:
         yield pool
@@ -98,6 +99,19 @@ def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_prof
         np.testing.assert_allclose(result.latent_distance, expected.latent_distance, atol=1e-4)
     np.testing.assert_allclose(result.cost, expected.cost, atol=1e-4)
     np.testing.assert_allclose(result.information, expected.information, rtol=1e-2, atol=1e-2)
+
+
+def test_torch_is_loaded_with_the_first_job_by_latents(bundle: Bundle, job: RefinementJob) -> None:
+    def loaded() -> bool:
+        (worker,) = set(_workers()) - others
+        return any("libtorch" in entry.path for entry in psutil.Process(worker).memory_maps())
+
+    others = set(_workers())
+    with _pool(bundle, by_latents=False, workers=1) as pool:
+        wait_for(lambda: pool.state.ready == 1, 120.0)
+        assert not loaded()
+        assert _refine(pool, job, _LONG_S) is not None
+        assert loaded()
 
 
 def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: RefinementJob) -> None:
