@@ -357,7 +357,7 @@ def test_every_refusal_says_what_to_do_and_has_an_entry(
         assert missing == []
 
 
-def test_refusals_without_keys_have_entries(client: httpx.Client) -> None:
+def test_refusal_without_keys_names_host_and_origin(client: httpx.Client) -> None:
     for headers, value in (
         ({"Host": "evil.example"}, "evil.example"),
         ({"Origin": "http://evil.example"}, "http://evil"),
