@@ -385,7 +385,10 @@ class InsufficientScopeError(ServiceError):
             text = f"API keys are off, and this request needs one with scope '{needed}': set LALALOC_API_KEYS=on"
         else:
             scopes = ", ".join(sorted(given)) or "none"
-            text = f"this request needs an API key or token with scope '{needed}'; it has: {scopes}"
+            text = (
+                f"this request needs an API key or token with scope '{needed}'; it has: {scopes}. Use another one, or "
+                "ask the operator of the service for the scope"
+            )
         super().__init__(text)
 
 
@@ -410,9 +413,9 @@ class UnknownKeyError(ServiceError):
 class ExposedWithoutKeysError(ServiceError):
     """A request from another machine, or from a page of another site, while API keys are off."""
 
-    def __init__(self, accepted: str) -> None:
+    def __init__(self, accepted: str, given: str) -> None:
         super().__init__(
-            f"API keys are off, so only requests {accepted} are answered; set LALALOC_API_KEYS, "
+            f"API keys are off, so only requests {accepted} are answered, not '{given[:100]}'; set LALALOC_API_KEYS, "
             "LALALOC_ALLOW_ANONYMOUS or LALALOC_ALLOWED_HOSTS"
         )
 
@@ -431,8 +434,8 @@ class TooManyRefusedKeysError(ServiceError):
     def __init__(self, limit: int, retry_after_s: int) -> None:
         self.retry_after_s = retry_after_s
         super().__init__(
-            f"Too many invalid API keys from this address: the limit is {limit} per minute. Retry after "
-            f"{retry_after_s} s."
+            f"Too many invalid API keys from this address: the limit is {limit} per minute. Retry with a valid key "
+            f"after {retry_after_s} s."
         )
 
 

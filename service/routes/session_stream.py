@@ -25,6 +25,7 @@ from service.http.socket_requests import (
 from service.routes.query_request import PHOTO
 from service.runtime import Runtime
 from service.security import caller_of
+from service.security.audit import entry_of
 
 router = APIRouter(tags=["sessions"])
 _SUFFIX = "/stream"
@@ -56,7 +57,10 @@ async def stream_session(socket: WebSocket) -> None:
             await socket.send_text(answer_text("session", answer))
             await _serve(socket, requests, f"{path}/photographs", runtime)
     except (ExposedWithoutKeysError, OverloadedError) as error:
-        await _deny(socket, problem_answer(request, error))
+        denial = problem_answer(request, error)
+        if isinstance(error, ExposedWithoutKeysError):
+            runtime.audit_trail.count(entry_of(request.scope, denial.status_code))
+        await _deny(socket, denial)
 
 
 async def _serve(socket: WebSocket, requests: SocketRequests, path: str, runtime: Runtime) -> None:

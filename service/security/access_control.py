@@ -41,7 +41,7 @@ REFUSALS = (
 _NO_KEY = "an API key is required: send `Authorization: Bearer lalaloc_...`"
 _MALFORMED = "the Authorization header must be `Bearer lalaloc_...`, with one API key"
 _TOKEN_TOO = ", or a token of the issuer"
-_REFUSED = "the API key is unknown or revoked"
+_REFUSED = "the API key '{}' is unknown or revoked; ask the operator of the service for a valid one"
 
 
 class AccessControl:
@@ -139,7 +139,7 @@ class AccessControl:
         """
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
-            raise ExposedWithoutKeysError("over a loopback address")
+            raise ExposedWithoutKeysError("over a loopback address", "" if server is None else str(server[0]))
         # Only proxies use Unix sockets, and they pass on the host name that their clients use.
         if server is not None and server[1] is not None:
             headers = Headers(scope=request.scope)
@@ -158,7 +158,7 @@ class AccessControl:
                     await self._rates.check_refused(client)
                 identity = await self._holder_of_key(request, presented)
                 if identity is None:
-                    raise UnauthenticatedError(_REFUSED)
+                    raise UnauthenticatedError(_REFUSED.format(presented.id))
                 return identity
             token = parse_token(values)
             if self._tokens is None or token is None:
@@ -178,7 +178,9 @@ class AccessControl:
         key = await self._keys.find(presented)
         if key is not None and key.is_expired(datetime.now(UTC)):
             add_log_fields(request, key=key.id, tenant=key.tenant)
-            raise UnauthenticatedError(f"the API key expired at {key.expires_at:%Y-%m-%dT%H:%M:%SZ}; use its successor")
+            raise UnauthenticatedError(
+                f"the API key expired at {key.expires_at:%Y-%m-%dT%H:%M:%SZ}; use its successor, or ask the operator"
+            )
         return None if key is None else Identity.of_key(key)
 
 

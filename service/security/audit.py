@@ -25,6 +25,8 @@ from starlette.requests import Request
 from service.errors import (
     ExposedWithoutKeysError,
     InsufficientScopeError,
+    IssuerUnavailableError,
+    RateLimitedError,
     StoreUnavailableError,
     TooManyRefusedKeysError,
     UnauthenticatedError,
@@ -37,7 +39,16 @@ from service.telemetry import LOGGER_NAME
 from service.telemetry.log_fields import log_fields_of
 
 # Refusals that are audited, besides those of changes.
-AUDITED_REFUSALS = (UnauthenticatedError, InsufficientScopeError, ExposedWithoutKeysError, TooManyRefusedKeysError)
+AUDITED_REFUSALS = (
+    UnauthenticatedError,
+    InsufficientScopeError,
+    ExposedWithoutKeysError,
+    RateLimitedError,
+    TooManyRefusedKeysError,
+    IssuerUnavailableError,
+)
+# Statuses of refusals by routes that are not audited otherwise: photographs where features are required, or too many.
+REFUSED = frozenset({403, 429})
 # nginx's status for a client that disconnected before the answer; a change may have been made.
 CLIENT_CLOSED = 499
 READING = frozenset({"GET", "HEAD"})

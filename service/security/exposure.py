@@ -63,11 +63,13 @@ def check_origin(
     Raises:
         ExposedWithoutKeysError: another host name, or a change requested by a page of another site.
     """
-    if not all(is_allowed_host(host, allowed) for host in hosts):
-        raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)")
+    for host in hosts:
+        if not is_allowed_host(host, allowed):
+            raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)", host)
     foreign = [origin for origin in origins if origin.lower() not in pages]
-    if method in _CHANGING and not all(is_allowed_host(origin.partition("://")[2], allowed) for origin in foreign):
-        raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)")
+    for origin in foreign if method in _CHANGING else ():
+        if not is_allowed_host(origin.partition("://")[2], allowed):
+            raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)", origin)
 
 
 def check_address(host: str, settings: Settings) -> None:

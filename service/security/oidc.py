@@ -93,17 +93,27 @@ class TokenVerifier:
             decoded = await self._decoded(token)
             self._check(decoded)
         except UnsupportedAlgorithmError as error:
-            raise UnauthenticatedError(f"the token's algorithm is not one of {', '.join(ALGORITHMS)}") from error
+            raise UnauthenticatedError(
+                f"the token's algorithm is not one of {', '.join(ALGORITHMS)}; get another token from the issuer"
+            ) from error
         except InvalidKeyIdError as error:
-            raise UnauthenticatedError("the token is signed with a key that the issuer does not publish") from error
+            raise UnauthenticatedError(
+                "the token is signed with a key that the issuer does not publish; get a new one from the issuer"
+            ) from error
         except ExpiredTokenError as error:
             raise UnauthenticatedError("the token has expired; get a new one from the issuer") from error
         except ClaimError as error:
             expected = {"iss": self._settings.oidc_issuer, "aud": self._settings.oidc_audience}.get(error.claim)
-            reason = f"must be '{expected}'" if expected else "is missing or not acceptable now"
+            reason = (
+                f"must be '{expected}'"
+                if expected
+                else "is missing or not acceptable now; get a new one from the issuer"
+            )
             raise UnauthenticatedError(f"the token's claim '{error.claim}' {reason}") from error
         except _MALFORMED as error:
-            raise UnauthenticatedError("the token is not a JSON Web Token with a valid signature") from error
+            raise UnauthenticatedError(
+                "the token is not a JSON Web Token with a valid signature; get a new one from the issuer"
+            ) from error
         return self._identity(decoded.claims)
 
     async def _decoded(self, token: str) -> jwt.Token:

@@ -99,7 +99,10 @@ class Store:
             database = Database(url, connections=connections, wait_s=wait_s)
             _migrate(database)
         except (ArgumentError, CommandError, RevisionError, ImportError, OSError, SQLAlchemyError) as error:
-            raise ConfigError(f"cannot open the database (LALALOC_DATABASE_URL): {error}") from error
+            reason = str(getattr(error, "orig", None) or error).strip()
+            raise ConfigError(
+                f"cannot open the database (LALALOC_DATABASE_URL): {reason}; if its file is damaged, restore a backup"
+            ) from error
         self._database = database
         self.plan_cache = PlanCache(plan_cache_bytes)
         self.quota = StorageQuota(database, stored_bytes)

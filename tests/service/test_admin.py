@@ -310,6 +310,64 @@ def test_log_is_read_in_pages_and_filtered(admin: httpx.Client) -> None:
 
 
 @pytest.mark.one_replica
+def test_every_refusal_says_what_to_do_and_has_an_entry(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, api_keys=True, key_cache_s=0.0, rate_burst=0, require_features=True) as client:
+        opened = Store(database_of(tmp_path))
+        client.headers["Authorization"] = bearer(make_key(opened))["Authorization"]
+        opened.close()
+        plan = {"floorplan_id": upload(client)}
+        keys = {name: _created(client, **changes) for name, changes in (
+            ("reader", {"scopes": ["read"]}), ("slow", {"rate_per_minute": 1}), ("revoked", {}),
+        )}  # fmt: skip
+        client.delete(f"/admin/keys/{keys['revoked']['id']}")
+        held = {name: bearer(key["key"]) for name, key in keys.items()}
+        client.get("/limits", headers=held["slow"])
+        photo: dict[str, Any] = {"data": plan, "files": {"photo": b"\xff\xd8\xff"}}
+        photos = photo | {"files": 2 * [("photo", b"\xff\xd8\xff")]}
+        geopose = {"json": {"sensorReadings": {}}}
+        revoked, unknown = keys["revoked"]["id"], f"lalaloc_{'0' * 32}_{'x' * 43}"
+        table: list[tuple[str, str, dict[str, str], dict[str, Any], int, str, list[str]]] = [
+            ("GET", "/limits", {"Authorization": ""}, {}, 401, "unauthenticated", ["Bearer lalaloc_"]),
+            ("GET", "/limits", bearer("x"), {}, 401, "unauthenticated", ["Bearer lalaloc_"]),
+            ("GET", "/limits", bearer(unknown), {}, 401, "unauthenticated", ["0" * 32, "ask the operator"]),
+            ("GET", "/usage", held["revoked"], {}, 401, "unauthenticated", [revoked, "ask the operator"]),
+            (
+                "GET",
+                "/metrics",
+                held["reader"],
+                {},
+                403,
+                "insufficient-scope",
+                ["'metrics'", "it has: read"],
+            ),
+            ("POST", "/localise", held["reader"], photo, 403, "insufficient-scope", ["'localise'", "it has: read"]),
+            ("POST", "/admin/keys", held["reader"], {}, 403, "insufficient-scope", ["'admin'", "it has: read"]),
+            ("GET", "/limits", held["slow"], {}, 429, "rate-limited", ["1 requests per minute", "Retry after"]),
+            ("POST", "/localise", {}, photo, 403, "features-required", ["LALALOC_REQUIRE_FEATURES", "lalaloc encode"]),
+            ("POST", "/localise/sequence", {}, photos, 403, "features-required", ["LALALOC_REQUIRE_FEATURES"]),
+            ("POST", "/geopose", {}, geopose, 403, "features-required", ["LALALOC_REQUIRE_FEATURES"]),
+        ]
+        for method, path, headers, body, status, slug, words in table:
+            problem = assert_problem(client.request(method, path, headers=headers, **body), status, slug)
+            assert [word for word in words if word not in problem["detail"]] == [], problem["detail"]
+        found = Counter((entry["action"], entry["status"], entry["result"]) for entry in _entries(client))
+        missing = [row for row in table if found[f"{row[0]} {row[1]}", row[4], row[5]] == 0]
+        assert missing == []
+
+
+def test_refusal_without_keys_names_host_and_origin(client: httpx.Client) -> None:
+    for headers, value in (
+        ({"Host": "evil.example"}, "evil.example"),
+        ({"Origin": "http://evil.example"}, "http://evil"),
+    ):
+        problem = assert_problem(client.post("/floorplans", headers=headers), 403, "exposed-without-keys")
+        assert f"not '{value}" in problem["detail"]
+        assert "LALALOC_ALLOWED_HOSTS" in problem["detail"]
+
+
+@pytest.mark.one_replica
 def test_flood_of_refusals_has_few_entries(admin: httpx.Client) -> None:
     # A key that was used is not affected by invalid ones of the same address.
     assert admin.get("/limits").status_code == 200

@@ -9,7 +9,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import http_problem_answer, problem_answer
 from service.security.access_control import REFUSALS, AccessControl, routed_path
-from service.security.audit import AUDITED_REFUSALS, CLIENT_CLOSED, READING, AuditTrail, entry_of, is_audited
+from service.security.audit import AUDITED_REFUSALS, CLIENT_CLOSED, READING, REFUSED, AuditTrail, entry_of, is_audited
 from service.security.permissions import OPEN_PATHS, Caller, put_caller
 
 
@@ -43,7 +43,19 @@ class AuthorisationMiddleware:
         if is_audited(scope):
             await self._audited(trail, access, caller, scope, receive, send)
         else:
-            await self._handle(access, caller, scope, receive, send)
+            await self._refusing(trail, access, caller, scope, receive, send)
+
+    async def _refusing(
+        self, trail: AuditTrail, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        """Handle a request whose entry is stored only if its route refuses it."""
+
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] in REFUSED:
+                trail.count(entry_of(scope, message["status"], caller=caller))
+            await send(message)
+
+        await self._handle(access, caller, scope, receive, sending)
 
     async def _audited(
         self, trail: AuditTrail, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send
