@@ -41,7 +41,7 @@ REFUSALS = (
 _NO_KEY = "an API key is required: send `Authorization: Bearer lalaloc_...`"
 _MALFORMED = "the Authorization header must be `Bearer lalaloc_...`, with one API key"
 _TOKEN_TOO = ", or a token of the issuer"
-_REFUSED = "the API key '{}' is unknown or revoked; ask the operator of the service for a valid one"
+_REFUSED = "the API key is unknown or revoked; ask the operator of the service for a valid one"
 
 
 class AccessControl:
@@ -158,7 +158,7 @@ class AccessControl:
                     await self._rates.check_refused(client)
                 identity = await self._holder_of_key(request, presented)
                 if identity is None:
-                    raise UnauthenticatedError(_REFUSED.format(presented.id))
+                    raise UnauthenticatedError(_REFUSED)
                 return identity
             token = parse_token(values)
             if self._tokens is None or token is None:
