@@ -11,6 +11,7 @@ import pytest
 import shapely
 import torch
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
@@ -24,6 +25,7 @@ from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 from lalaloc_core.learn.synth.records import Column, Joined, Records
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
 from lalaloc_core.learn.synth.scene.facts import FACTS, facts_of
 from lalaloc_core.learn.synth.scene.leaves import boards, hang_leaves
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
@@ -136,14 +138,14 @@ def test_empty_staged_rooms_have_no_mirrors_or_fittings(materials: MaterialLibra
             assert not build_scene(shot, materials).facts & {"mirror", "bare_bright"}
 
 
-@given(seed=seeds())
+@given(seed=seeds(), fitted=st.booleans())
 @settings(max_examples=25)
-def test_built_in_furniture_stays_in_its_room_clear_of_doors(seed: int) -> None:
+def test_built_in_furniture_stays_in_its_room_clear_of_doors(seed: int, fitted: bool) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     for index, room in enumerate(home.plan.rooms):
         openings = [opening for opening in home.openings if opening.room == index]
-        for prism in furnish(room, openings, "empty", rng, built_in=True):
+        for prism in furnish(room, openings, "empty", rng, built_in=True, fitted=fitted):
             footprint = rectangle(
                 np.array([prism.x, prism.y]), np.array([prism.axis_x, prism.axis_y]), prism.half_a, prism.half_b
             )
@@ -153,6 +155,41 @@ def test_built_in_furniture_stays_in_its_room_clear_of_doors(seed: int) -> None:
                 start, along, inwards = wall_frame(room, opening.wall)
                 before = start + along * 0.5 * (opening.start_m + opening.end_m) + inwards * 0.1
                 assert opening.kind == "window" or not footprint.contains(shapely.Point(before))
+
+
+@given(seed=seeds())
+@settings(max_examples=25)
+def test_ceiling_boxes_stay_in_their_room_above_camera_and_openings(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = generate_home(rng)
+    for index, room in enumerate(home.plan.rooms):
+        openings = [opening for opening in home.openings if opening.room == index]
+        camera_m = rng.uniform(0.5, room.ceiling_height_m - 0.3)
+        for prism in ceiling_boxes(room, openings, camera_m, rng):
+            assert camera_m < prism.z0 < prism.z1 == room.ceiling_height_m
+            axis = np.array([prism.axis_x, prism.axis_y])
+            footprint = rectangle(np.array([prism.x, prism.y]), axis, prism.half_a, prism.half_b)
+            assert footprint.difference(room.shape.buffer(0.01)).area <= 0.01 * footprint.area
+            if prism.finish != "paint":
+                continue
+            # Beams cross windows above their head only in height; soffits and slopes keep clear of them.
+            for opening in openings:
+                start, along, inwards = wall_frame(room, opening.wall)
+                before = start + along * 0.5 * (opening.start_m + opening.end_m) + inwards * 0.05
+                parallel = abs(float(axis @ along)) > 0.99
+                assert not parallel or prism.z0 > opening.head_m or not footprint.contains(shapely.Point(before))
+
+
+def test_only_fitted_rooms_have_uneven_ceilings() -> None:
+    shots = [dataclasses.replace(shot, is_fitted=fitted) for shot in shots_of(12) for fitted in (False, True)]
+    materials = MaterialLibrary.create(np.random.default_rng(0))
+    hanging = []
+    for shot in shots:
+        top = shot.home.plan.rooms[shot.room_index].ceiling_height_m
+        prisms = build_scene(shot, materials).prisms
+        hanging.append(int(((prisms.z1_m == top) & (prisms.z0_m > shot.camera_height_m)).sum()))
+    assert not any(hanging[::2])
+    assert sum(count > 0 for count in hanging[1::2]) > len(shots) / 4
 
 
 def test_leaves_stay_in_their_rooms_at_every_angle() -> None:

@@ -39,6 +39,8 @@ _CAMERA_HEIGHTS_M = (0.5, 2.2)
 _HARD_SHARE = 0.25
 # Share of generated panoramas at night.
 _NIGHT_SHARE = 0.12
+# Share of generated panoramas with uneven ceilings, and with kitchens and closets as in real homes.
+_FITTED_SHARE = 0.4
 _SCENES_CACHED = 256
 _PICTURE_BYTES_CACHED = 1 << 28
 # Consecutive visits without a sample that indicate a fault of the generator.
@@ -178,6 +180,7 @@ class GeneratedSource:
             hard_share=_HARD_SHARE,
             unusual_heights_m=_CAMERA_HEIGHTS_M,
             night_share=_NIGHT_SHARE,
+            fitted_share=_FITTED_SHARE,
         )
         # Created on first use, so that it is not sent to worker processes.
         self._renderers = self._renderers or self._renderers_on("cpu")

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box
-from lalaloc_core.learn.synth.furniture.pieces_living import wardrobe_run
+from lalaloc_core.learn.synth.furniture.pieces_living import shelf_run, wardrobe_run
 from lalaloc_core.learn.synth.furniture.pieces_service import (
     COUNTER_DEPTH_M,
     bathtub,
     counter_run,
+    fridge,
     shower,
     toilet,
     washbasin,
@@ -25,6 +26,9 @@ from lalaloc_core.learn.synth.furniture.pieces_service import (
 _MIN_RUN_M = 1.2
 _MAX_RUN_M = 6.0
 _TALL_UNIT_M = 0.6
+# Width of the place of a fridge.
+_FRIDGE_M = 0.92
+_MAX_SHELVED_WALLS = 3
 
 
 class Stretch(NamedTuple):
@@ -51,11 +55,17 @@ class Placed(NamedTuple):
 
 
 def kitchen(
-    stretches: list[Stretch], lengths_m: Float[np.ndarray, "n"], ceiling_m: float, rng: np.random.Generator
+    stretches: list[Stretch],
+    lengths_m: Float[np.ndarray, "n"],
+    ceiling_m: float,
+    rng: np.random.Generator,
+    *,
+    fitted: bool = False,
 ) -> list[Placed]:
     """Return a run of units along a wall, sometimes around a corner, with tall units, an island or a peninsula.
 
-    `stretches` are free stretches of wall, and `lengths_m` the lengths of the room's walls, in order.
+    `stretches` are free stretches of wall, and `lengths_m` the lengths of the room's walls, in order. A `fitted`
+    kitchen has a fridge in its run, wall units up to the ceiling, and things on its worktops.
     """
     usable = [stretch for stretch in stretches if stretch.length_m > _MIN_RUN_M]
     if not usable:
@@ -70,6 +80,10 @@ def kitchen(
     height = rng.uniform(0.85, 0.95)
     has_wall_units = rng.random() < 0.75 and not main.has_window
     placed = []
+    if fitted and length > _MIN_RUN_M + _FRIDGE_M:
+        at_start = rng.random() < 0.5
+        placed.append(Placed(fridge(rng), main.wall, start + 0.46 if at_start else start + length - 0.46))
+        start, length = start + (_FRIDGE_M if at_start else 0.0), length - _FRIDGE_M
     if length > _MIN_RUN_M + _TALL_UNIT_M and rng.random() < 0.5 and not main.has_window:
         # A tall unit or a fridge closes the run on one side.
         top = min(rng.uniform(1.9, 2.4), ceiling_m - 0.02)
@@ -78,7 +92,11 @@ def kitchen(
         placed.append(Placed(tall, main.wall, start + 0.3 if at_start else start + length - 0.3))
         start, length = start + (_TALL_UNIT_M if at_start else 0.0), length - _TALL_UNIT_M
     placed.append(
-        Placed(counter_run(rng, length, height, body, wall_units=has_wall_units), main.wall, start + 0.5 * length)
+        Placed(
+            counter_run(rng, length, height, body, wall_units=has_wall_units, ceiling_m=ceiling_m if fitted else None),
+            main.wall,
+            start + 0.5 * length,
+        )
     )
     placed += _around_the_corner(stretches, lengths_m, main, (start, start + length), height, body, rng)
     kind = rng.random()
@@ -104,6 +122,21 @@ def wardrobes(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generat
     width = chosen.length_m if rng.random() < 0.75 else rng.uniform(0.9, chosen.length_m)
     start = chosen.start_m if rng.random() < 0.5 else chosen.end_m - width
     return [Placed(wardrobe_run(rng, width - 0.01, height), chosen.wall, start + 0.5 * width)]
+
+
+def closet_shelves(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generator) -> list[Placed]:
+    """Return open shelves and rails with clothes along one to three walls of a walk-in closet."""
+    depth, height = rng.uniform(0.3, 0.6), min(rng.uniform(1.9, 2.4), ceiling_m - 0.02)
+    usable = sorted((s for s in stretches if s.length_m > 0.6 and not s.has_window), key=lambda s: -s.length_m)
+    placed: list[Placed] = []
+    for stretch in usable[: int(rng.integers(1, _MAX_SHELVED_WALLS + 1))]:
+        # Later runs leave the corners to earlier ones.
+        margin = depth + 0.02 if placed else 0.0
+        length = stretch.length_m - 2 * margin - 0.01
+        if length > 0.5:
+            middle = 0.5 * (stretch.start_m + stretch.end_m)
+            placed.append(Placed(shelf_run(rng, length, depth, height), stretch.wall, middle))
+    return placed
 
 
 def sanitary(rng: np.random.Generator) -> list[Piece]:

@@ -10,7 +10,14 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
-from lalaloc_core.learn.synth.furniture.built_in import Placed, Stretch, kitchen, sanitary, wardrobes
+from lalaloc_core.learn.synth.furniture.built_in import (
+    Placed,
+    Stretch,
+    closet_shelves,
+    kitchen,
+    sanitary,
+    wardrobes,
+)
 from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
 from lalaloc_core.learn.synth.furniture.pieces import Finish, Label, Maker, Piece, box, cylinder
 from lalaloc_core.learn.synth.furniture.pieces_service import counter, island
@@ -157,12 +164,13 @@ def furnish(
     camera_m: Float[np.ndarray, "2"] | None = None,
     *,
     built_in: bool = False,
+    fitted: bool = False,
 ) -> list[Prism]:
     """Furnish one room.
 
     The room's name decides its furniture. The floor before doors and windows above the sill stays free, and everything
     keeps `CAMERA_CLEARANCE_M` away from `camera_m`. `built_in` builds kitchens, bathrooms and wardrobes in where they
-    belong, in empty rooms too.
+    belong, in empty rooms too; `fitted` equips them as in real homes.
     """
     most = _MAX_PIECES[level]
     if most == 0 and not built_in:
@@ -171,7 +179,7 @@ def furnish(
     if camera_m is not None:
         keep_clear.append(shapely.Point(camera_m).buffer(CAMERA_CLEARANCE_M + 0.01))
     floor = _Floor(room, openings, keep_clear)
-    prisms = _build_in(floor, room, rng) if built_in else []
+    prisms = _build_in(floor, room, rng, fitted=fitted) if built_in else []
     first = 1 + max((prism.piece for prism in prisms), default=-1)
     has_kitchen = any(prism.label == "counter" for prism in prisms)
     placed = refused = 0
@@ -192,13 +200,15 @@ def furnish(
     return prisms + (_rugs(floor, rng, first_number=first + placed) if most else [])
 
 
-def _build_in(floor: _Floor, room: Room, rng: np.random.Generator) -> list[Prism]:
+def _build_in(floor: _Floor, room: Room, rng: np.random.Generator, *, fitted: bool) -> list[Prism]:
     """Return the built-in furniture of a room; pieces of one kitchen share a number, hence their looks."""
     kind = room.name.split()[0]
     stretches, lengths = floor.stretches()
     groups: list[list[Placed]] = []
     if rng.random() < _KITCHEN_CHANCE.get(kind, 0.0):
-        groups.append(kitchen(stretches, lengths, room.ceiling_height_m, rng))
+        groups.append(kitchen(stretches, lengths, room.ceiling_height_m, rng, fitted=fitted))
+    if fitted and kind in ("closet", "storage"):
+        groups.append(closet_shelves(stretches, room.ceiling_height_m, rng))
     if rng.random() < _WARDROBE_CHANCE.get(kind, 0.1):
         groups.append(wardrobes(stretches, room.ceiling_height_m, rng))
     prisms: list[Prism] = []

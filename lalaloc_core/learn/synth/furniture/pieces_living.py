@@ -149,6 +149,31 @@ def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece
     return Piece(width, depth, tuple(parts))
 
 
+def shelf_run(rng: np.random.Generator, width: float, depth: float, height: float) -> Piece:
+    """Return open bays of a width, depth and height (m): boards with boxes, or a rail with clothes."""
+    bays, hy = max(1, round(width / rng.uniform(0.6, 1.1))), 0.5 * depth
+    body = cast(Finish, "white" if rng.random() < 0.7 else "wood")
+    half = 0.5 * width / bays
+    parts = [box(at=(0.0, 0.0), half=(0.5 * width, hy), z=(height - 0.025, height), finish=body)]
+    for bay in range(bays):
+        x = -0.5 * width + (2 * bay + 1) * half
+        parts.append(box(at=(x - half + 0.01, 0.0), half=(0.01, hy), z=(0.0, height), finish=body))
+        has_rail = rng.random() < 0.5
+        levels = [rng.uniform(1.5, height - 0.15)] if has_rail else np.arange(0.1, height - 0.3, rng.uniform(0.3, 0.5))
+        for level in levels:
+            stuff = cast(Finish, ("fabric", "accent", "dark", "paint", "white")[int(rng.integers(5))])
+            span = half * rng.uniform(0.3, 0.9)
+            if has_rail:
+                hem = rng.uniform(0.3, 1.0)
+                parts.append(box(at=(x, 0.0), half=(span, 0.8 * hy), z=(hem, level), finish=stuff))
+                continue
+            parts.append(box(at=(x, 0.0), half=(half, hy), z=(level, level + 0.025), finish=body))
+            if rng.random() < 0.7:
+                top = level + rng.uniform(0.08, 0.28)
+                parts.append(box(at=(x, 0.0), half=(span, 0.8 * hy), z=(level + 0.025, top), finish=stuff))
+    return Piece(width, depth, tuple(parts))
+
+
 def bookcase(rng: np.random.Generator) -> Piece:
     """Return uprights, boards and books."""
     width, depth, height = rng.uniform(0.6, 1.8), rng.uniform(0.25, 0.4), rng.uniform(0.8, 2.3)

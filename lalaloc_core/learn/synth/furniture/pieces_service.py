@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box, cylinder
+from lalaloc_core.learn.synth.furniture.pieces import Finish, Part, Piece, box, cylinder
 
 COUNTER_DEPTH_M = 0.62
 _UNIT_M = 0.6
@@ -17,8 +17,19 @@ def counter(rng: np.random.Generator) -> Piece:
     return counter_run(rng, width, rng.uniform(0.85, 0.95), body, wall_units=bool(rng.random() < 0.75))
 
 
-def counter_run(rng: np.random.Generator, width: float, height: float, body: Finish, *, wall_units: bool) -> Piece:
-    """Return a run of kitchen units of a width and height (m)."""
+def counter_run(
+    rng: np.random.Generator,
+    width: float,
+    height: float,
+    body: Finish,
+    *,
+    wall_units: bool,
+    ceiling_m: float | None = None,
+) -> Piece:
+    """Return a run of kitchen units of a width and height (m).
+
+    With the height of the ceiling, there are things on the worktop, and wall units may reach the ceiling.
+    """
     units = max(1, round(width / _UNIT_M))
     unit, depth = width / units, COUNTER_DEPTH_M
     hx, hy = 0.5 * width, 0.5 * depth
@@ -46,11 +57,32 @@ def counter_run(rng: np.random.Generator, width: float, height: float, body: Fin
         parts.append(box(at=(x, hy - 0.01), half=(0.25 * unit, 0.01), z=(height - 0.14, height - 0.12), finish="metal"))
     if wall_units:
         bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.15)
+        if ceiling_m is not None:
+            top = min(top, ceiling_m - 0.01)
+            if rng.random() < 0.3:
+                top = ceiling_m - 0.01
+            elif rng.random() < 0.4:
+                # A box of plaster closes the gap to the ceiling.
+                parts.append(box(at=(0.0, -hy + 0.18), half=(hx, 0.18), z=(top, ceiling_m - 0.01), finish="white"))
         for k in range(units):
             if rng.random() < 0.85:
                 x = -hx + unit * (k + 0.5)
                 parts.append(box(at=(x, -hy + 0.17), half=(0.495 * unit, 0.17), z=(bottom, top), finish=body))
+    if ceiling_m is not None:
+        parts += _on_worktop(rng, hx, height)
     return Piece(width, depth, tuple(parts), label="counter")
+
+
+def _on_worktop(rng: np.random.Generator, half_width: float, height: float) -> list[Part]:
+    """Return appliances and jars on a worktop."""
+    parts = []
+    for _ in range(int(rng.integers(1, 2 + round(3 * half_width)))):
+        finish: Finish = ("metal", "white", "dark", "accent", "wood", "ceramic")[int(rng.integers(6))]
+        shape, half = (box, rng.uniform(0.05, 0.25)) if rng.random() < 0.6 else (cylinder, rng.uniform(0.03, 0.09))
+        x, y = rng.uniform(-1.0, 1.0) * max(half_width - half, 0.0), rng.uniform(-0.2, 0.05)
+        top = height + rng.uniform(0.08, 0.38)
+        parts.append(shape(at=(x, y), half=(half, min(half, 0.15)), z=(height, top), finish=finish))
+    return parts
 
 
 def island(rng: np.random.Generator) -> Piece:

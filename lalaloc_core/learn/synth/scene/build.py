@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from lalaloc_core.learn.synth.camera.exposure import sample_exposure, sample_staged_exposure
 from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel, furnish
+from lalaloc_core.learn.synth.furniture.pieces import Finish
 from lalaloc_core.learn.synth.homes.openings import Opening
+from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
 from lalaloc_core.learn.synth.scene.doors import add_door
 from lalaloc_core.learn.synth.scene.lighting import Lighting, light_room, relit, sample_backdrop
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.mirrors import add_mirror, sample_mirror
-from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene
+from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, VisibleRooms
 from lalaloc_core.learn.synth.scene.shells import Shells
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
@@ -89,6 +91,17 @@ class _Builder:
         for opening in self._openings_of(room_index):
             self._add_opening(first + opening.wall, opening, is_own=slot == 0)
         self._furnish(room_index, is_own=slot == 0)
+        if slot == 0 and self._shot.is_fitted:
+            self._lower_ceiling()
+
+    def _lower_ceiling(self) -> None:
+        """Add boxes below the ceiling of the own room, most of them of its surface."""
+        tables = self._tables
+        surfaces: dict[Finish, int] = {"paint": int(VisibleRooms.stacked(tables.rooms).ceiling_surface[0])}
+        for box in ceiling_boxes(self._room, self._openings, self._shot.camera_height_m, self._rng):
+            if box.finish not in surfaces:
+                surfaces[box.finish] = tables.surfaces.add_finish(box.finish)
+            tables.add_prism(box, surfaces[box.finish])
 
     def _add_opening(self, wall: int, opening: Opening, *, is_own: bool) -> None:
         """Add a window, or a door that is see-through in the camera's own room."""
@@ -113,7 +126,7 @@ class _Builder:
         # The empty rooms of a staged home are bare; others keep what is built in.
         built_in = not (self._streams.is_staged and level == "empty")
         room, openings = self._home.plan.rooms[room_index], self._openings_of(room_index)
-        pieces = furnish(room, openings, level, self._rng, camera, built_in=built_in)
+        pieces = furnish(room, openings, level, self._rng, camera, built_in=built_in, fitted=self._shot.is_fitted)
         if is_own:
             self._facts |= {prism.label for prism in pieces if prism.label}
         self._tables.add_pieces(pieces)

@@ -37,6 +37,7 @@ class Shot:
         lighting: colour of all light; None draws one. A shot with lighting is *staged*: shots of one home with the same
             seed show the same materials, whatever their furniture and lighting, and there is no tripod.
         is_night: dark outdoors, and lamps on.
+        is_fitted: beams, soffits or slopes below the ceiling, and kitchens and closets fitted as in real homes.
     """
 
     home: Home
@@ -48,6 +49,7 @@ class Shot:
     seed: int
     lighting: Mood | None = None
     is_night: bool = False
+    is_fitted: bool = False
 
 
 def sample_shots(
@@ -60,6 +62,7 @@ def sample_shots(
     hard_share: float = 0.0,
     unusual_heights_m: tuple[float, float] = (1.0, 1.9),
     night_share: float = 0.0,
+    fitted_share: float = 0.0,
 ) -> list[Shot]:
     """Draw shots uniformly over a home's floor.
 
@@ -67,7 +70,7 @@ def sample_shots(
     uniformly first, which favours closets and corridors; `hard_share` the share from rare places that are hard to
     localise: close to a wall, on the threshold of an open door or in it, in the narrowest rooms. `unusual_heights_m` is
     the range of camera heights of the quarter that is not taken from 1.3 to 1.7 m. Shots at night (`night_share`) have
-    black windows.
+    black windows; `fitted_share` is the share of `Shot.is_fitted`.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
     by_room = np.flatnonzero(rng.random(count) < by_room_share)
@@ -92,6 +95,7 @@ def sample_shots(
                 furniture=level or FURNITURE_LEVELS[int(rng.choice(3, p=_LEVEL_SHARES))],
                 seed=int(rng.integers(1 << 62)),
                 is_night=bool(night_share) and rng.random() < night_share,
+                is_fitted=bool(fitted_share) and rng.random() < fitted_share,
             )
         )
     return shots
