@@ -123,6 +123,8 @@ class ImageStageConfig:
         photographs_per_batch: photographs added to each batch.
         style_mixing: share of a batch whose early features take on another picture's style, every other time that of a
             photograph; needs photographs.
+        hidden_share: share of the pictures that show only a part of the horizon, 0.15 to 0.6 of the circle, so that
+            walls are read where they are seen (architectures `ring` and `trunk`).
         ema_decay: decay per step of the averaged weights, which are validated and shipped; 0 turns averaging off.
     """
 
@@ -151,6 +153,7 @@ class ImageStageConfig:
     photograph_profile_weight: float = 0.0
     photographs_per_batch: int = 4
     style_mixing: float = 0.0
+    hidden_share: float = 0.0
     ema_decay: float = 0.0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
 
@@ -203,7 +206,11 @@ class TrainConfig:
         for name in ("uses_per_panorama", "replay_panoramas", "photographs_per_batch"):
             if getattr(image, name) < 1:
                 raise ConfigError(f"config.image.{name} is {getattr(image, name)}; the minimum is 1")
-        for name in ("photometric", "optics", "opening_balance"):
+        if image.hidden_share and not self.has_ring:
+            raise ConfigError(
+                f"config.image.hidden_share is {image.hidden_share:g}; architecture 'paper' supports 0 only"
+            )
+        for name in ("photometric", "optics", "opening_balance", "hidden_share"):
             if not 0.0 <= getattr(image, name) <= 1.0:
                 raise ConfigError(f"config.image.{name} is {getattr(image, name):g}; it must lie between 0 and 1")
         if self.architecture != "trunk":

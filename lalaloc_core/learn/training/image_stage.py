@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
@@ -21,6 +23,11 @@ from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+
+# Part of the horizon, in turns, that is seen in pictures with hidden sectors.
+_SEEN_TURNS = (0.15, 0.6)
+# Value of hidden pixels, zero after normalisation.
+_HIDDEN_GREY = 127
 
 
 class ImageStage(TrainingStage):
@@ -81,15 +88,19 @@ class ImageStage(TrainingStage):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            features, photograph_terms = self._encode(batch)
-            latent = self.teacher.head(features.ring)
+            seen = self._draw_seen(len(ring))
+            features, photograph_terms = self._encode(batch, seen)
+            # The latent needs all sectors: the teacher's stand in for hidden ones.
+            seen_ring = torch.where(seen[:, None], features.ring, ring)
+            latent = self.teacher.head(seen_ring)
+            known = seen.repeat_interleave(self.config.profile_columns // seen.shape[1], dim=1)
             if features.structure is not None:
-                terms |= self._structure_losses(features.structure, batch)
+                terms |= self._structure_losses(features.structure, batch, known)
             terms |= photograph_terms
             if settings.ring_weight:
-                terms["ring"] = settings.ring_weight * losses.ring_distillation(features.ring, ring)
+                terms["ring"] = settings.ring_weight * losses.ring_distillation(seen_ring, ring)
             if settings.profile_weight:
-                likelihood = losses.laplace(features.log_profile, features.log_scale, batch["profile_m"])
+                likelihood = losses.laplace(features.log_profile, features.log_scale, batch["profile_m"], known)
                 terms["profile"] = settings.profile_weight * likelihood
         else:
             with torch.no_grad():
@@ -101,14 +112,16 @@ class ImageStage(TrainingStage):
             terms |= self._distance_losses(latent.float(), target.float(), batch)
         return terms
 
-    def _encode(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
+    def _encode(self, batch: Batch, seen: Bool[Tensor, "b s"]) -> tuple[ImageFeatures, dict[str, Tensor]]:
         """Return the features of a batch's panoramas, and the loss of the photographs encoded with them."""
         settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
         if self.photographs is None or not (settings.photograph_weight or settings.photograph_profile_weight):
-            return self.encoder(self._augment(image), height), {}
+            return self.encoder(self._hide(self._augment(image), seen), height), {}
         count, columns = settings.photographs_per_batch, self.config.profile_columns
         photographs = self.photographs.draw(count, columns, self._generator(torch.device("cpu")))
+        photograph_seen = self._draw_seen(count)
         images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
+        images = self._hide(images, torch.cat([seen, photograph_seen]))
         # The camera height of photographs is unknown, so their unit of length is the camera height.
         heights = torch.cat([height, height.new_ones(count)])
         styles = sample_styles(
@@ -121,16 +134,23 @@ class ImageStage(TrainingStage):
         )
         photograph_rows = slice(len(image), None)
         logits = features.structure.opening_logits[photograph_rows]
-        openings_loss = losses.teacher_openings(logits, openings)
+        known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
+        openings_loss = losses.teacher_openings(logits[known][None], openings[known][None])
         walls_loss = losses.teacher_walls(
-            features.log_profile[photograph_rows], features.log_scale[photograph_rows], log_distance, logits
+            features.log_profile[photograph_rows],
+            features.log_scale[photograph_rows],
+            torch.where(known, log_distance, torch.nan),
+            logits,
         )
         total = settings.photograph_weight * openings_loss + settings.photograph_profile_weight * walls_loss
         return first_rows(features, len(image)), {"photographs": total}
 
-    def _structure_losses(self, features: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
+    def _structure_losses(
+        self, features: StructureFeatures, batch: Batch, known: Bool[Tensor, "b w"]
+    ) -> dict[str, Tensor]:
         """Return the losses on openings, ceiling height and room type."""
-        settings, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
+        settings, room_type = self.settings, batch["room_type"]
+        kind = torch.where(known, batch["opening_kind"], UNKNOWN)
         assert isinstance(self.encoder, TrunkImageEncoder)
         self.encoder.update_class_shares(kind, room_type)
         terms = {}
@@ -155,6 +175,24 @@ class ImageStage(TrainingStage):
             if self.settings.optics:
                 image = optics(image.float(), self.settings.optics, self._generator(image.device))
         return image
+
+    def _draw_seen(self, count: int) -> Bool[Tensor, "b s"]:
+        """Draw the sectors that pictures show: all, or in a share of the pictures a part of the horizon."""
+        sectors, device = self.config.ring.sectors, next(self.encoder.parameters()).device
+        if not self.settings.hidden_share:
+            return torch.ones(count, sectors, dtype=torch.bool, device=device)
+        generator = self._generator(torch.device("cpu"))
+        first, width, hidden = torch.rand(3, count, 1, generator=generator)
+        width = _SEEN_TURNS[0] + (_SEEN_TURNS[1] - _SEEN_TURNS[0]) * width
+        offset = (torch.arange(sectors) / sectors - first) % 1.0
+        return ((hidden >= self.settings.hidden_share) | (offset < width)).to(device)
+
+    def _hide(self, image: Tensor, seen: Bool[Tensor, "b s"]) -> Tensor:
+        """Paint the hidden sectors grey."""
+        if not self.settings.hidden_share:
+            return image
+        columns = seen.repeat_interleave(image.shape[2] // seen.shape[1], dim=1)
+        return torch.where(columns[:, None, :, None], image, torch.full_like(image, _HIDDEN_GREY))
 
     def _generator(self, device: torch.device) -> torch.Generator:
         if device not in self._generators:

@@ -59,11 +59,17 @@ def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b
 
 
 def laplace(
-    log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], profile_m: Float[Tensor, "b w"]
+    log_profile: Float[Tensor, "b w"],
+    log_scale: Float[Tensor, "b w"],
+    profile_m: Float[Tensor, "b w"],
+    known: Bool[Tensor, "b w"] | None = None,
 ) -> Tensor:
-    """Return the negative log likelihood of the true log wall profile under the predicted Laplace distributions."""
+    """Return the negative log likelihood of true log distances under predicted Laplace distributions, where known."""
     error = (log_profile - torch.log(profile_m)).abs()
-    return (error * torch.exp(-log_scale) + log_scale).mean()
+    loss = error * torch.exp(-log_scale) + log_scale
+    if known is None:
+        return loss.mean()
+    return (loss * known).sum() / known.sum().clamp_min(1)
 
 
 def laplace_mixture(
