@@ -103,7 +103,7 @@ def test_pdf_levels_of_a_file_and_a_photograph_lead_to_an_answer(
             page.locator("#plan-file").set_input_files(tmp_path / "house.geojson")
             page.get_by_role("button", name="Import all levels as a venue").click()
             expect(page.locator("#venue-bar")).to_be_visible()
-            expect(page.locator("#venue-plan option")).to_have_text(["0", "1"])
+            expect(page.locator("#venue-plan option")).to_have_text(["Level 0", "Level 1"])
             page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
             visited.find()
             # An answer that is higher than the window begins at its top.
