@@ -118,7 +118,12 @@ def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str,
             continue
         place = answer["position"]["x_m"], answer["position"]["y_m"]
         ((longitude, latitude),) = plan.anchor.to_earth(np.array([place])).tolist()
-        properties = {name: answer[name] for name in ("photograph", "room", "confidence")}
+        confidence = answer["confidence"]
+        properties = {
+            "photograph": answer["photograph"],
+            "room": answer["room"],
+            "confidence": None if confidence is None else round(confidence, 4),
+        }
         azimuth_deg = plan.anchor.true_azimuth_deg(place, answer["heading_deg"])
         features.append(
             {

@@ -14,7 +14,12 @@ import pytest
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, split_renderer_cache
+from lalaloc_core.learn.synth.homes.splits import VALIDATION, home_of
+from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import localise
@@ -24,7 +29,7 @@ from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, SequenceRefiner, localise_sequence
+from lalaloc_core.localise.sequence.search import SequenceLocalisation, SequenceRefiner, linked, localise_sequence
 from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, present, rectangle
@@ -354,3 +359,79 @@ class TestSearch:
     def test_wrong_number_of_motions_is_refused(self, search: Search, walk_queries: list[Query]) -> None:
         with pytest.raises(InvalidMotionError, match="1 motions are given; 3 pictures need 2"):
             search(walk_queries, [Motion()])
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Bundle:
+    return Bundle.open(default_bundle())
+
+
+class TestConfidence:
+    """Walks through furnished homes, with the shipped model, exact odometry and a height for each photograph."""
+
+    HOMES, HEIGHTS_M, STATED_M = (0, 6, 17), (1.25, 1.65, 1.45), 1.45
+    # Joint refinement moves a pose from where its own walls fit best.
+    TOLERANCE = 0.05
+
+    @pytest.mark.parametrize("index", HOMES)
+    @pytest.mark.parametrize("heights", ["each", "one"])
+    def test_sequence_is_as_sure_as_its_photographs(self, shipped: Bundle, index: int, heights: str) -> None:
+        encoders, refiner = Encoders(shipped, threads=1), local_refiner(shipped)
+        home, rng = home_of(VALIDATION, 0, index)
+        shots = [
+            replace(shot, camera_height_m=height_m)
+            for shot, height_m in zip(sample_shots(home, 3, rng, "full"), self.HEIGHTS_M, strict=True)
+        ]
+        stated = CameraHeight(self.STATED_M)
+        renderers = split_renderer_cache(VALIDATION, 0, None)
+        size = shipped.manifest.image_height, shipped.manifest.image_width
+        queries = [
+            encoders.query(
+                RenderedPhotograph(shot, renderers).image(*size),
+                None,
+                stated.at(shot.camera_height_m) if heights == "each" else stated,
+            )
+            for shot in shots
+        ]
+        walk = [((shot.position_m[0], shot.position_m[1]), shot.room_index, shot.heading) for shot in shots]
+        grid = build_grid(home.plan, encoders, step_m=STEP_M, camera_height_m=self.STATED_M, latents=False)
+        alone = [localise(home.plan, grid, encoders, query, refiner=refiner) for query in queries]
+        together = localise_sequence(home.plan, grid, encoders, queries, motions_along(walk), refiner=refine_sequence)
+        assert together.motions_contradicted == ()
+        model = shipped.manifest.confidence_for(view=False)
+        sure = [present(picture.confidence(model)).position for picture in alone]
+        joint = [present(picture.confidence(model)).position for picture in together.pictures]
+        assert min(joint) > max(sure) - self.TOLERANCE
+        assert present(together.confidence(shipped.manifest)) > max(sure) - self.TOLERANCE
+        for shot, picture in zip(shots, together.pictures, strict=True):
+            assert np.linalg.norm(picture.candidates[0].position_m - shot.position_m) < 1.0
+
+    @pytest.mark.parametrize(
+        ("motions", "missed", "expected"),
+        [
+            ([Motion(distance_m=1.0), Motion(distance_m=2.0)], (), (0.9, 0.9, 0.9)),
+            ([Motion(distance_m=1.0), Motion(distance_m=2.0)], (1,), (0.9, 0.9, 0.3)),
+            ([Motion(distance_m=1.0), Motion(turn=0.5)], (), (0.9, 0.9, 0.3)),
+            ([Motion(), Motion(distance_m=2.0)], (), (0.2, 0.9, 0.9)),
+        ],
+    )
+    def test_fit_holds_for_photographs_that_are_linked(
+        self,
+        search: Search,
+        walk_queries: list[Query],
+        shipped: Bundle,
+        monkeypatch: pytest.MonkeyPatch,
+        motions: list[Motion],
+        missed: tuple[int, ...],
+        expected: tuple[float, ...],
+    ) -> None:
+        found = search(walk_queries, [Motion()] * 2)
+        own = dict(zip((picture.signals["retrieval"].cost for picture in found.pictures), (0.2, 0.9, 0.3), strict=True))
+        manifest = shipped.manifest
+        model = present(manifest.confidence_for(view=False))
+        monkeypatch.setattr(type(model), "fit_probability", lambda self, stage, signals, **_: own[signals["cost"]])
+        pictures = linked([replace(picture, linked_fit=0.0) for picture in found.pictures], motions, missed, manifest)
+        fits = [present(picture.confidence(model)).fit for picture in pictures]
+        assert fits == pytest.approx(expected)
+        # A photograph can be of a plan that was not searched.
+        assert present(pictures[0].confidence(model, 0.5)).fit == pytest.approx(0.5 * expected[0])

@@ -12,6 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D
 from PIL import Image, ImageDraw, ImageFont
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -100,6 +105,40 @@ class PrintedPlan:
         self._text(position, f"{end - start:.2f}", 90.0 if is_vertical else 0.0)
 
 
+class OutlinedPlan(PrintedPlan):
+    """The same flat as a PDF at 1:50 whose letters are drawn as areas, beside the number of the sheet as a text."""
+
+    def __post_init__(self) -> None:
+        sides_m = 9.3 + 2 * self.margin_m, 6.4 + 2 * self.margin_m
+        self.figure = Figure(figsize=(sides_m[0] / 50 / 0.0254, sides_m[1] / 50 / 0.0254))
+        self.axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        self.axes.set(xlim=(-self.margin_m, 9.3 + self.margin_m), ylim=(-self.margin_m, 6.4 + self.margin_m))
+        self.axes.set_axis_off()
+        super().__post_init__()
+
+    def pdf(self, sheet: str) -> bytes:
+        """Return the page with the number of the sheet in its corner."""
+        self.axes.text(7.0, -1.6, sheet)
+        stream = io.BytesIO()
+        self.figure.savefig(stream, format="pdf")
+        return stream.getvalue()
+
+    def _box(self, bounds: tuple[float, float, float, float], grey: int) -> None:
+        x0, y0, x1, y1 = bounds
+        if grey == 0:
+            self.axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, color="black", linewidth=0.0))
+
+    def _line(self, ends: tuple[float, float, float, float], width: int = 2) -> None:
+        self.axes.plot(ends[::2], ends[1::2], "black", linewidth=0.3 * width)
+
+    def _text(self, middle: tuple[float, float], text: str, degrees: float = 0.0) -> None:
+        path = TextPath((0.0, 0.0), text, size=self.text_px / self.px_per_m, prop=FontProperties(fname=str(FONT)))
+        box = path.get_extents()
+        place = Affine2D().translate(-0.5 * (box.x0 + box.x1), -0.5 * (box.y0 + box.y1))
+        path = path.transformed(place.rotate_deg(degrees).translate(*middle))
+        self.axes.add_patch(PathPatch(path, color="black", linewidth=0.0))
+
+
 def check_flat(plan: ImportedPlan, pixels_per_metre: float | None = None) -> None:
     names = {room["name"]: room["type"] for room in plan.document["rooms"]}
     assert names == {"Wohnzimmer": "living", "Küche": "kitchen", "Bedroom": "bedroom"}
@@ -122,6 +161,21 @@ def test_printed_names_and_dimensions_of_a_scan_are_read():
     plan = import_plan(page.file("PDF", resolution=100.0), limits=LIMITS)
     check_flat(plan, page.px_per_m * 72.0 / 100.0)
     assert "page 1 was read as a picture" in plan.report.notes
+
+
+def test_letters_that_a_pdf_draws_are_read_and_are_no_pillars():
+    plan = import_plan(OutlinedPlan().pdf("Sheet A-101"), limits=LIMITS)
+    check_flat(plan, 72.0 / 0.0254 / 50.0)
+    assert plan.report.scale_source.startswith("6 dimensions")
+    assert "page 1 was read as a picture" not in plan.report.notes
+    assert not any("holes" in room for room in plan.document["rooms"])
+
+
+def test_drawn_letters_are_no_pillars_where_texts_are_not_read(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lettering, "find_spec", lambda name: None)
+    plan = import_plan(OutlinedPlan().pdf("1:50"))
+    assert plan.report.scale_source == "1:50, written in the drawing"
+    assert [room.get("holes") for room in plan.document["rooms"]] == [None] * 3
 
 
 def test_scale_that_contradicts_the_texts_gives_warnings():

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from playwright.sync_api import Browser, expect
 
+from tests.importers.test_pictures import vector_pdf
 from tests.service.conftest import FLAT, StartApp, upload
+from tests.service.test_venue_levels import geojson
 from tests.web.conftest import EXAMPLES, PHONE, visit
 from tests.web.test_answer import _assert_accessible
 
@@ -84,3 +88,23 @@ def test_venue_is_created_and_searched(browser: Browser, start_app: StartApp, tm
             page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
             visited.find()
             expect(page.locator("#answer .plan-of")).to_contain_text("level")
+
+
+def test_pdf_levels_of_a_file_and_a_photograph_lead_to_an_answer(
+    browser: Browser, start_app: StartApp, tmp_path: Path
+) -> None:
+    (tmp_path / "ground floor.pdf").write_bytes(vector_pdf())
+    (tmp_path / "house.geojson").write_bytes(geojson())
+    with start_app(tmp_path / "service") as client:
+        for visited in visit(browser, client, viewport=PHONE):
+            page = visited.open()
+            page.locator("#plan-file").set_input_files(tmp_path / "ground floor.pdf")
+            expect(page.locator("#plan-name")).to_have_text("ground floor")
+            page.locator("#plan-file").set_input_files(tmp_path / "house.geojson")
+            page.get_by_role("button", name="Import all levels as a venue").click()
+            expect(page.locator("#venue-bar")).to_be_visible()
+            expect(page.locator("#venue-plan option")).to_have_text(["Level 0", "Level 1"])
+            page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+            visited.find()
+            # An answer that is higher than the window begins at its top.
+            expect(page.locator("#answer .verdict")).to_be_in_viewport()

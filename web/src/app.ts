@@ -371,7 +371,9 @@ class Page {
       this.photos.drawStrip();
       byId<HTMLDetailsElement>("settings").open = false;
       hideGuide();
-      byId("answer").scrollIntoView({ block: "nearest" });
+      const answer = byId("answer");
+      // The nearest edge of an answer that is higher than the window is its lower one.
+      answer.scrollIntoView({ block: answer.offsetHeight > innerHeight ? "start" : "nearest" });
     } catch (error) {
       if (!signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {

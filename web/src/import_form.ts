@@ -18,6 +18,11 @@ const FIELDS: [string, string, string][] = [
 const OF_PICTURES = ["metres_per_pixel", "scale", "ceiling_height_m"];
 const MAX_NAME_LENGTH = 200;
 const PICTURES = /^image\/(png|jpeg)$/;
+const NAMELESS = /\.(png|jpe?g|pdf|svg|dxf|dwg)$/i;
+
+/** Name a plan after its file, if the format has no name of a plan. */
+export const nameAfter = (file: File): Record<string, string> =>
+  NAMELESS.test(file.name) ? { name: file.name.replace(NAMELESS, "").slice(0, MAX_NAME_LENGTH) || file.name } : {};
 
 export class ImportForm {
   private readonly inputs = new Map<string, HTMLInputElement | HTMLSelectElement>();
@@ -102,8 +107,6 @@ export class ImportForm {
     const values = Object.fromEntries(Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)));
     const distance = this.picture.knownDistance;
     if (isPicture && distance !== null) values.known_distance = distance;
-    // A picture contains no name.
-    if (isPicture) values.name = this.file.name.replace(/\.[^.]*$/, "").slice(0, MAX_NAME_LENGTH) || this.file.name;
     this.again(this.file, values);
   }
 }

@@ -70,7 +70,10 @@ export class Venues {
       byId("venue-name").textContent = venue.name;
       byId("venue-facts").textContent = `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}`
         + (more === null ? "" : `; the list shows the first ${plans.length}`);
-      show(this.choice, ...plans.map((plan) => h("option", { value: plan.floorplan_id }, planLabel(plan))));
+      // Plans of a file are named after it and their level; the list would show no more than the file.
+      const prefix = `${venue.name} – `, all = plans.every(({ name }) => name.startsWith(prefix));
+      show(this.choice, ...plans.map((plan) => h("option", { value: plan.floorplan_id },
+        all ? plan.name.slice(prefix.length) : planLabel(plan))));
       this.bar.hidden = false;
       this.draw();
       this.actions.chosen(venue);

@@ -105,15 +105,17 @@ def outcomes_of(bundle: Bundle, homes: int, split: Split, textures: Path | None)
     return [outcome_of(spot, encoder, refiner) for spot in spots(homes, split, textures)]
 
 
-def predicted_shares(manifest: Manifest, errors: Errors, spots: Sequence[Spot], draws: int = DRAWS) -> dict[str, float]:
-    """Return the mean probability by condition that photographs of spots are found, from their plans alone."""
+def predicted_shares(
+    manifest: Manifest, errors: Errors, spots: Sequence[Spot], draws: int = DRAWS
+) -> dict[str, Float[np.ndarray, "n"]]:
+    """Return the probability of each of n spots, by condition, that a photograph is found, from its plan alone."""
     rng, found = np.random.default_rng(0), {name: list[float]() for name in CONDITIONS}
     for spot in spots:
         search = Searches(spot.plan, manifest, errors, step_m=GRID_STEP_M)
         for name in CONDITIONS:
             (outcomes,) = search.draws(spot.place, name, draws, rng)
-            found[name] += [outcome.found for outcome in outcomes]
-    return {name: float(np.mean(values)) for name, values in found.items()}
+            found[name].append(float(np.mean([outcome.found for outcome in outcomes])))
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def measure_errors(bundle: Bundle, outcomes: Sequence[Outcome]) -> Bundle:
@@ -130,7 +132,7 @@ def measure_errors(bundle: Bundle, outcomes: Sequence[Outcome]) -> Bundle:
     def misses(spread: float) -> dict[str, float]:
         errors = Errors(replace(sphere, spread=spread), replace(view, spread=spread))
         predicted = predicted_shares(manifest, errors, spots, _FIT_DRAWS)
-        return {name: abs(predicted[name] - shares[name]) for name in CONDITIONS}
+        return {name: abs(float(predicted[name].mean()) - shares[name]) for name in CONDITIONS}
 
     tried = {spread: misses(spread) for spread in _SPREADS}
     return write_manifest(

@@ -42,6 +42,8 @@ _OPEN_LEAF = 1.45
 _SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z])\)?", re.IGNORECASE)
 # Width of pens that draw walls.
 _THICK_M = (0.05, 0.6)
+# Size and width of strokes of letters that are drawn as areas.
+_LETTER_M, _LETTER_STROKE_M = 0.5, 0.06
 # Lines of walls nearer to a room's outline are its own walls.
 _OFF_WALL_M = 0.03
 _MAX_SEGMENTS = 60_000
@@ -152,7 +154,7 @@ def _enclosed(drawing: Drawing, budget: Budget) -> tuple[Enclosed, str]:
         bodies = [shape for shape in named_bodies if not _is_outline(shape)]
         return enclose(bodies, _pieces([*named_lines, *outlines]), closers, check_time=budget.check_time), "the walls"
     dark = [area.shape for area in drawing.areas if area.is_dark and area.role is None]
-    dark = [shape for shape in dark if not _is_outline(shape)]
+    dark = [shape for shape in dark if not (_is_outline(shape) or _is_stroke_of_letter(shape))]
     thick = [stroke for stroke in drawing.strokes if stroke.role is None and _THICK_M[0] <= stroke.width <= _THICK_M[1]]
     dark += [stroke.line.buffer(0.5 * stroke.width, cap_style="square", join_style="mitre") for stroke in thick]
     if dark and (found := enclose(dark, [], closers, check_time=budget.check_time)).rooms:
@@ -165,6 +167,11 @@ def _enclosed(drawing: Drawing, budget: Budget) -> tuple[Enclosed, str]:
 def _is_outline(shape: shapely.Polygon) -> bool:
     """Return whether a closed wall polyline runs along the faces of a room, and is not the body of a wall."""
     return not shape.buffer(-0.5 * DEFAULT_WALLS.thickest).is_empty
+
+
+def _is_stroke_of_letter(shape: shapely.Polygon) -> bool:
+    """Return whether a dark area is too small and thin for a wall or pillar, as letters that are drawn are."""
+    return _sides(shape)[1] < _LETTER_M and shape.buffer(-0.5 * _LETTER_STROKE_M).is_empty
 
 
 def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:

@@ -5,10 +5,12 @@ A PDF has neither rooms nor meaningful layers, so the result is always a draft.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pypdfium2
+import shapely
 from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -17,6 +19,7 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
+from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.dimensions import drawn_scale
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import Area
@@ -29,6 +32,8 @@ _METRES_PER_POINT = 0.0254 / 72.0
 # A page with fewer lines, or with a larger share covered by pictures, is a scan.
 _MIN_LINES, _MOSTLY = 12, 0.5
 _FINEST_M, _COARSEST_PT = 0.01, 4.0
+# Margin around a text that is removed, as a share of the root of its area.
+_AROUND_TEXT = 0.1
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -56,6 +61,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
                 drawn_scale(found.drawing, budget.check_time) or drawn_scale(scan.drawing, budget.check_time)
             ),
         )
+        # Marks of dimensions can be read as letters, so these are removed after the scale is known.
+        _remove_letters(found)
         notes = list(builder.notes)
         sketch = _as_drawing(found, factor, builder, budget)
         if sketch is None or not sketch.rooms:
@@ -109,8 +116,9 @@ def _as_picture(
 
 def _read_scan(page: pypdfium2.PdfPage, found: PageContent, builder: ReportBuilder, budget: Budget) -> PictureTexts:
     """Return the texts of a scanned page, in points; letters that are drawn as lines join the texts of the page."""
-    is_scan = found.picture_share > _MOSTLY
-    if found.drawing.letterings and not is_scan:
+    is_scan, own = found.picture_share > _MOSTLY, list(found.drawing.letterings)
+    # A page can have a title block as text, and rooms with drawn letters.
+    if not is_scan and any(room_type_from_name(lettering.text) is not None for lettering in own):
         return PictureTexts()
     width, height = found.size_pt
     scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)
@@ -119,11 +127,26 @@ def _read_scan(page: pypdfium2.PdfPage, found: PageContent, builder: ReportBuild
     scan = read_texts(_gray(bitmap), builder, budget, straighten=is_scan).scaled(1.0 / scale)
     if is_scan:
         return scan
-    to_page = bitmap.get_posconv(page).to_page
-    for lettering in scan.placed(scale):
-        position = to_page(round(lettering.position[0]), bitmap.height - round(lettering.position[1]))
-        found.drawing.letterings.append(replace(lettering, position=position, height=lettering.height / scale))
+    convert = bitmap.get_posconv(page)
+
+    def on_page(x: float, y: float) -> tuple[float, float]:
+        """Return a place on the page for one in points from the middle of the bitmap."""
+        return convert.to_page(round(0.5 * bitmap.width + x * scale), round(0.5 * bitmap.height - y * scale))
+
+    for lettering in scan.drawing.letterings:
+        position = on_page(*lettering.position)
+        if all(math.dist(position, text.position) > lettering.height for text in own):
+            found.drawing.letterings.append(replace(lettering, position=position))
+    found.letters = [shapely.Polygon([on_page(*corner) for corner in corners]) for corners in scan.outlines]
     return PictureTexts()
+
+
+def _remove_letters(found: PageContent) -> None:
+    """Remove the shapes that texts consist of: dark letters would be pillars."""
+    tree = shapely.STRtree([text.buffer(_AROUND_TEXT * math.sqrt(text.area), quad_segs=1) for text in found.letters])
+    drawing = found.drawing
+    drawing.areas = [area for area in drawing.areas if not len(tree.query(area.shape, predicate="within"))]
+    drawing.strokes = [stroke for stroke in drawing.strokes if not len(tree.query(stroke.line, predicate="within"))]
 
 
 def _gray(bitmap: pypdfium2.PdfBitmap) -> UInt8[np.ndarray, "h w"]:

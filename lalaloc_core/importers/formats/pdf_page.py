@@ -34,11 +34,12 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass
 class PageContent:
-    """Drawing on a page, the page's size (points), and the share of it that pictures cover."""
+    """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts."""
 
     drawing: Drawing = field(default_factory=Drawing)
     size_pt: tuple[float, float] = (0.0, 0.0)
     picture_share: float = 0.0
+    letters: list[shapely.Polygon] = field(default_factory=list)
 
 
 @dataclass

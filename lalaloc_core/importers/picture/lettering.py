@@ -55,14 +55,18 @@ class PictureTexts:
     Attributes:
         drawing: texts and lines.
         size: width and height of the picture, in the same unit: pixels, or points of a page.
+        outlines: corners of each text.
     """
 
     drawing: Drawing = field(default_factory=Drawing)
     size: tuple[float, float] = (0.0, 0.0)
+    outlines: list[Corners] = field(default_factory=list)
 
     def scaled(self, factor: float) -> PictureTexts:
         """Return the texts in another unit."""
-        return PictureTexts(self.drawing.scaled(factor, flip_y=False), (self.size[0] * factor, self.size[1] * factor))
+        size = (self.size[0] * factor, self.size[1] * factor)
+        outlines = [corners * factor for corners in self.outlines]
+        return PictureTexts(self.drawing.scaled(factor, flip_y=False), size, outlines)
 
     def placed(self, factor: float) -> list[Lettering]:
         """Return the texts in another unit, from the picture's lower left corner, as `sketch_picture` places rooms."""
@@ -104,6 +108,7 @@ def read_texts(
     for text, box in boxes:
         x, y = from_middle(box.mean(axis=0, keepdims=True))[0]
         found.drawing.letterings.append(Lettering(text, (float(x), float(y)), height=_height(box) / factor))
+        found.outlines.append(from_middle(box))
     if boxes:
         lines = _thin_lines(ink, [box for _, box in boxes])
         found.drawing.strokes += [Stroke(shapely.transform(line, from_middle), "", None, 0.0) for line in lines]

@@ -173,6 +173,7 @@ def localise_sequence_steps(
         for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
     ]
     missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
+    localisations = linked(localisations, motions, missed, encoders.manifest)
     # Paths that differ by less than counts as right are right as well, so Boole's inequality can say more.
     wrong = sum(1.0 - picture.position for picture in found.pictures)
     return SequenceLocalisation(localisations, max(float(found.path[0]), 1.0 - wrong), stage, missed, clock.timings_ms)
@@ -195,6 +196,31 @@ def _localisation(
         heading_contradicted=picture.doubted,
         best={stage: answers[0]},
     )
+
+
+def linked(
+    pictures: Sequence[Localisation], motions: Sequence[Motion], missed: Sequence[int], manifest: Manifest
+) -> list[Localisation]:
+    """Return the localisations, each with the highest fit of the pictures that it is linked to.
+
+    Pictures between which the camera moved by a measured distance are of one building, unless the answer contradicts
+    the motion: if any of them is of the plan, all are.
+    """
+    groups = [[0]]
+    for index, motion in enumerate(motions):
+        if motion.distance_m is not None and index not in missed:
+            groups[-1].append(index + 1)
+        else:
+            groups.append([index + 1])
+    found = list(pictures)
+    for group in groups:
+        own = [
+            pictures[index].confidence(manifest.confidence_for(view=pictures[index].query.is_view)) for index in group
+        ]
+        fit = max((confidence.fit for confidence in own if confidence is not None), default=0.0)
+        for index in group:
+            found[index] = replace(pictures[index], linked_fit=fit)
+    return found
 
 
 def _contradicted_motions(

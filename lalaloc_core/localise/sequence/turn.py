@@ -41,6 +41,7 @@ def judged_turn(found: SequenceLocalisation, joint: Localisation) -> SequenceLoc
             picture,
             posterior=_judged(picture, joint.posterior),
             signals={picture.stage: joint.signals[joint.stage]},
+            linked_fit=0.0,
         )
         for picture in found.pictures
     ]
