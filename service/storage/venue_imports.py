@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import FloorPlan
 from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_cache import PlanCache
-from service.storage.plan_rows import PlanContent, count_plans, insert_plan, new_record
+from service.storage.plan_rows import PlanContent, count_plans, insert_plans, new_record
 from service.storage.records import ComputedGrid, Original, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, VENUES
@@ -96,7 +96,7 @@ class VenueImports:
                 # The venue comes first, so that of two attempts of the same request only one stores plans.
                 is_new = insert_venue(connection, self._database, tenant, venue_id, name, None)
             if is_new:
-                batch.insert(connection, self._database)
+                insert_plans(connection, batch.records, batch.contents)
                 insert_members(connection, venue_id, batch.members)
                 self._settle(connection, tenant, size, max_plans)
                 check_count(connection, tenant, max_venues)
@@ -147,7 +147,7 @@ class VenueImports:
                 is_new = not batch.is_stored(connection)
                 if is_new:
                     self._check(connection, batch, size, max_plans)
-                    batch.insert(connection, self._database)
+                    insert_plans(connection, batch.records, batch.contents)
                     insert_members(connection, venue_id, batch.members)
                     check_members(connection, venue_id, max_venue_plans)
                     values = {"revision_id": uuid.uuid4().hex, "number": row.number + 1, "updated_at": batch.now}
@@ -219,8 +219,3 @@ class _Batch:
         """Return whether an earlier attempt stored the plans, of which some can be deleted by now."""
         ids = [record.id for record in self.records]
         return connection.scalar(select(FLOORPLANS.c.id).where(FLOORPLANS.c.id.in_(ids)).limit(1)) is not None
-
-    def insert(self, connection: Connection, database: Database) -> None:
-        """Insert the plans."""
-        for record, content in zip(self.records, self.contents, strict=True):
-            insert_plan(connection, database, record, content)

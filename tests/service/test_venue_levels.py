@@ -312,7 +312,9 @@ def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: Data
         found = list(threads.map(attempt, range(4)))
     assert len({revision for revision, _ in found}) == 1
     assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
-    assert store.venues.get("t", venue.id).plans == 4
+    extended = store.venues.get("t", venue.id)
+    assert extended is not None
+    assert extended.plans == 4
     used = store.quota.account("t").used
     store.quota.recount()
     assert store.quota.account("t").used == used
