@@ -348,12 +348,12 @@ class Client(Transport):
         Args:
             venue_id: id of the venue.
             file: as for `upload_floorplan`.
-            options: as for `upload_venue`.
+            options: as for `upload_venue`; `name` begins the names of several plans instead of that of the venue.
             idempotency_key: as for `upload_floorplan`.
             if_match: as for `change_venue`.
         """
         key = idempotency_key or uuid.uuid4().hex
-        path, values = resource_path("venues", venue_id), dict(options or {}, name=None)
+        path, values = resource_path("venues", venue_id), {"name": None, **(options or {})}
         request = run_blocking(plan_request, "PATCH", path, file, values, if_match=if_match, idempotency_key=key)
         return self._stored(Venue, request)
 
