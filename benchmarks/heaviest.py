@@ -297,6 +297,16 @@ def _post_levels(caller: Caller, _stored: Stored, size: int) -> None:
             caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
 
 
+def _extend_venue(caller: Caller, _stored: Stored, size: int) -> None:
+    content = _body({"plans": [home(number) for number in range(size)]})
+    path = f"/venues/{created(caller.send('POST', '/venues', _venue([])))}"
+    caller.send("PATCH", path, *form((), (("file", content),)))
+    plans = caller.send("GET", f"{path}/plans?limit=500").json()["plans"]
+    caller.send("DELETE", path)
+    for plan in plans:
+        caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
+
+
 def _put_venue(caller: Caller, stored: Stored, _size: int) -> None:
     caller.send("PUT", f"/venues/{stored.venue_id}", _venue(stored.member_ids, f"venue {next(_names)}"))
 
@@ -410,6 +420,7 @@ LOADS = (
     Load(("PUT /floorplans/{floorplan_id}",), ROOMS_PLAN, _put_plan, 10_000),
     Load(("POST /venues", "DELETE /venues/{venue_id}"), "{homes} homes", _post_venue),
     Load(("POST /venues",), "file of 200 levels × 50 rooms", _post_levels, 10_000),
+    Load(("PATCH /venues/{venue_id}",), "file of 200 homes", _extend_venue, 200),
     Load(("GET /venues",), "pages of 500", _get("/venues", limit=None), 500),
     Load(("GET /venues/{venue_id}",), "{homes} homes", _get("/venues/{venue_id}")),
     Load(("GET /venues/{venue_id}",), "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),

@@ -18,6 +18,7 @@ from lalaloc_core.localise.bundle import Bundle
 from service.audit_commands import add_audit_commands
 from service.backup_commands import add_backup_commands
 from service.command_parts import audit, configured_store, duration, tenant_name, text_table
+from service.cores import limit_arenas, usable_cores
 from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
@@ -55,6 +56,7 @@ def serve(arguments: argparse.Namespace) -> int:
         ConfigError: an invalid setting, or a public address without keys.
     """
     settings = Settings.load()
+    limit_arenas(usable_cores())
     with _listener(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]
         check_address(host, settings)

@@ -173,6 +173,24 @@ class WallTable:
             exit_m=frozen(np.concatenate(leave_m, axis=1)),
         )
 
+    @classmethod
+    def joined(cls, tables: Sequence[WallTable]) -> WallTable:
+        """Return one table for several plans, each in its own frame; rooms are numbered plan after plan."""
+        walls = np.cumsum([0, *(len(table.start_m) for table in tables)])
+        rooms = np.cumsum([0, *(len(table.first) - 1 for table in tables)])
+        shifted = {
+            "first": [table.first[:-1] + shift for table, shift in zip(tables, walls, strict=False)] + [walls[-1:]],
+            "opening_begin": [table.opening_begin + shift for table, shift in zip(tables, walls, strict=False)],
+            "opening_end": [table.opening_end + shift for table, shift in zip(tables, walls, strict=False)],
+            "behind": [
+                np.where(table.behind < 0, -1, table.behind + shift)
+                for table, shift in zip(tables, rooms, strict=False)
+            ],
+        }
+        names = [field.name for field in fields(cls)]
+        parts = {name: shifted.get(name) or [getattr(table, name) for table in tables] for name in names}
+        return cls(**{name: frozen(np.concatenate(arrays)) for name, arrays in parts.items()})
+
     @property
     def nbytes(self) -> int:
         """Memory of the arrays."""

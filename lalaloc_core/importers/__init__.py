@@ -20,6 +20,7 @@ from lalaloc_core.importers.common.report import ImportReport, LayerUse
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.common.trace import Trace
 from lalaloc_core.importers.importing import (
+    begins_with_plans,
     building_name,
     detect_format,
     detect_media_type,
@@ -46,6 +47,7 @@ __all__ = [
     "LayerUse",
     "Level",
     "Trace",
+    "begins_with_plans",
     "building_name",
     "detect_format",
     "detect_media_type",

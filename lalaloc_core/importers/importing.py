@@ -30,6 +30,9 @@ _ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": 
 _SUFFIXES = re.compile(r"(?:(?<=.)\.imdf)?(?<=.)\.[A-Za-z0-9]{1,10}$")
 # Members of a JSON document of no known format that are named.
 _MAX_MEMBERS = 8
+# Member of a document in the native format with several plans.
+PLANS = "plans"
+_SEVERAL_PLANS = re.compile(rb"(?:\xef\xbb\xbf)?\s*\{\s*\"plans\"\s*:")
 # Files of IMDF, zipped IFC models and ROS maps.
 _IN_ARCHIVES = (".geojson", ".json", ".ifc", ".yaml", ".yml", ".pgm", ".png")
 _OPTIONS_OF_ALL_FORMATS = {"name", "ceiling_height_m"}
@@ -51,7 +54,8 @@ def import_plans(
         options: options of the import.
         limits: limits of the file and its plans.
         clock: clock for the time limit.
-        building: name for plans of several storeys, unless the options have one: "Duplex – Level 1".
+        building: name for plans of several storeys, unless the options have one: "Duplex – Level 1". Plans in the
+            native format keep their own names.
         trace: receives what is read from a drawing or a picture, also of a file that is refused.
 
     Raises:
@@ -74,7 +78,7 @@ def import_plans(
     except MemoryError as error:
         raise InvalidFloorPlanError("the file needs more memory than is available; export a single storey") from error
     building = options.name or building
-    if len(plans) > 1 and building is not None:
+    if len(plans) > 1 and building is not None and format.name != "native":
         plans = [_named_by_level(plan, building) for plan in plans]
     return tuple(_with_option_warnings(plan, format, options) for plan in plans)
 
@@ -100,7 +104,7 @@ def import_plan(
 def import_if_native(
     content: bytes, options: ImportOptions = DEFAULT_OPTIONS, limits: ImportLimits = DEFAULT_IMPORT_LIMITS
 ) -> ImportedPlan | None:
-    """Return the plan in a file, None if the file is not in the native format.
+    """Return the plan in a file, None if the file is not in the native format or has several plans.
 
     It loads no library of another format, so a caller can leave the other formats to a worker process.
 
@@ -111,7 +115,7 @@ def import_if_native(
         return None
     document = read_json(content, limits.max_depth, limits.max_json_values)
     format = _json_format(document)
-    if format.name != "native":
+    if format.name != "native" or PLANS in document:
         return None
     (plan,) = format.read(document, options, Budget(limits))
     return _with_option_warnings(plan, format, options)
@@ -155,6 +159,11 @@ def is_json(content: bytes) -> bool:
     return is_wide or (start[:1] in (b"{", b"[") and not start.startswith(b"{\\rtf"))
 
 
+def begins_with_plans(content: bytes) -> bool:
+    """Return whether a file begins like a document in the native format with several plans."""
+    return _SEVERAL_PLANS.match(content) is not None
+
+
 def detect_media_type(content: bytes, format: str) -> str:
     """Return the media type of a file whose import reported `format`."""
     if content.startswith(b"PK\x03\x04"):
@@ -189,14 +198,14 @@ def _json_format(document: Any) -> Format:
         format = next(known, None)
         if format is not None:
             return format
-        if "rooms" in document:
+        if "rooms" in document or PLANS in document:
             return FORMATS["native"]
         if document.get("type") in _GEOJSON_TYPES:
             return FORMATS["geojson"]
         members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
         raise InvalidFloorPlanError(
-            f"the JSON has the members {members}, of no known format; the native format has 'rooms', GeoJSON 'type', "
-            "OpenStreetMap 'elements', and RoomPlan 'walls', 'doors' and 'windows'"
+            f"the JSON has the members {members}, of no known format; the native format has 'rooms' or 'plans', "
+            "GeoJSON 'type', OpenStreetMap 'elements', and RoomPlan 'walls', 'doors' and 'windows'"
         )
     found = "a list" if isinstance(document, list) else "a single value"
     raise InvalidFloorPlanError(

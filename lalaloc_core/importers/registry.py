@@ -99,7 +99,7 @@ FORMATS: Mapping[str, Format] = {
             title="native JSON",
             media_type="application/json",
             suffix="json",
-            options=frozenset({"units", "y_axis"}),
+            options=frozenset({"units", "y_axis", "level"}),
         ),
         Format(
             name="geojson",

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.geometry import WallTable
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at, swept_views
 
@@ -96,6 +97,33 @@ def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"],
     behind = view.row, view.column, view.kind[view.row, view.column], np.log(view.behind_m)
     seen = SeenThrough(*behind) if len(view.row) else None
     return Layouts(np.log(view.distance_m), poses.room_index, view.kind, seen)
+
+
+def layouts_of_plans(plans: Sequence[FloorPlan], poses: Sequence[PoseSet], columns: int) -> list[Layouts]:
+    """Render poses of several plans at heading 0 in one pass; the layouts of each plan are those of `layouts_at`.
+
+    The cost of a pass hardly depends on the number of poses while they are few, as in small plans.
+    """
+    tables = [plan.wall_table for plan in plans]
+    rooms = np.cumsum([0, *(len(plan.rooms) for plan in plans)])
+    first = np.cumsum([0, *map(len, poses)])
+    eye_m = np.repeat([plan.camera_height_m for plan in plans], [len(table.sill_m) for table in tables])
+    position_m = np.concatenate([part.position_m for part in poses])
+    room_index = np.concatenate([part.room_index + shift for part, shift in zip(poses, rooms, strict=False)])
+    view = swept_views(position_m, np.zeros(len(position_m)), room_index, WallTable.joined(tables), columns, eye_m)
+    log_profile, log_behind = np.log(view.distance_m), np.log(view.behind_m)
+    kind, through = view.kind[view.row, view.column], np.searchsorted(view.row, first)
+    layouts = []
+    for number, (plan, part) in enumerate(zip(plans, poses, strict=True)):
+        own, seen = slice(first[number], first[number + 1]), slice(through[number], through[number + 1])
+        if not plan.opening_faces:
+            layouts.append(Layouts(log_profile[own], part.room_index))
+            continue
+        behind = view.row[seen] - own.start, view.column[seen], kind[seen], log_behind[seen]
+        layouts.append(
+            Layouts(log_profile[own], part.room_index, view.kind[own], SeenThrough(*behind) if len(behind[0]) else None)
+        )
+    return layouts
 
 
 def joined_layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -> Layouts:

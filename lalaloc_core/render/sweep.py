@@ -46,12 +46,12 @@ def swept_views(
     room_index: Int[np.ndarray, "n"],
     walls: WallTable,
     columns: int,
-    eye_m: float,
+    eye_m: float | Float[np.ndarray, "m"],
 ) -> SweptViews:
-    """Render the layout views of poses of a plan.
+    """Render the layout views of poses of a plan, or of several plans with a joined table.
 
     Positions are inside their rooms; `heading` is the azimuth of the centre column, radians. An opening is visible if
-    its sill is below the eye and its head above.
+    its sill is below the eye and its head above; `eye_m` is one height, or that for each opening face of the table.
     """
     distance_m = np.empty((len(position_m), columns), np.float32)
     kind = np.full((len(position_m), columns), WALL_CODE, np.uint8)

@@ -1,7 +1,8 @@
 """Conversion of an uploaded plan file.
 
-The service parses native plans of up to 256 KiB itself, in milliseconds. Worker processes read, validate and describe
-all others: large plans would take the interpreter from other requests, and other formats can crash their reader.
+The service parses single native plans of up to 256 KiB itself, in milliseconds. Worker processes read, validate and
+describe all others: large or many plans would take the interpreter from other requests, and other formats can crash
+their reader.
 """
 
 from __future__ import annotations
@@ -11,7 +12,15 @@ from dataclasses import dataclass
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportOptions, Level, detect_format, detect_media_type, import_if_native, is_json
+from lalaloc_core.importers import (
+    ImportOptions,
+    Level,
+    begins_with_plans,
+    detect_format,
+    detect_media_type,
+    import_if_native,
+    is_json,
+)
 from service.conversion.converter import Converter
 from service.settings import Settings
 from service.stored_plan import LARGE, PlanDocument, Rendition
@@ -47,7 +56,8 @@ def seems_native(file: UploadedFile) -> bool:
 
 
 def _seems_native(content: bytes) -> bool:
-    return len(content) <= LARGE and is_json(content) and describe_file(content) is None
+    is_small = len(content) <= LARGE and not begins_with_plans(content)
+    return is_small and is_json(content) and describe_file(content) is None
 
 
 def convert(

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 
 import numpy as np
 
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.layouts import joined_layouts
+from lalaloc_core.localise.layouts import joined_layouts, layouts_of_plans
 from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings
+from service.storage.grid_format import SortedPrototypes
+from service.storage.records import millimetres
 
 # Poses per chunk, for models with wall profiles and for models with latents; queries go first between chunks.
 RENDERED, _EMBEDDED = 256, 128
+# Poses of small plans that are rendered together.
+_TOGETHER = 512
 # Memory that queries add at first use. Per azimuth: the log distance, in half precision without latents, and a code.
 # Per pose: views through openings, and arrays of the coarse pass.
 _BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400
@@ -71,6 +76,42 @@ def embed(
             return PoseGrid.without_latents(poses, whole, step_m, camera_height_m)
         profile_m = np.exp(whole.log_profile)
         return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
+
+
+def embed_small(
+    plans: Sequence[FloorPlan],
+    encoders: Encoders,
+    *,
+    step_m: float,
+    computing: Callable[[], AbstractContextManager[None]],
+) -> Iterator[list[tuple[PoseGrid, SortedPrototypes]]]:
+    """Make the own grids of small plans and their prototypes as `embed` does, several plans at a time.
+
+    Args:
+        plans: plans of few poses, by their estimates.
+        encoders: networks that predict wall profiles.
+        step_m: grid step (m).
+        computing: entered for at most about `_TOGETHER` poses at a time, so that queries take turns with them.
+
+    Yields:
+        Grids and prototypes of the next plans.
+    """
+    begin, poses = 0, np.cumsum([grid_size(plan, step_m) for plan in plans])
+    while begin < len(plans):
+        past = int(poses[begin - 1]) if begin else 0
+        end = max(begin + 1, int(np.searchsorted(poses, past + _TOGETHER, side="right")))
+        part, begin = plans[begin:end], end
+        with computing():
+            sampled = [pose_grid(plan, step_m) for plan in part]
+            layouts = layouts_of_plans(part, sampled, encoders.manifest.profile_columns)
+            grids = [
+                PoseGrid.without_latents(poses, seen, step_m, millimetres(plan.camera_height_m) / 1000.0)
+                for plan, poses, seen in zip(part, sampled, layouts, strict=True)
+            ]
+            prototypes = SortedPrototypes.of_grids(grids, part)
+            # Without layouts, which take most of the memory; queries render them.
+            grids = [replace(grid) for grid in grids]
+        yield list(zip(grids, prototypes, strict=True))
 
 
 def check_size(plan: FloorPlan, settings: Settings, level: str | None = None) -> None:

@@ -16,7 +16,7 @@ from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
-from service.grids.embedding import RENDERED, check_size, embed
+from service.grids.embedding import RENDERED, check_size, embed, embed_small
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
 from service.schemas import PlanStatus
@@ -31,6 +31,9 @@ from service.tenancy.fair_share import FairSemaphore
 _BATCH = 16
 # Share of the cache that small grids may fill before a query reads them.
 _UNREAD_SHARE = 1.0 / 32.0
+# Maximum size of all pose grids that are computed during the upload of several plans, in `inline_grid_poses`: a second
+# or two of a core, and 0.6 kB per pose until they are stored.
+_INLINE_TOTAL = 80
 
 
 @dataclass(frozen=True)
@@ -178,10 +181,42 @@ class GridProvider:
             return None
 
     def prepare_all(self, plans: Sequence[FloorPlan], client: str) -> list[ComputedGrid | None]:
-        """Compute the own grids of a client's plans at once if they are small together, as `prepare` does for one."""
-        if sum(self._estimate(plan) for plan in plans) > self._settings.grids.inline_grid_poses:
-            return [None] * len(plans)
-        return [self.prepare(plan, client) for plan in plans]
+        """Compute the own grids of a client's plans at once, as `prepare` does for one.
+
+        Small plans come first, and the total is limited; the background computes the others.
+        """
+        limit, poses = self._settings.grids.inline_grid_poses, [self._estimate(plan) for plan in plans]
+        order = sorted(range(len(plans)), key=lambda number: poses[number])
+        total, chosen = 0, list[int]()
+        for number in order:
+            total += poses[number]
+            if poses[number] > limit or total > _INLINE_TOTAL * limit:
+                break
+            chosen.append(number)
+        # In the order of the file, whose neighbours are often alike.
+        chosen.sort()
+        found: list[ComputedGrid | None] = [None] * len(plans)
+        if not self._encoders.predicts_profile or len(chosen) < 2:
+            for number in chosen:
+                found[number] = self.prepare(plans[number], client)
+            return found
+        made = self._embed_small([plans[number] for number in chosen], client)
+        for number, (grid, prototypes) in zip(chosen, made, strict=False):
+            found[number] = ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
+        return found
+
+    def _embed_small(self, plans: Sequence[FloorPlan], client: str) -> list[tuple[PoseGrid, SortedPrototypes]]:
+        """Return the grids of plans and their prototypes; after an error, those before it."""
+        made: list[tuple[PoseGrid, SortedPrototypes]] = []
+        step_m, hold = self._settings.grids.grid_step_m, partial(self._permits.hold, client)
+        try:
+            with self._telemetry.timed(self._telemetry.grid_seconds):
+                for part in embed_small(plans, self._encoders, step_m=step_m, computing=hold):
+                    made += part
+        except Exception:
+            # As in `prepare`.
+            logging.getLogger(LOGGER_NAME).exception("pose grids failed")
+        return made
 
     def expected_bytes(self, plan: FloorPlan) -> int:
         """Estimate the stored bytes of a plan's own grid."""

@@ -1,4 +1,4 @@
-"""Venue of the levels of a plan file."""
+"""Venues of the levels of plan files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from service.conversion import PlanFile, convert_levels
 from service.errors import InvalidRequestError
 from service.routes.plan_uploads import PlanUpload
 from service.runtime import Runtime
-from service.storage.records import JSON, ComputedGrid, Original, VenueRecord
+from service.storage.records import JSON, ComputedGrid, Original, PlanRecord, VenueRecord
 from service.storage.venue_imports import NewPlan
 from service.stored_plan import PlanDocument
 
@@ -35,27 +35,76 @@ def store_venue_of_levels(
         TooManyFloorPlansError, TooManyVenuesError, StorageQuotaError: see `VenueImports.add`.
         MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `convert`.
     """
-    content = uploaded.file.read()
     name = uploaded.options.name or building_name(uploaded.file.name) or _DEFAULT_NAME
+    plans = _new_plans(uploaded, runtime, client, name)
+    limits = runtime.settings.plans
+    venue, records = runtime.store.venue_imports.add(
+        tenant, venue_id, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
+    )
+    _announce(plans, records, runtime)
+    return venue
+
+
+def add_levels_to_venue(
+    uploaded: PlanUpload,
+    runtime: Runtime,
+    tenant: str,
+    client: str,
+    venue: VenueRecord,
+    token: str,
+    expected: str | None,
+) -> VenueRecord:
+    """Store a plan of every level of a file with rooms, and add them to a venue. Blocks.
+
+    Args:
+        uploaded: the file with its options.
+        runtime: the service.
+        tenant: owner of the venue.
+        client: client of the request.
+        venue: the venue.
+        token: the same for every attempt of the request.
+        expected: id of the revision that the venue must have; None for any.
+
+    Raises:
+        LaLaLocError: see `store_venue_of_levels` and `VenueImports.extend`.
+    """
+    plans = _new_plans(uploaded, runtime, client, uploaded.options.name or venue.name or _DEFAULT_NAME)
+    limits = runtime.settings.plans
+    extended, records = runtime.store.venue_imports.extend(
+        tenant,
+        venue.id,
+        token,
+        plans,
+        max_plans=limits.max_floorplans,
+        max_venue_plans=limits.max_venue_plans,
+        expected=expected,
+    )
+    _announce(plans, records, runtime)
+    return extended
+
+
+def _new_plans(uploaded: PlanUpload, runtime: Runtime, client: str, name: str) -> list[NewPlan]:
+    """Return the plans of a file, with the pose grids that are computed at once."""
+    content = uploaded.file.read()
     files = convert_levels(
         content, uploaded.options, name, runtime.converter, runtime.settings, client, runtime.permits
     )
-    limits = runtime.settings.plans
-    if len(files) > limits.max_venue_plans:
-        fault = f"has {len(files)} levels; the limit is {limits.max_venue_plans} floor plans (LALALOC_MAX_VENUE_PLANS)"
+    limit = runtime.settings.plans.max_venue_plans
+    if len(files) > limit:
+        fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
         raise InvalidRequestError([("file", fault)])
     for file in files:
         runtime.grids.check_size(file.plan, None if file.level is None else file.level.name)
     grids = runtime.grids.prepare_all([file.plan for file in files], client)
     originals = [_original(file, content if len(files) == 1 else None) for file in files]
-    plans = [_new_plan(*values, runtime) for values in zip(files, _level_numbers(files), originals, grids, strict=True)]
-    venue, records = runtime.store.venue_imports.add(
-        tenant, venue_id, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
-    )
-    # None if an earlier attempt stored them; the grids that it left are computed later.
-    for record, grid in zip(records, grids, strict=False):
-        runtime.grids.on_plan_stored(record, grid)
-    return venue
+    return [_new_plan(*values, runtime) for values in zip(files, _level_numbers(files), originals, grids, strict=True)]
+
+
+def _announce(plans: Sequence[NewPlan], records: Sequence[PlanRecord], runtime: Runtime) -> None:
+    """Tell the provider of grids about stored plans; there are no records if an earlier attempt stored them."""
+    # The grids that an earlier attempt left are computed later.
+    for record, new in zip(records, plans, strict=False):
+        runtime.grids.on_plan_stored(record, new.grid)
 
 
 def _new_plan(file: PlanFile, level: float, original: Original, grid: ComputedGrid | None, runtime: Runtime) -> NewPlan:

@@ -46,7 +46,7 @@ from service.routes.dependencies import (
 )
 from service.routes.plan_uploads import LEVELS_FORM, REFUSED_UPLOADS, read_upload
 from service.routes.venue_answers import plan_entries, venue_representation, venue_summary
-from service.routes.venue_levels import store_venue_of_levels
+from service.routes.venue_levels import add_levels_to_venue, store_venue_of_levels
 from service.runtime import Runtime
 from service.schemas import (
     LevelsForm,
@@ -65,6 +65,8 @@ from service.uploaded_file import UploadedFile
 router = APIRouter(prefix="/venues", tags=["venues"])
 
 _MAX_LISTED = 500
+# Characters of a route that idempotency keys belong to, enough for any id of a venue.
+_MAX_ROUTE = 64
 # Lists, objects and further items of a venue document, besides those of its plans.
 _FURTHER_VALUES = 1000
 _REFUSED_BODIES = (
@@ -86,7 +88,9 @@ def _body(model: type[BaseModel]) -> dict[str, Any]:
 
 
 _NEW_VENUE = _body(VenueDocument)
-_NEW_VENUE["content"][MULTIPART] = LEVELS_FORM
+_VENUE_CHANGE = _body(VenueChangeDocument)
+for _described in (_NEW_VENUE, _VENUE_CHANGE):
+    _described["content"][MULTIPART] = LEVELS_FORM
 
 
 @router.post(
@@ -226,11 +230,24 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
     "/{venue_id}",
     summary="Change a venue",
     response_model=VenueAnswer,
-    openapi_extra={"requestBody": _body(VenueChangeDocument), "parameters": UNLESS_CHANGED},
-    responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
+    openapi_extra={"requestBody": _VENUE_CHANGE, "parameters": [*UNLESS_CHANGED, IDEMPOTENCY_KEY]},
+    responses=problem_responses(
+        *REFUSED_UPLOADS,
+        UnknownVenueError,
+        RevisionMismatchError,
+        TooManyFloorPlansError,
+        IdempotencyKeyReusedError,
+        IdempotencyInProgressError,
+    ),
 )
 async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Change the name, the anchor or some plans of a venue."""
+    """Change the name, the anchor or some plans of a venue.
+
+    A form has a plan file as for `POST /venues`: every level with rooms becomes a plan of the venue, or nothing is
+    stored. With an idempotency key, a repeated request does not add the plans again.
+    """
+    if media_type(request, (JSON, MULTIPART)) == MULTIPART:
+        return await _add_levels(venue_id, request, runtime, tenant, client)
     content = await _read(request, runtime)
 
     def store() -> Response:
@@ -269,6 +286,21 @@ def delete_venue(venue_id: str, request: Request, runtime: Running, tenant: Tena
     expected = expected_revision(request, current.id, current.revision_id, what="venue")
     if not runtime.store.venues.delete(tenant, current.id, expected=expected):
         raise UnknownVenueError(venue_id)
+
+
+async def _add_levels(venue_id: str, request: Request, runtime: Runtime, tenant: str, client: str) -> Response:
+    idempotent = IdempotentRequest(
+        runtime.store.idempotency_keys, request, tenant, f"PATCH /venues/{venue_id}"[:_MAX_ROUTE]
+    )
+    uploaded = await read_upload(request, runtime, LevelsForm)
+
+    def store(token: str) -> Response:
+        current = _stored(tenant, venue_id, runtime)
+        expected = expected_revision(request, current.id, current.revision_id, what="venue")
+        record = add_levels_to_venue(uploaded, runtime, tenant, client, current, token, expected)
+        return _written(request, record, runtime, status.HTTP_200_OK)
+
+    return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
 
 
 def _stored(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:

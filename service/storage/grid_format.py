@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
-from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, prototypes_of
+from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, joined, prototypes_of
 from lalaloc_core.render.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
@@ -47,6 +48,14 @@ class SortedPrototypes:
     def of_grid(cls, grid: PoseGrid, plan: FloorPlan) -> SortedPrototypes:
         """Make the prototypes of a plan's pose grid, sorted into the shipped cells."""
         return cls.of(prototypes_of(grid, plan), shipped_cells())
+
+    @classmethod
+    def of_grids(cls, grids: Sequence[PoseGrid], plans: Sequence[FloorPlan]) -> list[SortedPrototypes]:
+        """Make the prototypes of several plans as `of_grid` does, sorted at once."""
+        made = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]
+        whole = cls.of(joined(made), shipped_cells())
+        parts = np.split(whole.rows, np.cumsum([len(part) for part in made])[:-1])
+        return [cls(rows, whole.version) for rows in parts]
 
     def in_shipped_cells(self) -> np.ndarray:
         """Return the rows, sorted into the shipped cells again if their version differs."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import uuid
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Self
@@ -16,11 +17,14 @@ from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_places import place_columns
 from service.storage.records import ComputedGrid, GridKey, Original, PlanRecord
-from service.storage.statements import write_chunks
+from service.storage.statements import write_all_chunks, write_chunks
 from service.storage.stored_bytes import ROW_BYTES, StoredBytes
-from service.storage.stored_grids import grid_bytes, insert_grid
+from service.storage.stored_grids import grid_bytes, insert_grid, insert_grids
 from service.storage.tables import FLOORPLANS, ORIGINAL_CHUNKS, REVISIONS
 from service.stored_plan import PlanDocument
+
+# Plans per statement, so that copies of their files and grids are few.
+_TOGETHER = 50
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,28 @@ def count_plans(connection: Connection, tenant: str) -> int:
 
 def insert_plan(connection: Connection, database: Database, record: PlanRecord, content: PlanContent) -> bool:
     """Insert a plan with its first revision; False if its id exists already."""
-    values = {"id": record.id, "tenant": record.tenant, "created_at": record.created_at, **revision_values(record)}
-    statement = database.insert(FLOORPLANS).values(values).on_conflict_do_nothing()
+    statement = database.insert(FLOORPLANS).values(_plan_values(record)).on_conflict_do_nothing()
     if connection.scalar(statement.returning(FLOORPLANS.c.id)) is None:
         return False
     insert_revision(connection, record, content)
     return True
+
+
+def insert_plans(connection: Connection, records: Sequence[PlanRecord], contents: Sequence[PlanContent]) -> None:
+    """Insert new plans with their first revisions, a few statements for many plans at a time."""
+    for first in range(0, len(records), _TOGETHER):
+        part = list(zip(records[first : first + _TOGETHER], contents[first : first + _TOGETHER], strict=True))
+        connection.execute(FLOORPLANS.insert(), [_plan_values(record) for record, _ in part])
+        connection.execute(REVISIONS.insert(), [_revision_row(record, content) for record, content in part])
+        originals = [
+            ({"revision_id": record.revision_id}, memoryview(content.original.content)) for record, content in part
+        ]
+        write_all_chunks(connection, ORIGINAL_CHUNKS, originals)
+        insert_grids(connection, [content.grid for _, content in part if content.grid is not None])
+
+
+def _plan_values(record: PlanRecord) -> dict[str, Any]:
+    return {"id": record.id, "tenant": record.tenant, "created_at": record.created_at, **revision_values(record)}
 
 
 def revision_values(record: PlanRecord) -> dict[str, Any]:
@@ -110,8 +130,15 @@ def revision_values(record: PlanRecord) -> dict[str, Any]:
 
 def insert_revision(connection: Connection, record: PlanRecord, content: PlanContent) -> None:
     """Insert a revision of a plan that exists."""
+    connection.execute(REVISIONS.insert(), _revision_row(record, content))
+    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
+    if content.grid is not None:
+        insert_grid(connection, *content.grid)
+
+
+def _revision_row(record: PlanRecord, content: PlanContent) -> dict[str, Any]:
     plan = record.plan
-    values = {
+    return {
         "id": record.revision_id,
         "plan_id": record.id,
         "number": record.revision,
@@ -126,10 +153,6 @@ def insert_revision(connection: Connection, record: PlanRecord, content: PlanCon
         "camera_height_std_m": _height_std_m(plan),
         "stored_bytes": content.stored.plans,
     }
-    connection.execute(REVISIONS.insert(), values)
-    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
-    if content.grid is not None:
-        insert_grid(connection, *content.grid)
 
 
 def _height_std_m(plan: FloorPlan) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, or_, select
@@ -46,9 +46,20 @@ def write_chunks(connection: Connection, table: Table, owner: dict[str, Any], co
         owner: name and value of the column that identifies the value.
         content: the value.
     """
+    for row in _chunk_rows(owner, content):
+        connection.execute(table.insert(), row)
+
+
+def write_all_chunks(connection: Connection, table: Table, values: Sequence[tuple[dict[str, Any], memoryview]]) -> None:
+    """Write several small values at once as `write_chunks` does, each with its owner."""
+    rows = [row for owner, content in values for row in _chunk_rows(owner, content)]
+    if rows:
+        connection.execute(table.insert(), rows)
+
+
+def _chunk_rows(owner: dict[str, Any], content: memoryview) -> Iterator[dict[str, Any]]:
     for number, first in enumerate(range(0, len(content), CHUNK_BYTES)):
-        chunk = bytes(content[first : first + CHUNK_BYTES])
-        connection.execute(table.insert(), {**owner, "number": number, "content": chunk})
+        yield {**owner, "number": number, "content": bytes(content[first : first + CHUNK_BYTES])}
 
 
 def read_chunks(connection: Connection, table: Table, owner: dict[str, Any]) -> Iterator[bytes]:

@@ -29,6 +29,7 @@ from service.storage.statements import (
     lock_plan_of,
     read_exactly,
     select_summaries,
+    write_all_chunks,
     write_chunks,
 )
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
@@ -268,7 +269,23 @@ def grid_bytes(packed: PackedGrid) -> int:
 
 def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> None:
     """Insert a packed grid within a transaction."""
-    values = {
+    statement = LATENT_GRIDS.insert().values(_row(key, packed)).returning(LATENT_GRIDS.c.id)
+    write_chunks(connection, GRID_CHUNKS, {"grid_id": connection.scalar(statement)}, memoryview(packed.content))
+
+
+def insert_grids(connection: Connection, grids: Sequence[tuple[GridKey, PackedGrid]]) -> None:
+    """Insert the packed grids of several revisions within a transaction."""
+    if not grids:
+        return
+    statement = LATENT_GRIDS.insert().returning(LATENT_GRIDS.c.id, LATENT_GRIDS.c.revision_id)
+    inserted = connection.execute(statement, [_row(key, packed) for key, packed in grids])
+    ids = {row.revision_id: row.id for row in inserted}
+    chunks = [({"grid_id": ids[key.revision_id]}, memoryview(packed.content)) for key, packed in grids]
+    write_all_chunks(connection, GRID_CHUNKS, chunks)
+
+
+def _row(key: GridKey, packed: PackedGrid) -> dict[str, Any]:
+    return {
         **_columns(key),
         "poses": packed.poses,
         "size_bytes": len(packed.content),
@@ -276,8 +293,6 @@ def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> Non
         "prototypes": packed.prototypes,
         "stored_bytes": grid_bytes(packed),
     }
-    grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
-    write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
 
 
 def _unpacked(key: GridKey, content: bytes | bytearray | None, sha256: str) -> PoseGrid | None:

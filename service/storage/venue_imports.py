@@ -1,20 +1,31 @@
-"""Venues that are stored together with their plans: all of them, or nothing."""
+"""Venues that are stored or extended together with new plans: all of them, or nothing."""
 
 from __future__ import annotations
 
+import hashlib
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
+from sqlalchemy import Connection, select, update
+
 from lalaloc_core.floorplan import FloorPlan
-from service.errors import TooManyFloorPlansError
+from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_cache import PlanCache
-from service.storage.plan_rows import PlanContent, count_plans, insert_plan, new_record
+from service.storage.plan_rows import PlanContent, count_plans, insert_plans, new_record
 from service.storage.records import ComputedGrid, Original, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
-from service.storage.venue_rows import check_count, find_venue, insert_members, insert_venue
+from service.storage.tables import FLOORPLANS, VENUES
+from service.storage.venue_rows import (
+    check_count,
+    check_members,
+    find_venue,
+    insert_members,
+    insert_venue,
+    lock_venue,
+)
 from service.stored_plan import PlanDocument
 
 
@@ -76,51 +87,135 @@ class VenueImports:
             TooManyFloorPlansError, TooManyVenuesError: the tenant would have too many plans or venues.
             StorageQuotaError: the tenant would store too many bytes.
         """
+        batch = _Batch.of(tenant, venue_id, plans)
+        size = replace(batch.size, venues=ROW_BYTES * (1 + len(plans)))
+        with self._database.writing(grows_by=size.total) as connection:
+            is_new = find_venue(connection, tenant, venue_id) is None
+            if is_new:
+                self._check(connection, batch, size, max_plans)
+                # The venue comes first, so that of two attempts of the same request only one stores plans.
+                is_new = insert_venue(connection, self._database, tenant, venue_id, name, None)
+            if is_new:
+                insert_plans(connection, batch.records, batch.contents)
+                insert_members(connection, venue_id, batch.members)
+                self._settle(connection, tenant, size, max_plans)
+                check_count(connection, tenant, max_venues)
+            stored = find_venue(connection, tenant, venue_id)
+        assert stored is not None
+        return stored, self._cached(batch.records if is_new else [])
+
+    def extend(
+        self,
+        tenant: str,
+        venue_id: str,
+        token: str,
+        plans: Sequence[NewPlan],
+        *,
+        max_plans: int,
+        max_venue_plans: int,
+        expected: str | None = None,
+    ) -> tuple[VenueRecord, list[PlanRecord]]:
+        """Store plans and add them to a venue in one transaction.
+
+        Args:
+            tenant: owner of the venue.
+            venue_id: id of the venue.
+            token: 32 hexadecimal digits, the same for every attempt of the request; plans of an earlier attempt, whose
+                answer was lost, are not stored again.
+            plans: the plans.
+            max_plans: limit of the tenant's plans.
+            max_venue_plans: limit of the venue's plans.
+            expected: id of the revision that the venue must have; None for any.
+
+        Returns:
+            The venue, and the records of the plans in order; none if an earlier attempt stored them.
+
+        Raises:
+            UnknownVenueError: the tenant has no such venue.
+            RevisionMismatchError: the venue has another revision.
+            InvalidRequestError: the venue would have too many plans.
+            TooManyFloorPlansError: the tenant would have too many plans.
+            StorageQuotaError: the tenant would store too many bytes.
+        """
+        batch = _Batch.of(tenant, token, plans)
+        size = replace(batch.size, venues=ROW_BYTES * len(plans))
+        with self._database.writing(grows_by=size.total) as connection:
+            is_new = not batch.is_stored(connection)
+            if is_new:
+                # Waits for an attempt that runs beside.
+                row = lock_venue(connection, tenant, venue_id, expected)
+                is_new = not batch.is_stored(connection)
+                if is_new:
+                    self._check(connection, batch, size, max_plans)
+                    insert_plans(connection, batch.records, batch.contents)
+                    insert_members(connection, venue_id, batch.members)
+                    check_members(connection, venue_id, max_venue_plans)
+                    values = {"revision_id": uuid.uuid4().hex, "number": row.number + 1, "updated_at": batch.now}
+                    connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
+                    self._settle(connection, tenant, size, max_plans)
+            stored = find_venue(connection, tenant, venue_id)
+        if stored is None:
+            raise UnknownVenueError(venue_id)
+        return stored, self._cached(batch.records if is_new else [])
+
+    def _check(self, connection: Connection, batch: _Batch, size: StoredBytes, max_plans: int) -> None:
+        if count_plans(connection, batch.tenant) + len(batch.records) > max_plans:
+            raise TooManyFloorPlansError(max_plans)
+        self._quota.check(connection, batch.tenant, size.total + batch.later_bytes)
+
+    def _settle(self, connection: Connection, tenant: str, size: StoredBytes, max_plans: int) -> None:
+        self._quota.settle(connection, tenant, size)
+        # Exact now, because settling locks the tenant.
+        if count_plans(connection, tenant) > max_plans:
+            raise TooManyFloorPlansError(max_plans)
+
+    def _cached(self, records: list[PlanRecord]) -> list[PlanRecord]:
+        for record in records:
+            self._cache.put(record)
+        return records
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Plans of one request, prepared before the transaction."""
+
+    tenant: str
+    now: datetime
+    records: list[PlanRecord]
+    contents: list[PlanContent]
+    members: list[VenueMember]
+    later_bytes: int
+
+    @classmethod
+    def of(cls, tenant: str, token: str, plans: Sequence[NewPlan]) -> _Batch:
+        """Prepare plans, whose ids are the same for every attempt of a request."""
         now = datetime.now(UTC)
         records = [
             new_record(
                 new.plan,
                 new.original,
-                plan_id=uuid.uuid4().hex,
+                plan_id=hashlib.sha256(f"{token} {number}".encode()).hexdigest()[:32],
                 tenant=tenant,
                 number=1,
                 created_at=now,
                 updated_at=now,
             )
-            for new in plans
+            for number, new in enumerate(plans)
         ]
         contents = [
             PlanContent.prepare(record, new.original, new.document, new.grid)
             for record, new in zip(records, plans, strict=True)
         ]
-        size = StoredBytes(
-            plans=sum(content.stored.plans for content in contents),
-            grids=sum(content.stored.grids for content in contents),
-            venues=ROW_BYTES * (1 + len(plans)),
-        )
-        later_bytes = sum(new.later_bytes for new in plans)
-        with self._database.writing(grows_by=size.total) as connection:
-            is_new = find_venue(connection, tenant, venue_id) is None
-            if is_new:
-                if count_plans(connection, tenant) + len(plans) > max_plans:
-                    raise TooManyFloorPlansError(max_plans)
-                self._quota.check(connection, tenant, size.total + later_bytes)
-                # The venue comes first, so that of two attempts of the same request only one stores plans.
-                is_new = insert_venue(connection, self._database, tenant, venue_id, name, None)
-            if is_new:
-                for record, content in zip(records, contents, strict=True):
-                    insert_plan(connection, self._database, record, content)
-                levels = zip(records, plans, strict=True)
-                insert_members(connection, venue_id, [VenueMember(record.id, new.level) for record, new in levels])
-                self._quota.settle(connection, tenant, size)
-                # Exact now, because settling locks the tenant.
-                if count_plans(connection, tenant) > max_plans:
-                    raise TooManyFloorPlansError(max_plans)
-                check_count(connection, tenant, max_venues)
-            stored = find_venue(connection, tenant, venue_id)
-        assert stored is not None
-        if not is_new:
-            return stored, []
-        for record in records:
-            self._cache.put(record)
-        return stored, records
+        members = [VenueMember(record.id, new.level) for record, new in zip(records, plans, strict=True)]
+        return cls(tenant, now, records, contents, members, sum(new.later_bytes for new in plans))
+
+    @property
+    def size(self) -> StoredBytes:
+        """Size of the plans and their grids."""
+        stored = [content.stored for content in self.contents]
+        return StoredBytes(plans=sum(size.plans for size in stored), grids=sum(size.grids for size in stored))
+
+    def is_stored(self, connection: Connection) -> bool:
+        """Return whether an earlier attempt stored the plans, of which some can be deleted by now."""
+        ids = [record.id for record in self.records]
+        return connection.scalar(select(FLOORPLANS.c.id).where(FLOORPLANS.c.id.in_(ids)).limit(1)) is not None

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, delete, func, select, update
 
 from lalaloc_core.floorplan.earth import Anchor
-from service.errors import TooManyVenuesError
+from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.records import VenueMember, VenueRecord
 from service.storage.tables import VENUE_PLANS, VENUES
@@ -107,3 +107,33 @@ def venue_record(row: Row[Any]) -> VenueRecord:
         created_at=row.created_at,
         updated_at=row.updated_at,
     )
+
+
+def lock_venue(connection: Connection, tenant: str, venue_id: str, expected: str | None) -> Row[Any]:
+    """Return a venue's row, locked until the transaction ends."""
+    query = select(VENUES).where(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)
+    row = connection.execute(query.with_for_update()).one_or_none()
+    if row is None:
+        raise UnknownVenueError(venue_id)
+    if expected not in (None, row.revision_id):
+        raise RevisionMismatchError(venue_id, expected, row.revision_id, what="venue")
+    return row
+
+
+def count_members(connection: Connection, venue_id: str) -> int:
+    """Return the number of a venue's plans."""
+    own = VENUE_PLANS.c.venue_id == venue_id
+    return connection.scalar(select(func.count()).select_from(VENUE_PLANS).where(own)) or 0
+
+
+def check_members(connection: Connection, venue_id: str, limit: int) -> int:
+    """Check the number of a venue's plans after a change, and return it.
+
+    Raises:
+        InvalidRequestError: there are more than `limit`.
+    """
+    count = count_members(connection, venue_id)
+    if count > limit:
+        fault = f"the venue would have {count} plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)"
+        raise InvalidRequestError([("plans", fault)])
+    return count

@@ -28,7 +28,7 @@ from sqlalchemy import (
 )
 
 from lalaloc_core.floorplan.earth import Anchor
-from service.errors import InvalidRequestError, RevisionMismatchError, UnknownVenueError
+from service.errors import InvalidRequestError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_places import lies_in_box
 from service.storage.records import (
@@ -44,9 +44,12 @@ from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, d
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES
 from service.storage.venue_rows import (
     check_count,
+    check_members,
+    count_members,
     find_venue,
     insert_members,
     insert_venue,
+    lock_venue,
     revision_values,
     select_venues,
     venue_record,
@@ -162,17 +165,14 @@ class Venues:
         with self._database.writing(grows_by=ROW_BYTES * len(members)) as connection:
             # Plans are locked before venues, as in the deletion of a plan, to avoid a deadlock.
             _check_plans(connection, tenant, [member.plan_id for member in members])
-            row = _locked(connection, tenant, venue_id, expected)
-            before = _count(connection, venue_id)
+            row = lock_venue(connection, tenant, venue_id, expected)
+            before = count_members(connection, venue_id)
             if replace_members:
                 connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.venue_id == venue_id))
             _remove(connection, venue_id, removed)
             _remove(connection, venue_id, [member.plan_id for member in members], strict=False)
             insert_members(connection, venue_id, members)
-            count = _count(connection, venue_id)
-            if count > max_plans:
-                fault = f"the venue would have {count} plans; the limit is {max_plans} (LALALOC_MAX_VENUE_PLANS)"
-                raise InvalidRequestError([("plans", fault)])
+            count = check_members(connection, venue_id, max_plans)
             kept = None if drop_anchor else venue_record(row).anchor if anchor is None else anchor
             values = revision_values(row.name if name is None else name, kept, now) | {"number": row.number + 1}
             connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
@@ -310,27 +310,16 @@ class Venues:
 
         def work(connection: Connection) -> bool:
             try:
-                _locked(connection, tenant, venue_id, expected)
+                lock_venue(connection, tenant, venue_id, expected)
             except UnknownVenueError:
                 return False
-            rows = 1 + _count(connection, venue_id)
+            rows = 1 + count_members(connection, venue_id)
             sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.venue_id == venue_id))
             connection.execute(delete(VENUES).where(VENUES.c.id == venue_id))
             self._quota.settle(connection, tenant, StoredBytes(venues=-ROW_BYTES * rows, sessions=-sessions))
             return True
 
         return self._database.freeing(work)
-
-
-def _locked(connection: Connection, tenant: str, venue_id: str, expected: str | None) -> Row[Any]:
-    """Return a venue's row, locked until the transaction ends."""
-    query = select(VENUES).where(VENUES.c.id == venue_id, VENUES.c.tenant == tenant)
-    row = connection.execute(query.with_for_update()).one_or_none()
-    if row is None:
-        raise UnknownVenueError(venue_id)
-    if expected not in (None, row.revision_id):
-        raise RevisionMismatchError(venue_id, expected, row.revision_id, what="venue")
-    return row
 
 
 def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -> None:
@@ -355,11 +344,6 @@ def _remove(connection: Connection, venue_id: str, plan_ids: Collection[str], *,
         left -= set(connection.scalars(statement.returning(VENUE_PLANS.c.plan_id)))
     if left and strict:
         raise InvalidRequestError([("remove", f"the venue does not have floor plan {_named(sorted(left))}")])
-
-
-def _count(connection: Connection, venue_id: str) -> int:
-    own = VENUE_PLANS.c.venue_id == venue_id
-    return connection.scalar(select(func.count()).select_from(VENUE_PLANS).where(own)) or 0
 
 
 def _in_venue(query: Any, venue_id: str, model_sha256: str, step_m: float) -> Any:

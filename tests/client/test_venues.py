@@ -76,6 +76,24 @@ def test_file_of_several_levels_becomes_a_venue(service: Any, tmp_path: Path) ->
         service.upload_venue(file, options={"level": "1"})
 
 
+def test_files_of_plans_extend_a_venue(service: Any) -> None:
+    def homes(*numbers: int) -> dict[str, Any]:
+        return {"plans": [{**FLAT, "name": f"home {number}", "level": number} for number in numbers]}
+
+    venue = service.upload_venue(homes(0))
+    extended = service.extend_venue(venue.id, homes(2, 1), idempotency_key="b", if_match=venue.etag)
+    assert (extended.plans, extended.revision_number) == (3, 2)
+    assert service.extend_venue(venue.id, homes(2, 1), idempotency_key="b", if_match=venue.etag) == extended
+    assert [(plan.name, plan.level) for plan in service.venue_plans(venue.id)] == [
+        (f"home {number}", number) for number in range(3)
+    ]
+    with pytest.raises(ConflictError):
+        service.extend_venue(venue.id, homes(3), if_match=venue.etag)
+    with pytest.raises(InvalidError, match="level 'home 4'"):
+        service.extend_venue(venue.id, {"plans": [FLAT, {"name": "home 4", "rooms": []}]})
+    assert service.venue(venue.id) == extended
+
+
 def test_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:
     plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
     venue = service.make_venue([VenuePlan(plan, 3) for plan in plans])

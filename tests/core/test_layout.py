@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
 import torch
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.localise.layouts import Layouts, layouts_at, layouts_of_plans
 from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient
 from lalaloc_core.render.layout import LayoutView, layout_view
 from lalaloc_core.render.profile import wall_profile
@@ -192,6 +195,26 @@ def test_sweep_matches_cast_in_a_building(turned: bool) -> None:
     heading = rng.uniform(-4.0, 4.0, len(some)) if turned else np.full(len(some), 0.3)
     poses = PoseSet(every.position_m[some], every.room_index[some])
     assert_the_same(plan, poses, heading, misses=1e-3)
+
+
+@settings(max_examples=15)
+@given(st.lists(rows_of_rooms(), min_size=2, max_size=5), st.lists(st.floats(1.0, 2.0), min_size=5, max_size=5))
+def test_plans_rendered_together_are_those_rendered_alone(plans: list[FloorPlan], eyes_m: list[float]) -> None:
+    plans = [replace(plan, camera_height_m=eye_m) for plan, eye_m in zip(plans, eyes_m, strict=False)]
+    # A plan without openings between others.
+    plans.insert(1, plan_of(rectangle(3.0, 2.0)))
+    poses = [pose_grid(plan, 0.5) for plan in plans]
+    together = layouts_of_plans(plans, poses, COLUMNS)
+    assert [layout.kind is None for layout in together] == [not plan.opening_faces for plan in plans]
+
+    def arrays(layout: Layouts) -> list[np.ndarray]:
+        own = [layout.log_profile, layout.room_index] + ([] if layout.kind is None else [layout.kind])
+        return own + ([] if layout.seen is None else list(vars(layout.seen).values()))
+
+    for plan, part, layout in zip(plans, poses, together, strict=True):
+        alone = arrays(layouts_at(plan, part, np.zeros(len(part)), COLUMNS))
+        assert len(alone) == len(arrays(layout))
+        assert all(np.array_equal(*pair) for pair in zip(alone, arrays(layout), strict=True))
 
 
 def test_free_standing_walls_have_two_sides() -> None:

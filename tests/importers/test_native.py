@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 
 import pytest
 
-from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
+from lalaloc_core.importers import (
+    ImportOptions,
+    KnownDistance,
+    begins_with_plans,
+    import_if_native,
+    import_plan,
+    import_plans,
+)
 from lalaloc_core.importers.common.checks import check_document, likely_unit
 from tests.importers.conftest import FLAT, assert_same_plan
 
@@ -60,6 +69,51 @@ def test_units_option_overrides_the_file():
 def test_unused_option_gives_a_warning():
     (warning,) = _import(FLAT, page=3).report.warnings
     assert warning == "the option 'page' was ignored: it does not apply to native JSON"
+
+
+def _street(*levels: object) -> list[dict]:
+    return [{**FLAT, "name": f"home {number}", "level": level} for number, level in enumerate(levels)]
+
+
+def test_several_plans_keep_their_names_and_are_ordered_by_level():
+    content = json.dumps({"plans": [*_street(2, -1.5), {**FLAT, "name": "home 2"}]}).encode()
+    plans = import_plans(content, ImportOptions(ceiling_height_m=2.4), building="street")
+    assert [(plan.document["name"], plan.level and plan.level.number) for plan in plans] == [
+        ("home 1", -1.5),
+        ("home 2", 0.0),
+        ("home 0", 2.0),
+    ]
+    assert all(plan.document["rooms"] == json.loads(json.dumps(FLAT["rooms"])) for plan in plans)
+    assert begins_with_plans(b"\xef\xbb\xbf " + content)
+    # A service's own process leaves them to a worker.
+    assert import_if_native(content) is None
+    assert import_plan(content, ImportOptions(level="home 2", name="mine")).document["name"] == "mine"
+    with pytest.raises(SeveralLevelsError):
+        import_plan(content)
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ({"plans": []}, "'plans' must be a list of at least one plan"),
+        ({"plans": {"0": FLAT}}, "'plans' must be a list of at least one plan"),
+        ({"plans": [FLAT, 3]}, "each an object with 'rooms'"),
+        ({"plans": [FLAT], "units": "ft"}, "'units' stands beside 'plans'; move it into the plans"),
+        ({"plans": _street(0, "1")}, "plan 1 of 'plans' has level '1'; it must be a number from -1000 to 1000"),
+        ({"plans": _street(math.nan)}, "plan 0 of 'plans' has level 'nan'"),
+        ({"plans": [FLAT, {**FLAT, "name": "home", "rooms": []}]}, "level 'home': "),
+        ({"plans": [FLAT, {"plans": [FLAT]}]}, "level 'plan 1': "),
+        ({"plans": _street(*range(201))}, "has 201 levels; the limit is 200 (max_levels)"),
+    ],
+)
+def test_faulty_plans_are_refused(document: dict, words: str):
+    with pytest.raises(InvalidFloorPlanError, match=re.escape(words)):
+        import_plans(json.dumps(document).encode())
+
+
+def test_level_of_a_single_plan_is_ignored_with_a_warning():
+    (warning,) = _import(FLAT, level="1").report.warnings
+    assert warning == "the option 'level' was ignored: it does not apply to native JSON"
 
 
 def test_y_down_flips_plan_and_north():

@@ -1,8 +1,11 @@
-"""Division of the cores."""
+"""Division of the cores and of memory."""
 
 from __future__ import annotations
 
 import os
+import platform
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -53,3 +56,44 @@ def test_smallest_cgroup_quota_counts(tmp_path: Path, files: dict[str, str], exp
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(content + "\n")
     assert _quota_cores(tmp_path / "fs", own) == expected
+
+
+_ARENAS = """
+import ctypes, os, sys, threading
+from service.cores import limit_arenas
+
+is_limited = limit_arenas(3)
+libc, meet = ctypes.CDLL(None), threading.Barrier(8)
+libc.fdopen.restype, libc.fdopen.argtypes = ctypes.c_void_p, (ctypes.c_int, ctypes.c_char_p)
+libc.malloc_info.argtypes = (ctypes.c_int, ctypes.c_void_p)
+libc.fflush.argtypes = (ctypes.c_void_p,)
+libc.malloc.restype, libc.free.argtypes = ctypes.c_void_p, (ctypes.c_void_p,)
+
+def use_memory():
+    block = libc.malloc(4096)
+    meet.wait()
+    libc.free(block)
+
+threads = [threading.Thread(target=use_memory) for _ in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(is_limited, flush=True)
+stream = libc.fdopen(1, b"w")
+libc.malloc_info(0, stream)
+libc.fflush(stream)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries divide memory in other ways")
+@pytest.mark.parametrize("given", [None, "7"])
+def test_threads_share_arenas_of_memory(given: str | None) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "MALLOC_ARENA_MAX"}
+    environment |= {} if given is None else {"MALLOC_ARENA_MAX": given}
+    answer = subprocess.run(
+        [sys.executable, "-c", _ARENAS], env=environment, capture_output=True, text=True, check=True
+    ).stdout
+    assert answer.startswith("True" if given is None else "False")
+    # Eight threads that hold memory at once, in as many arenas as they may use.
+    assert answer.count("<heap nr=") == (3 if given is None else 7)

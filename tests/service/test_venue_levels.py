@@ -15,7 +15,9 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
+from benchmarks.large_venue import random_home
 from lalaloc_core.floorplan import FloorPlan
+from service.errors import UnknownVenueError
 from service.storage.database import Database
 from service.storage.records import Original
 from service.storage.store import Store
@@ -236,6 +238,89 @@ def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, databa
         store.quota.recount()
         assert client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"] == used
         store.close()
+
+
+def street(first: int, count: int = 3) -> bytes:
+    """Return a file of homes of two rooms in the native format, alternately on the levels 0 and 1."""
+    return json.dumps({"plans": [{**random_home(n), "level": n % 2} for n in range(first, first + count)]}).encode()
+
+
+def extend(client: httpx.Client, venue_id: str, content: bytes, **headers: str) -> httpx.Response:
+    return client.patch(f"/venues/{venue_id}", files={"file": ("street.json", content)}, headers=headers)
+
+
+def test_files_of_plans_make_and_extend_a_venue(client: httpx.Client) -> None:
+    venue = send(client, street(0), "Street.json").json()
+    # Ready at once, although the file passes through a worker.
+    assert (venue["name"], venue["plans"], venue["plans_ready"]) == ("Street", 3, 3)
+    before, key = counts(client), {"Idempotency-Key": uuid.uuid4().hex}
+    response = extend(client, venue["id"], street(3), **key)
+    assert response.status_code == 200, response.text
+    extended = response.json()
+    assert (extended["plans"], extended["plans_ready"]) == (6, 6)
+    assert extended["revision"] != venue["revision"]
+    again = extend(client, venue["id"], street(3), **key)
+    assert (again.json(), again.headers["Idempotency-Replayed"]) == (extended, "true")
+    assert counts(client) == (before[0] + 3, before[1])
+    entries = plans_of(client, venue["id"])
+    assert {(entry["name"], entry["level"]) for entry in entries} == {(f"home {n:05d}", n % 2) for n in range(6)}
+    # The same plan as of an upload of its own, and the same pose grid.
+    alone = client.post("/floorplans", json=random_home(4)).json()
+    home = client.get("/floorplans/" + next(e["floorplan_id"] for e in entries if e["name"] == alone["name"])).json()
+    for member in ("rooms", "area_m2", "status", "grid", "openings"):
+        assert home.get(member) == alone.get(member), member
+    assert json.loads(client.get(f"/floorplans/{home['id']}/original").content)["name"] == home["name"]
+    for entry in (*entries, {"floorplan_id": alone["id"]}):
+        client.delete(f"/floorplans/{entry['floorplan_id']}")
+    client.delete(f"/venues/{venue['id']}")
+
+
+def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_venue_plans=5, max_floorplans=6) as client:
+        venue = send(client, street(0), "Street.json")
+        path, before = f"/venues/{venue.json()['id']}", counts(client)
+        venue_id, used = venue.json()["id"], client.get("/usage").json()["stored_bytes"]
+        assert (
+            "would have 6 plans; the limit is 5 (LALALOC_MAX_VENUE_PLANS)"
+            in (assert_problem(extend(client, venue_id, street(3)), 422, "invalid-request")["detail"])
+        )
+        assert_problem(extend(client, venue_id, street(3, 4)), 507, "too-many-floorplans")
+        assert_problem(extend(client, venue_id, street(3, 2), **{"If-Match": '"old"'}), 412, "revision-mismatch")
+        assert_problem(extend(client, "0" * 32, street(3, 2)), 404, "unknown-venue")
+        wrong = json.dumps({"plans": [random_home(3), {**random_home(4), "rooms": []}]}).encode()
+        assert (
+            "level 'home 00004'" in assert_problem(extend(client, venue_id, wrong), 422, "invalid-floorplan")["detail"]
+        )
+        assert counts(client) == before
+        assert client.get("/usage").json()["stored_bytes"] == used
+        assert client.get(path).json() == venue.json()
+        tag = client.get(path).headers["etag"]
+        assert extend(client, venue_id, street(3, 2), **{"If-Match": tag}).json()["plans"] == 5
+
+
+def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: DatabaseOf) -> None:
+    store, token = Store(database_of(tmp_path)), uuid.uuid4().hex
+    venue, _ = store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
+
+    def attempt(_number: int) -> tuple[str, int]:
+        extended, records = store.venue_imports.extend(
+            "t", venue.id, token, new_plans(), max_plans=9, max_venue_plans=9
+        )
+        return extended.revision_id, len(records)
+
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(attempt, range(4)))
+    assert len({revision for revision, _ in found}) == 1
+    assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
+    extended = store.venues.get("t", venue.id)
+    assert extended is not None
+    assert extended.plans == 4
+    used = store.quota.account("t").used
+    store.quota.recount()
+    assert store.quota.account("t").used == used
+    with pytest.raises(UnknownVenueError):
+        store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
+    store.close()
 
 
 def new_plans(count: int = 3) -> list[NewPlan]:

@@ -1,29 +1,79 @@
-"""Native JSON format. Plans with `units` other than metres are converted."""
+"""Native JSON format: one plan, or several with their levels. Plans with `units` other than metres are converted."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.values import is_number
-from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble_levels, clean_name
 from lalaloc_core.importers.common.checks import USUAL_CEILING_M, check_document, likely_unit
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis
 from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Level
 
 # JSON allows numbers of any size; larger ones are left for the validation to refuse.
 _MAX_NUMBER = 1e12
+# Levels of a venue in requests.
+_MAX_LEVEL = 1000.0
 # Lengths of the format. The same key without "_m" holds a length in `units`.
 _LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_m", "head_m")
 
 
 def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read a plan in the native format.
+    """Read a plan in the native format, or a document with the member `plans`: plans with an additional `level`.
+
+    Raises:
+        InvalidFloorPlanError: a plan is invalid.
+    """
+    if isinstance(document, Mapping) and "plans" in document:
+        return _read_plans(document, options, budget)
+    plan = _read_plan(document, options, budget)
+    if options.level is not None:
+        ignored = "the option 'level' was ignored: it does not apply to native JSON"
+        plan = replace(plan, report=replace(plan.report, warnings=(ignored, *plan.report.warnings)))
+    return (plan,)
+
+
+def _read_plans(document: Mapping[str, Any], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read several plans, lowest level first; a plan without a level is on level 0."""
+    plans = document["plans"]
+    if more := [str(key)[:50] for key in document if key != "plans"]:
+        raise InvalidFloorPlanError(f"'{more[0]}' stands beside 'plans'; move it into the plans, or remove it")
+    if not isinstance(plans, list) or not plans or not all(isinstance(plan, Mapping) for plan in plans):
+        raise InvalidFloorPlanError("'plans' must be a list of at least one plan, each an object with 'rooms'")
+    if len(plans) > 1 and options.level is None:
+        # The name of all plans together; each has its own.
+        options = replace(options, name=None)
+    levels = {str(number): (_level(plan, number), plan) for number, plan in enumerate(plans)}
+
+    def make(level: Level, plan: Mapping[str, Any]) -> ImportedPlan:
+        own = {key: value for key, value in plan.items() if key != "level"}
+        return replace(_read_plan(own, options, budget), level=level)
+
+    return assemble_levels(levels, options, budget.limits, make)
+
+
+def _level(plan: Mapping[str, Any], number: int) -> Level:
+    """Return the level of one of several plans, named like the plan, which errors name."""
+    level = plan.get("level", 0)
+    if not is_number(level) or not abs(level) <= _MAX_LEVEL:
+        raise InvalidFloorPlanError(
+            f"plan {number} of 'plans' has level {str(level)[:50]!r}; it must be a number from {-_MAX_LEVEL:g} to "
+            f"{_MAX_LEVEL:g}"
+        )
+    name = plan.get("name")
+    return Level(clean_name(name if isinstance(name, str) else None) or f"plan {number}", float(level))
+
+
+def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> ImportedPlan:
+    """Read a plan.
 
     The document can contain `units` and `y_axis` ("down"); the options take precedence. Keys that end in `_m` are
     always in metres. The same keys without it (`ceiling_height`) and all coordinates are in `units`.
@@ -58,7 +108,7 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
         builder.use("openings", str(opening["kind"]))
     builder.warnings.extend(check_document(parsed.to_dict()))
     report = builder.build("native", factor, "units" if "units" in document or options.units else "the format: metres")
-    return (ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed)),)
+    return ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed))
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
