@@ -154,6 +154,7 @@ class TestEncoder:
 
 
 class TestTraining:
+    @pytest.mark.slow
     def test_a_run_is_exported_and_answers_queries(self, tmp_path: Path) -> None:
         run = tmp_path / "run"
         train_views(SHORT, run, device=CPU, data=TrainingData(validation_scenes=1), workers=0)

@@ -126,7 +126,7 @@ def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: Database
         refused = assert_problem(
             client.post("/floorplans", json=FLAT, headers=bearer(reader)), 403, "insufficient-scope"
         )
-        assert refused["detail"].endswith("'write'; it has: read")
+        assert "'write'; it has: read." in refused["detail"]
         assert client.post("/floorplans", json=FLAT, headers=bearer(admin)).status_code == 201
         # Keys work beside tokens.
         store = Store(database_of(tmp_path))
@@ -483,3 +483,21 @@ def test_invalid_tokens_are_limited_and_events_end_with_the_token(
         statuses = [client.get("/limits", headers=bearer(brief)).status_code for _ in range(12)]
         assert set(statuses) == {401, 429}
         assert client.get("/limits", headers=bearer(valid)).status_code == 403
+        admin = _signed(FIRST, {"iss": issuer.url, "scope": "lalaloc:admin", "exp": int(time.time()) + 2000})
+        entries = client.get("/admin/audit", headers=bearer(admin)).json()["entries"]
+        results = {entry["result"] for entry in entries}
+        assert {"unauthenticated", "too-many-refused-keys", "insufficient-scope"} <= results
+
+
+@pytest.mark.one_replica
+def test_outage_of_the_issuer_is_said_and_audited(
+    start_app: StartApp, tmp_path: Path, issuer: AnyIssuer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(oidc, "_PAUSE_S", 0.0)
+    issuer.answer = lambda handler: handler.send_error(500)
+    with start_app(tmp_path, **_with_issuer(issuer.url)) as client:
+        admin = bearer(_signed(FIRST, {"iss": issuer.url, "scope": "lalaloc:admin"}))
+        assert_problem(client.get("/usage", headers=admin), 503, "issuer-unavailable")
+        issuer.answer = None
+        entries = client.get("/admin/audit", headers=admin).json()["entries"]
+        assert ("GET /usage", "issuer-unavailable") in {(entry["action"], entry["result"]) for entry in entries}

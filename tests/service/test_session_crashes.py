@@ -38,6 +38,7 @@ def kill(service: RunningService) -> None:
     service.process.wait(60.0)
 
 
+@pytest.mark.slow
 def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
     tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], panorama: bytes
 ) -> None:

@@ -167,14 +167,19 @@ def test_client_that_leaves_within_a_photograph_moves_nothing(
     assert send(client, session_id, panorama, number=1).status_code == 200
 
 
-def test_handshakes_are_refused_like_requests(client: httpx.Client, plan_id: str) -> None:
-    unknown = refusal(client, "0" * 32)
-    assert (unknown.status_code, unknown.json()["type"]) == (404, "urn:lalaloc:problem:unknown-session")
-    session_id = begin(client, plan_id)
-    foreign = refusal(client, session_id, origin="https://evil.example")
-    assert (foreign.status_code, foreign.json()["type"]) == (403, "urn:lalaloc:problem:exposed-without-keys")
-    with stream(client, session_id, origin=f"http://127.0.0.1:{client.base_url.port}"):
-        pass
+def test_handshakes_are_refused_like_requests(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        unknown = refusal(client, "0" * 32)
+        assert (unknown.status_code, unknown.json()["type"]) == (404, "urn:lalaloc:problem:unknown-session")
+        session_id = begin(client, upload(client))
+        foreign = refusal(client, session_id, origin="https://evil.example")
+        assert (foreign.status_code, foreign.json()["type"]) == (403, "urn:lalaloc:problem:exposed-without-keys")
+        with stream(client, session_id, origin=f"http://127.0.0.1:{client.base_url.port}"):
+            pass
+    store = Store(database_of(tmp_path))
+    results = [entry.result for entry in store.audit_log.export()]
+    store.close()
+    assert "exposed-without-keys" in results
 
 
 def test_connections_are_limited(start_app: StartApp, tmp_path: Path) -> None:

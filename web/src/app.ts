@@ -5,7 +5,7 @@ import { markSelected, showAnswer } from "./answer_panel";
 import { companions, ellipse, otherPlaces } from "./answer_overlay";
 import { api } from "./api";
 import { device } from "./device/device";
-import { byId, named, s, show } from "./dom";
+import { byId, named, s, scrollTo, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { heatMap } from "./heat";
@@ -371,9 +371,7 @@ class Page {
       this.photos.drawStrip();
       byId<HTMLDetailsElement>("settings").open = false;
       hideGuide();
-      const answer = byId("answer");
-      // The nearest edge of an answer that is higher than the window is its lower one.
-      answer.scrollIntoView({ block: answer.offsetHeight > innerHeight ? "start" : "nearest" });
+      scrollTo(byId("answer"));
     } catch (error) {
       if (!signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {

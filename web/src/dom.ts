@@ -68,6 +68,12 @@ export function followPointer(move: (event: PointerEvent) => void): void {
   addEventListener("pointercancel", end);
 }
 
+/** Scroll as little as needed to see an element, or its beginning if it is higher than the window. */
+export function scrollTo(element: HTMLElement): void {
+  // The nearest edge of a higher element is its lower one.
+  element.scrollIntoView({ block: element.offsetHeight > innerHeight ? "start" : "nearest" });
+}
+
 /** Offer a file for download. */
 export function download(content: Blob, name: string): void {
   const url = URL.createObjectURL(content);

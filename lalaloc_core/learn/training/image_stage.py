@@ -88,7 +88,7 @@ class ImageStage(TrainingStage):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            seen = self._draw_seen(len(ring))
+            seen = self._draw_seen(len(ring), ring.device)
             features, photograph_terms = self._encode(batch, seen)
             # The latent needs all sectors: the teacher's stand in for hidden ones.
             seen_ring = torch.where(seen[:, None], features.ring, ring)
@@ -119,7 +119,7 @@ class ImageStage(TrainingStage):
             return self.encoder(self._hide(self._augment(image), seen), height), {}
         count, columns = settings.photographs_per_batch, self.config.profile_columns
         photographs = self.photographs.draw(count, columns, self._generator(torch.device("cpu")))
-        photograph_seen = self._draw_seen(count)
+        photograph_seen = self._draw_seen(count, image.device)
         images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
         images = self._hide(images, torch.cat([seen, photograph_seen]))
         # The camera height of photographs is unknown, so their unit of length is the camera height.
@@ -176,9 +176,9 @@ class ImageStage(TrainingStage):
                 image = optics(image.float(), self.settings.optics, self._generator(image.device))
         return image
 
-    def _draw_seen(self, count: int) -> Bool[Tensor, "b s"]:
+    def _draw_seen(self, count: int, device: torch.device) -> Bool[Tensor, "b s"]:
         """Draw the sectors that pictures show: all, or in a share of the pictures a part of the horizon."""
-        sectors, device = self.config.ring.sectors, next(self.encoder.parameters()).device
+        sectors = self.config.ring.sectors
         if not self.settings.hidden_share:
             return torch.ones(count, sectors, dtype=torch.bool, device=device)
         generator = self._generator(torch.device("cpu"))
