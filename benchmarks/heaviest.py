@@ -297,10 +297,19 @@ def _post_levels(caller: Caller, _stored: Stored, size: int) -> None:
             caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
 
 
+@cache
+def _homes_body(homes: int) -> tuple[bytes, str]:
+    """Return a form with a file of many plans."""
+    return form((), (("file", _body({"plans": [home(number) for number in range(homes)]})),))
+
+
 def _extend_venue(caller: Caller, _stored: Stored, size: int) -> None:
-    content = _body({"plans": [home(number) for number in range(size)]})
-    path = f"/venues/{created(caller.send('POST', '/venues', _venue([])))}"
-    caller.send("PATCH", path, *form((), (("file", content),)))
+    body = _homes_body(size)
+    answer = caller.send("POST", "/venues", _venue([]))
+    if answer.status != 201:
+        return
+    path = f"/venues/{answer.json()['id']}"
+    caller.send("PATCH", path, *body)
     plans = caller.send("GET", f"{path}/plans?limit=500").json()["plans"]
     caller.send("DELETE", path)
     for plan in plans:

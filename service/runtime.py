@@ -174,8 +174,10 @@ def start_runtime(
     # One thread per client beside other clients, because small uploads share the interpreter with queries.
     uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts, cores=1, rests=True)
     _closing(cleanup, uploads)
-    # As many threads as converter processes. Closed after the converter, because its waiting jobs must end first.
-    file_threads = Threads("lalaloc-files", with_headroom(settings.imports.workers), telemetry.cpu_accounts, rests=True)
+    # As many threads as converter processes; fewer per client beside others, because plans are stored by this process.
+    # Closed after the converter, because its waiting jobs must end first.
+    count = with_headroom(settings.imports.workers)
+    file_threads = Threads("lalaloc-files", count, telemetry.cpu_accounts, cores=usable_cores(), rests=True)
     file_uploads = _closing(cleanup, file_threads)
     converter = _closing(cleanup, Converter(settings, telemetry))
     # A file can take its worker longer than the service may take to stop.
