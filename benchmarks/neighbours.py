@@ -314,6 +314,8 @@ def _flood(url: str, template: Template, load: Load) -> Iterator[tuple[dict[str,
     arguments = (url, template.heavy_key, number, load.size, template.stored[load.plan], theirs)
     process = context.Process(target=_send_flood, args=arguments, daemon=True)
     process.start()
+    # So that the end of the process ends the waiting for it.
+    theirs.close()
     answers: dict[str, int] = {}
     try:
         ours.recv()
