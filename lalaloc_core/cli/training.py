@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import dataclasses
 import json
 import os
@@ -19,6 +20,8 @@ from lalaloc_core.localise.bundle import Bundle
 _VALIDATION_HOMES = 50
 # Ratio of validation homes to out-of-distribution homes, which take longer to render.
 _PER_HELDOUT_HOME = 3
+# Parameters of glibc (malloc.h): size from which blocks are mapped, and free memory that is kept.
+_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 
 def add_commands(commands: Any) -> None:
@@ -150,6 +153,7 @@ def _train(arguments: argparse.Namespace) -> None:
     if device.type == "cpu":
         # Workers need cores of their own: threads that share cores are slower than fewer threads.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
+        _keep_freed_memory()
     if arguments.workers < 0:
         raise InvalidInputError(f"--workers is {arguments.workers}; it must be at least 0")
     if arguments.validation_homes < 1:
@@ -175,6 +179,14 @@ def _train(arguments: argparse.Namespace) -> None:
     optional = {name: getattr(arguments, name) for name in ("init_from", "layout_from")}
     given = {name: value for name, value in optional.items() if value is not None}
     train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **given)
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep what a step frees for the next one: returned to the system, it comes back by slow page faults."""
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_MMAP_THRESHOLD, 2**30)
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def _settings(pairs: list[str]) -> dict[str, Any]:

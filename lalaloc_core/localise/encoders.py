@@ -207,8 +207,7 @@ class Encoders:
     ) -> dict[str, Any]:
         """Return the predictions of a query, rolled to the right by numbers of sectors."""
         columns = shifts * (len(outputs["log_profile"]) // sectors)
-        profile = PredictedProfile(outputs["log_profile"][None], outputs["log_scale"][None])
-        predictions: dict[str, Any] = {"profile": profile.moved(columns)}
+        predictions: dict[str, Any] = {"profile": PredictedProfile.of_outputs(outputs).moved(columns)}
         if self.predicts_structure:
             openings = rolled(log_softmax(outputs["opening_logits"]), columns)
             predictions["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))

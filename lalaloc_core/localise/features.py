@@ -26,7 +26,7 @@ from lalaloc_core.errors import (
     InvalidPanoramaError,
 )
 from lalaloc_core.localise.bundle import IMAGE_ONNX, MANIFEST_NAME, VIEW_ONNX, Bundle, Manifest, MatchingWeights
-from lalaloc_core.localise.image_network import SphereNetwork
+from lalaloc_core.localise.image_network import PROFILE_OUTPUTS, SHARE_OUTPUT, SphereNetwork
 from lalaloc_core.localise.view_encoder import OnnxViewEncoder
 from lalaloc_core.photograph import Assumed, Encoded, Intrinsics, StatedView, View
 from lalaloc_core.photograph.cameras import Camera, Fisheye, Perspective
@@ -42,7 +42,8 @@ _MAX_WARNINGS, _MAX_WARNING_CHARACTERS = 8, 300
 # Camera heights (m) of the rings. The ring is the only output that depends on the height other than by its log.
 _RING_HEIGHTS_M = (0.5, 1.0, 1.5, 2.0, 3.0)
 # Modes of the distance that the encoder of views predicts at each azimuth.
-_MODES = 2
+_VIEW_MODES = 2
+_WALLS = (*PROFILE_OUTPUTS, SHARE_OUTPUT)
 # Ranges of the values, far beyond those of real ones; logs of lengths and of scales, then unbounded outputs.
 _LOGS, _OUTPUTS = (-12.0, 12.0), (-1e4, 1e4)
 _RANGES = {"log_share": (-1e4, 1e-3), "seen": (-1e-3, 1.0 + 1e-3), "ring": _OUTPUTS}
@@ -221,13 +222,15 @@ def _layout(manifest: Manifest, patches: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays, in the order of the file, of a full sphere or of some patches."""
     columns = manifest.profile_columns
     if not patches:
-        walls = dict.fromkeys(("log_profile", "log_scale"), (columns,))
+        modes = manifest.image_config.get("modes", 1)
+        names, shape = (_WALLS[:2], (columns,)) if modes == 1 else (_WALLS, (columns, modes))
+        walls = dict.fromkeys(names, shape)
         ring = (len(_RING_HEIGHTS_M), manifest.layout_config["channels"], manifest.ring_sectors)
         return {"ring": ring, **walls, **_structure((), columns)}
     assert manifest.view is not None
     columns = manifest.view.sectors * columns // manifest.ring_sectors
-    modes = dict.fromkeys(("log_profile", "log_scale", "log_share"), (patches, columns, _MODES))
-    return {**modes, "seen": (patches, columns), **_structure((patches,), columns)}
+    walls = dict.fromkeys(_WALLS, (patches, columns, _VIEW_MODES))
+    return {**walls, "seen": (patches, columns), **_structure((patches,), columns)}
 
 
 def _structure(patches: tuple[int, ...], columns: int) -> dict[str, tuple[int, ...]]:

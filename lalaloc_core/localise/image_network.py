@@ -11,9 +11,11 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.bundle import IMAGE_ONNX, Bundle, Manifest
 
 PROFILE_OUTPUTS = ["log_profile", "log_scale"]
+# Further output of networks that predict walls as mixtures; the others then have a value for each mode.
+SHARE_OUTPUT = "log_share"
 STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
 # Outputs with a value for every azimuth column.
-_BY_COLUMN = ("log_profile", "log_scale", "opening_logits")
+_BY_COLUMN = (*PROFILE_OUTPUTS, SHARE_OUTPUT, "opening_logits")
 
 
 class SphereNetwork:
@@ -36,9 +38,11 @@ class SphereNetwork:
         self.session = None if image is None else session(image, threads)
         inputs = [] if self.session is None else self.session.get_inputs()
         self._takes_height = any(node.name == "camera_height_m" for node in inputs)
-        outputs = [] if self.session is None else self.session.get_outputs()
-        self.predicts_profile = {node.name for node in outputs}.issuperset(PROFILE_OUTPUTS)
-        self.predicts_structure = {node.name for node in outputs}.issuperset(STRUCTURE_OUTPUTS)
+        outputs = {node.name for node in ([] if self.session is None else self.session.get_outputs())}
+        self.predicts_profile = outputs.issuperset(PROFILE_OUTPUTS)
+        self.predicts_structure = outputs.issuperset(STRUCTURE_OUTPUTS)
+        known = (*PROFILE_OUTPUTS, SHARE_OUTPUT, *STRUCTURE_OUTPUTS)
+        self._predictions = [name for name in known if name in outputs]
         if self.predicts_structure:
             _check_classes(self._manifest)
 
@@ -52,10 +56,9 @@ class SphereNetwork:
         """
         if not self.predicts_profile:
             return {"ring": self.run(image[None], camera_height_m, ["ring"])[0][0]}
-        names = [*PROFILE_OUTPUTS, *(STRUCTURE_OUTPUTS if self.predicts_structure else [])]
-        ring, *outputs = self.run(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
+        ring, *outputs = self.run(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *self._predictions])
         averaged = {}
-        for name, (value, mirrored) in zip(names, outputs, strict=True):
+        for name, (value, mirrored) in zip(self._predictions, outputs, strict=True):
             averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
         return {"ring": ring[0], **averaged}
 

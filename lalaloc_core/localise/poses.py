@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -134,6 +135,24 @@ class PredictedProfile:
     log_m: Float[np.ndarray, "k w"]
     log_scale: Float[np.ndarray, "k w"]
     rival: RivalWall | None = None
+
+    @classmethod
+    def of_outputs(cls, outputs: Mapping[str, np.ndarray]) -> PredictedProfile:
+        """Return the profile of one hypothesis by the outputs of an image encoder, the mode with most density first.
+
+        `log_profile` and `log_scale` are (w,), or with `log_share` (w, 2).
+        """
+        log_m, log_scale = outputs["log_profile"], outputs["log_scale"]
+        if log_m.ndim == 1:
+            return cls(log_m[None], log_scale[None])
+        density = outputs["log_share"] - log_scale
+        order = np.argsort(-density, axis=1, kind="stable")
+        log_m, log_scale, density = (np.take_along_axis(value, order, axis=1) for value in (log_m, log_scale, density))
+        # Azimuths that the photograph does not show have infinite scales.
+        with np.errstate(invalid="ignore"):
+            odds = np.nan_to_num(np.exp(density[:, 1] - density[:, 0]))
+        rival = RivalWall(log_m[None, :, 1], log_scale[None, :, 1], odds[None])
+        return cls(log_m[None, :, 0], log_scale[None, :, 0], rival)
 
     def moved(self, shifts: Int[np.ndarray, "j"]) -> PredictedProfile:
         """Return a profile of one hypothesis, moved to the right by a number of columns for each of several."""

@@ -15,14 +15,13 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.bundle import VIEW_ONNX, Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import log_softmax
-from lalaloc_core.localise.image_network import PROFILE_OUTPUTS, STRUCTURE_OUTPUTS, array, session
+from lalaloc_core.localise.image_network import PROFILE_OUTPUTS, SHARE_OUTPUT, STRUCTURE_OUTPUTS, array, session
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
     PredictedRoomType,
     Query,
-    RivalWall,
     rolled,
 )
 
@@ -32,7 +31,7 @@ _TRAINED_TILT_SD = math.radians(0.7)
 _BATCH = 4
 # Smallest share of an azimuth column that must be seen to count.
 MIN_SEEN = 0.25
-VIEW_OUTPUTS = [*PROFILE_OUTPUTS, "log_share", "seen", *STRUCTURE_OUTPUTS]
+VIEW_OUTPUTS = [*PROFILE_OUTPUTS, SHARE_OUTPUT, "seen", *STRUCTURE_OUTPUTS]
 
 
 class LevelPatch(NamedTuple):
@@ -157,16 +156,6 @@ class OnnxViewEncoder:
         self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight
     ) -> Query:
         """Return a query with one hypothesis for each shift, a number of columns to the right."""
-        density = outputs["log_share"] - outputs["log_scale"]
-        order = np.argsort(-density, axis=1, kind="stable")
-        log_m, log_scale, density = (
-            np.take_along_axis(value, order, axis=1)
-            for value in (outputs["log_profile"], outputs["log_scale"], density)
-        )
-        with np.errstate(invalid="ignore"):
-            odds = np.nan_to_num(np.exp(density[:, 1] - density[:, 0]))
-        rival = RivalWall(log_m[None, :, 1], log_scale[None, :, 1], odds[None])
-        profile = PredictedProfile(log_m[None, :, 0], log_scale[None, :, 0], rival)
         openings = rolled(log_softmax(outputs["opening_logits"]), shifts)
         return Query(
             np.zeros((len(shifts), self._manifest.latent_size), np.float32),
@@ -174,7 +163,7 @@ class OnnxViewEncoder:
             0.0,
             False,
             camera_height,
-            profile=profile.moved(shifts),
+            profile=PredictedProfile.of_outputs(outputs).moved(shifts),
             openings=PredictedOpenings(openings, np.array(self._view.opening_prior)),
             ceiling=PredictedCeiling(float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])),
             room_type=PredictedRoomType(log_softmax(outputs["room_type_logits"]), np.array(self._view.room_type_prior)),

@@ -19,13 +19,16 @@ from torch import Tensor, nn
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.horizon_attention import HorizonAttention
-from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures
+from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, WallModes
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 
 # Smallest update rate of the running class shares.
 _SHARE_RATE = 1e-3
 _MIN_LOG_SCALE, _MAX_LOG_SCALE = -6.0, 2.0
+# Log distance, log scale and logit of the share of each mode when training begins, relative to the first one; if they
+# were alike, both modes would learn the same.
+_APART = ((0.0, 0.0, 0.0), (0.7, 0.0, -2.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,8 @@ class TrunkEncoderConfig:
         trunk: sizes of the trunk.
         squeezed: features per sector from each feature map of the trunk.
         mixer_width, mixer_blocks, mixer_heads: sizes of the attention around the horizon.
+        modes: distributions whose mixture predicts the wall at an azimuth; with two, a passage and the wall behind it
+            are no compromise.
     """
 
     image_height: int = 128
@@ -46,6 +51,7 @@ class TrunkEncoderConfig:
     mixer_width: int = 192
     mixer_blocks: int = 2
     mixer_heads: int = 4
+    modes: int = 1
 
     def __post_init__(self) -> None:
         """Check the sizes.
@@ -58,6 +64,8 @@ class TrunkEncoderConfig:
                 raise ConfigError(f"trunk.{name} is {getattr(self, name)}; it must be a multiple of {TAP_STRIDES[-1]}")
         if len(self.squeezed) != len(TAP_STRIDES):
             raise ConfigError(f"trunk.squeezed has {len(self.squeezed)} values; it must have {len(TAP_STRIDES)}")
+        if not 1 <= self.modes <= len(_APART):
+            raise ConfigError(f"trunk.modes is {self.modes}; it must lie between 1 and {len(_APART)}")
 
 
 class HorizonEncoder(nn.Module):
@@ -67,7 +75,6 @@ class HorizonEncoder(nn.Module):
         config: sizes.
         sectors: sectors that the picture covers.
         columns_per_sector: azimuth columns of a sector.
-        profile_outputs: values that are predicted of the wall at each azimuth column.
         extra_inputs: further features of each sector, given to `sector_features`.
         circular: the picture shows the full circle.
     """
@@ -78,7 +85,6 @@ class HorizonEncoder(nn.Module):
         sectors: int,
         columns_per_sector: int,
         *,
-        profile_outputs: int,
         extra_inputs: int = 0,
         circular: bool,
     ) -> None:
@@ -102,7 +108,11 @@ class HorizonEncoder(nn.Module):
             )
         )
         self.norm = nn.LayerNorm(width)
-        self.to_profile = nn.Linear(width, profile_outputs * columns_per_sector)
+        self.to_profile = nn.Linear(width, columns_per_sector * config.modes * _values_per_mode(config.modes))
+        if config.modes > 1:
+            with torch.no_grad():
+                self.to_profile.bias.unflatten(0, (columns_per_sector, config.modes, -1)).add_(torch.tensor(_APART))
+        self.register_load_state_dict_pre_hook(_with_all_modes)
         self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * columns_per_sector)
         self.to_ceiling = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, 2))
         self.to_room_type = nn.Sequential(nn.Linear(2 * width, width), nn.GELU(), nn.Linear(width, len(ROOM_TYPES)))
@@ -143,10 +153,15 @@ class HorizonEncoder(nn.Module):
             squeezed.append(extra)
         return self.norm(self.mixer(self.join(torch.cat(squeezed, dim=2))))
 
-    def profile_values(self, mixed: Float[Tensor, "b s c"]) -> Float[Tensor, "b w p"]:
-        """Return the predicted values of the wall at each azimuth column."""
-        values = self.to_profile(mixed)
-        return values.unflatten(2, (self.columns_per_sector, -1)).flatten(1, 2)
+    def walls(self, mixed: Float[Tensor, "b s c"], log_height: Float[Tensor, "b"]) -> WallModes:
+        """Return the distance of the wall at each azimuth column; `log_height` as for `structure`."""
+        values = self.to_profile(mixed).unflatten(2, (self.columns_per_sector, self.config.modes, -1)).flatten(1, 2)
+        share = values[..., 2] if self.config.modes > 1 else torch.zeros_like(values[..., 0])
+        return WallModes(
+            log_profile=values[..., 0] + log_height[:, None, None],
+            log_scale=values[..., 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
+            log_share=torch.log_softmax(share, dim=2),
+        )
 
     def structure(self, mixed: Float[Tensor, "b s c"], log_height: Float[Tensor, "b"]) -> StructureFeatures:
         """Return openings, ceiling height and room type; `log_height` is the log of the camera height (m)."""
@@ -156,7 +171,7 @@ class HorizonEncoder(nn.Module):
         return StructureFeatures(
             opening_logits=openings,
             log_ceiling=ceiling[:, 0] + log_height,
-            log_ceiling_scale=clamped_scale(ceiling[:, 1]),
+            log_ceiling_scale=ceiling[:, 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
             room_type_logits=self.to_room_type(overall),
         )
 
@@ -169,7 +184,7 @@ class TrunkImageEncoder(HorizonEncoder):
     """Image encoder: panorama and camera height to ring, wall profile, openings, ceiling height and room type."""
 
     def __init__(self, config: TrunkEncoderConfig, ring: RingConfig) -> None:
-        super().__init__(config, ring.sectors, ring.profile_columns // ring.sectors, profile_outputs=2, circular=True)
+        super().__init__(config, ring.sectors, ring.profile_columns // ring.sectors, circular=True)
         width = config.mixer_width
         self.to_ring = nn.Sequential(nn.Linear(width + 1, width), nn.GELU(), nn.Linear(width, ring.channels))
 
@@ -183,18 +198,31 @@ class TrunkImageEncoder(HorizonEncoder):
         mixed = self.sector_features(self.normalised(image), styles)
         log_height = torch.log(camera_height_m)
         height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
-        profile = self.profile_values(mixed)
         return ImageFeatures(
             ring=self.to_ring(torch.cat([mixed, height_input], dim=2)).transpose(1, 2),
-            log_profile=profile[..., 0] + log_height[:, None],
-            log_scale=clamped_scale(profile[..., 1]),
+            walls=self.walls(mixed, log_height),
             structure=self.structure(mixed, log_height),
         )
 
 
-def clamped_scale(log_scale: Tensor) -> Tensor:
-    """Limit the log of a predicted scale."""
-    return log_scale.clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE)
+def _values_per_mode(modes: int) -> int:
+    """Return the number of values predicted of a mode: log distance, log scale, and among several its share's logit."""
+    return 2 if modes == 1 else len(_APART[0])
+
+
+def _with_all_modes(encoder: HorizonEncoder, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Let all modes of an encoder begin as the only mode of the weights that it is about to load."""
+    modes = encoder.config.modes
+    for name, own in encoder.to_profile.named_parameters():
+        key = f"{prefix}to_profile.{name}"
+        if key not in state or len(state[key]) != encoder.columns_per_sector * _values_per_mode(1) or modes == 1:
+            continue
+        single = state[key].unflatten(0, (encoder.columns_per_sector, 1, -1))
+        values = torch.zeros_like(own).unflatten(0, (encoder.columns_per_sector, modes, -1))
+        values[:, :, : single.shape[2]] = single
+        if name == "bias":
+            values += torch.tensor(_APART).to(values)
+        state[key] = values.flatten(0, 2)
 
 
 def _interpolation(width: int, stride: int, sectors: int, circular: bool) -> Float[Tensor, "s v"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -25,19 +26,42 @@ class StructureFeatures:
 
 
 @dataclass(frozen=True)
+class WallModes:
+    """Distance of the wall at each azimuth, as a mixture of Laplace distributions of its log.
+
+    Attributes:
+        log_profile: (b, w, m) centres of the modes: log distances of the wall (m).
+        log_scale: (b, w, m) logs of the scales of the modes.
+        log_share: (b, w, m) logs of the shares of the modes, which sum to 1.
+    """
+
+    log_profile: Tensor
+    log_scale: Tensor
+    log_share: Tensor
+
+    @property
+    def likeliest(self) -> Float[Tensor, "b w"]:
+        """Log distance (m) of the mode with the highest density."""
+        best = (self.log_share - self.log_scale).argmax(dim=2, keepdim=True)
+        return self.log_profile.gather(2, best)[..., 0]
+
+    def rows(self, rows: slice) -> WallModes:
+        """Return the predictions for some pictures of a batch."""
+        return WallModes(*(value[rows] for value in vars(self).values()))
+
+
+@dataclass(frozen=True)
 class ImageFeatures:
     """Predictions of an image encoder for a batch of panoramas.
 
     Attributes:
         ring: (b, c, s) features to compare with the layout encoder's.
-        log_profile: (b, w) log of the predicted wall profile (m).
-        log_scale: (b, w) log of the scale of the Laplace distribution of `log_profile`'s error.
+        walls: distance of the wall at each azimuth.
         structure: openings, ceiling height and room type, if the encoder predicts them.
     """
 
     ring: Tensor
-    log_profile: Tensor
-    log_scale: Tensor
+    walls: WallModes
     structure: StructureFeatures | None = None
 
 
@@ -46,4 +70,4 @@ def first_rows(features: ImageFeatures, count: int) -> ImageFeatures:
     structure = features.structure
     if structure is not None:
         structure = StructureFeatures(**{name: value[:count] for name, value in vars(structure).items()})
-    return ImageFeatures(features.ring[:count], features.log_profile[:count], features.log_scale[:count], structure)
+    return ImageFeatures(features.ring[:count], features.walls.rows(slice(count)), structure)

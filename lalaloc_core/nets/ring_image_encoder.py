@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lalaloc_core.nets.horizon_attention import HorizonAttention
-from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.image_features import ImageFeatures, WallModes
 from lalaloc_core.nets.layout_encoder import RingConfig, pad_around
 
 IMAGE_MEAN = (0.5, 0.5, 0.5)
@@ -92,6 +92,9 @@ class RingImageEncoder(nn.Module):
         return ImageFeatures(
             ring=self.to_ring(mixed).transpose(1, 2),
             # The network predicts distances in units of the camera height.
-            log_profile=profile[..., 0] + scale[:, :, 0],
-            log_scale=profile[..., 1].clamp(-6.0, 2.0),
+            walls=WallModes(
+                log_profile=(profile[..., 0] + scale[:, :, 0])[..., None],
+                log_scale=profile[..., 1:].clamp(-6.0, 2.0),
+                log_share=torch.zeros_like(profile[..., 1:]),
+            ),
         )

@@ -17,14 +17,10 @@ from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.image_encoder import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder, clamped_scale
-from lalaloc_core.nets.image_features import StructureFeatures
+from lalaloc_core.nets.image_encoder import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder
+from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.trunk import TAP_STRIDES, StyleMixing
-
-MODES = 2
-# Values predicted of each mode: log distance, log scale, logit of its share.
-_VALUES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +34,7 @@ class ViewEncoderConfig(TrunkEncoderConfig):
 
     image_height: int = 192
     image_width: int = 256
+    modes: int = 2
     sectors: int = 20
     top_deg: float = 39.375
 
@@ -62,16 +59,12 @@ class ViewFeatures:
     """Predictions of the encoder for a batch of views.
 
     Attributes:
-        log_profile: (b, w, m) centres of the modes: log distances of the wall (m).
-        log_scale: (b, w, m) logs of the scales of the modes.
-        log_share: (b, w, m) logs of the shares of the modes, which sum to 1.
+        walls: distance of the wall at each azimuth.
         seen: (b, w) share of each azimuth column that the photograph shows.
         structure: openings, ceiling height and room type.
     """
 
-    log_profile: Tensor
-    log_scale: Tensor
-    log_share: Tensor
+    walls: WallModes
     seen: Tensor
     structure: StructureFeatures
 
@@ -88,7 +81,6 @@ class ViewEncoder(HorizonEncoder):
             config,
             config.sectors,
             ring.profile_columns // ring.sectors,
-            profile_outputs=_VALUES * MODES,
             extra_inputs=1,
             circular=False,
         )
@@ -96,23 +88,21 @@ class ViewEncoder(HorizonEncoder):
         self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
         self.pooling: Tensor
         self.row_elevations = config.row_elevations(ring)
-        # The modes begin apart, or both would learn the same.
-        self._apart = torch.tensor([0.7, 0.0, -2.0])
-        with torch.no_grad():
-            self.to_profile.bias.view(-1, MODES, _VALUES)[:, 1] += self._apart
 
     @torch.no_grad()
     def start_from(self, sphere: TrunkImageEncoder) -> None:
-        """Take over the weights of an encoder of spheres; both modes begin as its only one.
+        """Take over the weights of an encoder of spheres; if it has one mode, both begin as that.
 
         Layers that flatten feature maps over height are resampled from the sphere's rows to the patch's.
         """
         own, theirs = self.state_dict(), sphere.state_dict()
-        for name, value in theirs.items():
-            if name in own and own[name].shape == value.shape:
-                own[name].copy_(value)
-        own["join.weight"][:, : sphere.join.in_features].copy_(theirs["join.weight"])
-        own["join.weight"][:, sphere.join.in_features :].zero_()
+        taken = {
+            name: value
+            for name, value in theirs.items()
+            if name in own and (own[name].shape == value.shape or name.startswith("to_profile."))
+        }
+        taken["join.weight"] = torch.zeros_like(own["join.weight"])
+        taken["join.weight"][:, : sphere.join.in_features] = theirs["join.weight"]
         elevations = torch.from_numpy(self.row_elevations).float()
         for number, stride in enumerate(TAP_STRIDES):
             weight = theirs[f"squeezes.{number}.weight"]
@@ -124,11 +114,8 @@ class ViewEncoder(HorizonEncoder):
             resampled = torch.lerp(by_row[..., left.long()], by_row[..., left.long() + 1], share)
             # A row of the sphere is seen by several rows of the patch.
             per_row = abs(float(elevations[0] - elevations[stride])) * rows / torch.pi
-            own[f"squeezes.{number}.weight"].copy_((resampled * per_row).flatten(1))
-        for name in ("weight", "bias"):
-            values = own[f"to_profile.{name}"].unflatten(0, (self.columns_per_sector, MODES, _VALUES))
-            values[:, :, :2] = theirs[f"to_profile.{name}"].unflatten(0, (self.columns_per_sector, 1, 2))
-        own["to_profile.bias"].unflatten(0, (self.columns_per_sector, MODES, _VALUES))[:, 1] += self._apart
+            taken[f"squeezes.{number}.weight"] = (resampled * per_row).flatten(1)
+        self.load_state_dict(own | taken)
 
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
@@ -144,11 +131,8 @@ class ViewEncoder(HorizonEncoder):
         by_sector = seen.unflatten(1, (-1, self.columns_per_sector)).mean(dim=2)
         mixed = self.sector_features(pixels, styles, by_sector[..., None])
         log_height = torch.log(camera_height_m)
-        modes = self.profile_values(mixed).unflatten(2, (MODES, _VALUES))
         return ViewFeatures(
-            log_profile=modes[..., 0] + log_height[:, None, None],
-            log_scale=clamped_scale(modes[..., 1]),
-            log_share=torch.log_softmax(modes[..., 2], dim=2),
+            walls=self.walls(mixed, log_height),
             seen=seen,
             structure=self.structure(mixed, log_height),
         )

@@ -71,8 +71,8 @@ class TestRolls:
             turned = encoder(image.roll(pixels * sectors, dims=2), height)
             torch.testing.assert_close(turned.ring, still.ring.roll(sectors, dims=2), atol=1e-4, rtol=1e-3)
             for name in ("log_profile", "log_scale"):
-                expected = getattr(still, name).roll(COLUMNS // SECTORS * sectors, dims=1)
-                torch.testing.assert_close(getattr(turned, name), expected, atol=1e-4, rtol=1e-3)
+                expected = getattr(still.walls, name).roll(COLUMNS // SECTORS * sectors, dims=1)
+                torch.testing.assert_close(getattr(turned.walls, name), expected, atol=1e-4, rtol=1e-3)
 
 
 class TestRealEncoders:

@@ -12,12 +12,20 @@ from hypothesis import strategies as st
 
 from lalaloc_core.learn.metrics import Accuracy, chamfer_distance
 from lalaloc_core.learn.training import losses
+from lalaloc_core.nets.image_features import WallModes
 from tests.strategies import present, seeds
 
 
 def distances(seed: int, anchors: int = 3, neighbours: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed % 2**31)
     return tuple(torch.empty(anchors, neighbours).uniform_(0.1, 2.0, generator=generator) for _ in range(2))  # type: ignore[return-value]
+
+
+def walls(log_profile: torch.Tensor, log_scale: float) -> WallModes:
+    """Return walls of one mode each."""
+    return WallModes(
+        *(value[..., None] for value in (log_profile, torch.full_like(log_profile, log_scale), 0.0 * log_profile))
+    )
 
 
 class TestLogRatio:
@@ -97,12 +105,23 @@ class TestOthers:
         log_profile = torch.log(profile) + error
 
         def loss(log_scale: float, shift: float = 0.0) -> float:
-            return losses.laplace(log_profile + shift, torch.full((1, 4), log_scale), profile).item()
+            return losses.laplace_mixture(walls(log_profile + shift, log_scale), profile.log()).item()
 
         # The loss is minimal at the scale of the error, and at the true profile.
         assert loss(log_error) < min(loss(log_error - 0.1), loss(log_error + 0.1))
         assert loss(log_error) == pytest.approx(1.0 + log_error, abs=1e-4)
         assert loss(log_error, shift=-error) == pytest.approx(log_error, abs=1e-4)
+
+    def test_each_of_two_modes_explains_its_own_walls(self) -> None:
+        near, far = torch.zeros(1, 2), torch.ones(1, 2)
+        modes = WallModes(
+            torch.stack([near, far], dim=2), torch.full((1, 2, 2), -3.0), torch.full((1, 2, 2), -math.log(2))
+        )
+        target = torch.tensor([[0.0, 1.0]])
+        compromise = losses.laplace_mixture(walls(torch.full((1, 2), 0.5), math.log(0.5)), target)
+        assert losses.laplace_mixture(modes, target) < compromise - 1.0
+        known = torch.tensor([[True, False]])
+        assert losses.laplace_mixture(modes, torch.tensor([[0.0, 9.0]]), known) < compromise
 
 
 class TestStructure:
@@ -168,7 +187,7 @@ class TestStructure:
             [[[0.9, 0.0, 0.0, 0.1], [0.9, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.9], [0, 0.6, 0, 0.4]]]
         )
         logits = (probability + 1e-9).log().requires_grad_()
-        loss = losses.teacher_walls(log_profile, torch.zeros(1, 4), target, logits)
+        loss = losses.teacher_walls(walls(log_profile, 0.0), target, logits)
         gradient, logits_gradient = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
         assert torch.equal(gradient.sign(), torch.tensor([[-1.0, 0.0, 0.0, 1.0]]))
         # The student must not reduce the loss by predicting a passage.

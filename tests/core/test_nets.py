@@ -119,7 +119,8 @@ class TestRing:
         with torch.no_grad():
             features = encoder(image, torch.tensor([1.3, 1.6]))
         assert features.ring.shape == (2, config.channels, config.sectors)
-        assert features.log_profile.shape == features.log_scale.shape == (2, config.profile_columns)
+        walls = features.walls
+        assert walls.log_profile.shape == walls.log_scale.shape == (2, config.profile_columns, 1)
 
     def test_fused_encoder_gives_the_same_output(self) -> None:
         torch.manual_seed(0)
@@ -146,7 +147,7 @@ class TestRing:
         with torch.no_grad():
             encoder.squeeze.weight[:, -1] = 0.0
             image = torch.randint(0, 256, (1, TINY.image_height, TINY.image_width, 3), dtype=torch.uint8)
-            low, high = (encoder(image, torch.tensor([height])).log_profile for height in (1.0, 2.0))
+            low, high = (encoder(image, torch.tensor([height])).walls.log_profile for height in (1.0, 2.0))
         torch.testing.assert_close(high - low, torch.full_like(low, 0.6931472))
 
     @pytest.mark.parametrize("padding", [0, 1, 3])

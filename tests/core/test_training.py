@@ -41,7 +41,7 @@ from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder
 from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.image_features import ImageFeatures, WallModes
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.sampling import random_poses
@@ -432,8 +432,9 @@ class TestStages:
         stage = image_stage(TINY, teacher)
         batch = next(stage.batches(0, 0))
         profile, camera, ceiling = batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"]
+        certain = torch.zeros_like(profile)[..., None]
         perfect = ImageFeatures(
-            ring=teacher.ring(profile, camera, ceiling), log_profile=profile.log(), log_scale=torch.zeros_like(profile)
+            ring=teacher.ring(profile, camera, ceiling), walls=WallModes(profile.log()[..., None], certain, certain)
         )
         monkeypatch.setattr(stage, "encoder", lambda image, height: perfect)
         assert all(abs(term.item()) < 1e-5 for term in stage.losses(batch).values())

@@ -45,6 +45,7 @@ WIDE = TrunkEncoderConfig(
     mixer_width=16,
     mixer_blocks=1,
     mixer_heads=2,
+    modes=2,
 )
 needs_weights = pytest.mark.skipif(
     importlib.util.find_spec(PRETRAINED_PACKAGE) is None, reason="the package with the pretrained weights is not there"
@@ -183,7 +184,9 @@ class TestEncoder:
     def test_outputs_have_the_documented_shapes(self, encoder: TrunkImageEncoder) -> None:
         features = encoder(pictures(2), torch.tensor([1.2, 1.6]))
         assert features.ring.shape == (2, TINY.ring.channels, TINY.ring.sectors)
-        assert features.log_profile.shape == features.log_scale.shape == (2, TINY.profile_columns)
+        for values in vars(features.walls).values():
+            assert values.shape == (2, TINY.profile_columns, 2)
+        torch.testing.assert_close(features.walls.log_share.exp().sum(dim=2), torch.ones(2, TINY.profile_columns))
         assert features.structure is not None
         assert features.structure.opening_logits.shape == (2, TINY.profile_columns, len(OPENING_CLASSES))
         assert features.structure.log_ceiling.shape == features.structure.log_ceiling_scale.shape == (2,)
@@ -196,9 +199,9 @@ class TestEncoder:
         plain, scaled = encoder(image, height), encoder(image, factor * height)
         before, after = present(plain.structure), present(scaled.structure)
         offset = torch.log(torch.tensor(factor))
-        torch.testing.assert_close(scaled.log_profile, plain.log_profile + offset, atol=1e-6, rtol=0.0)
+        torch.testing.assert_close(scaled.walls.log_profile, plain.walls.log_profile + offset, atol=1e-6, rtol=0.0)
         torch.testing.assert_close(after.log_ceiling, before.log_ceiling + offset, atol=1e-6, rtol=0.0)
-        assert torch.equal(plain.log_scale, scaled.log_scale)
+        assert torch.equal(plain.walls.log_scale, scaled.walls.log_scale)
         for name in ("opening_logits", "log_ceiling_scale", "room_type_logits"):
             assert torch.equal(getattr(before, name), getattr(after, name))
         # Layouts are compared in metres, so the ring must know.
@@ -214,12 +217,25 @@ class TestEncoder:
         sectors, columns = (n * pixels // WIDE.image_width for n in (TINY.ring.sectors, TINY.profile_columns))
         for found, expected in (
             (rolled.ring, plain.ring.roll(sectors, 2)),
-            (rolled.log_profile, plain.log_profile.roll(columns, 1)),
-            (rolled.log_scale, plain.log_scale.roll(columns, 1)),
+            (rolled.walls.log_profile, plain.walls.log_profile.roll(columns, 1)),
+            (rolled.walls.log_scale, plain.walls.log_scale.roll(columns, 1)),
             (after.opening_logits, before.opening_logits.roll(columns, 1)),
             (after.log_ceiling, before.log_ceiling),
         ):
             torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+    def test_both_modes_start_as_the_only_one_of_earlier_weights(self) -> None:
+        torch.manual_seed(0)
+        single = TrunkImageEncoder(dataclasses.replace(TINY.trunk, modes=1), TINY.ring).eval()
+        double = build_image_encoder(TINY).eval()
+        double.load_state_dict(single.state_dict())
+        with torch.no_grad():
+            one, two = (encoder(pictures(2, TINY.trunk), torch.ones(2)).walls for encoder in (single, double))
+        torch.testing.assert_close(two.likeliest, one.log_profile[..., 0])
+        torch.testing.assert_close(two.log_scale[..., 0], one.log_scale[..., 0])
+        # The second one is farther and less likely, so that each learns its own walls.
+        assert (two.log_profile[..., 1] > two.log_profile[..., 0]).all()
+        assert (two.log_share[..., 1] < two.log_share[..., 0]).all()
 
     def test_sectors_align_with_their_pixels(self) -> None:
         """Check that interpolation maps the centre of a column's receptive field to its sector."""

@@ -33,6 +33,7 @@ from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PredictedProfile, Query, RivalWall
 from lalaloc_core.localise.view_encoder import LevelPatch, OnnxViewEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_features import WallModes
 from lalaloc_core.nets.view_encoder import ViewEncoder
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.view import View
@@ -135,7 +136,7 @@ class TestEncoder:
         other[:, :, 40:, :3] = 9
         with torch.no_grad():
             first, second = (encoder(view, torch.ones(1)) for view in (image, other))
-        torch.testing.assert_close(first.log_profile, second.log_profile)
+        torch.testing.assert_close(first.walls.log_profile, second.walls.log_profile)
         columns = 4 * encoder.columns_per_sector
         torch.testing.assert_close(first.seen[0], (40 / 64 * columns - torch.arange(columns)).clamp(0, 1))
 
@@ -196,14 +197,14 @@ class TestTraining:
 
     def test_only_seen_azimuths_count(self) -> None:
         target = torch.zeros(1, 4)
-        modes = torch.zeros(1, 4, 2), torch.zeros(1, 4, 2), torch.full((1, 4, 2), math.log(0.5))
+        modes = WallModes(torch.zeros(1, 4, 2), torch.zeros(1, 4, 2), torch.full((1, 4, 2), math.log(0.5)))
         known = torch.tensor([[True, True, False, False]])
         wrong = target.clone()
         wrong[:, 2:] = 5.0
-        assert losses.laplace_mixture(*modes, wrong, known) == losses.laplace_mixture(*modes, target, known)
+        assert losses.laplace_mixture(modes, wrong, known) == losses.laplace_mixture(modes, target, known)
         wrong[:, 0] = 1.0
         # The mean of one azimuth at its centre and one that is a scale away.
-        assert float(losses.laplace_mixture(*modes, wrong, known)) == pytest.approx(0.5)
+        assert float(losses.laplace_mixture(modes, wrong, known)) == pytest.approx(0.5)
 
 
 class TestMatching:

@@ -169,7 +169,7 @@ def _export_networks(
         inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
         outputs = ["ring", "log_profile", "log_scale"]
         if isinstance(image_encoder, TrunkImageEncoder):
-            outputs += _STRUCTURE_OUTPUTS
+            outputs += [*(["log_share"] if image_encoder.config.modes > 1 else []), *_STRUCTURE_OUTPUTS]
         differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
     elif image_encoder is not None:
         differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
@@ -185,8 +185,11 @@ class _RingOutputs(nn.Module):
 
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         features = self.encoder(image, camera_height_m)
-        outputs = (features.ring, features.log_profile, features.log_scale)
-        return outputs if features.structure is None else (*outputs, *vars(features.structure).values())
+        walls: tuple[Tensor, ...] = tuple(vars(features.walls).values())
+        if walls[0].shape[2] == 1:
+            walls = walls[0][..., 0], walls[1][..., 0]
+        structure = () if features.structure is None else vars(features.structure).values()
+        return (features.ring, *walls, *structure)
 
 
 class _ViewOutputs(nn.Module):
@@ -198,8 +201,7 @@ class _ViewOutputs(nn.Module):
 
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         features = self.encoder(image, camera_height_m)
-        predictions = (features.log_profile, features.log_scale, features.log_share, features.seen)
-        return (*predictions, *vars(features.structure).values())
+        return (*vars(features.walls).values(), features.seen, *vars(features.structure).values())
 
 
 def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:

@@ -100,7 +100,7 @@ class ImageStage(TrainingStage):
             if settings.ring_weight:
                 terms["ring"] = settings.ring_weight * losses.ring_distillation(seen_ring, ring)
             if settings.profile_weight:
-                likelihood = losses.laplace(features.log_profile, features.log_scale, batch["profile_m"], known)
+                likelihood = losses.laplace_mixture(features.walls, batch["profile_m"].log(), known)
                 terms["profile"] = settings.profile_weight * likelihood
         else:
             with torch.no_grad():
@@ -136,12 +136,8 @@ class ImageStage(TrainingStage):
         logits = features.structure.opening_logits[photograph_rows]
         known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
         openings_loss = losses.teacher_openings(logits[known][None], openings[known][None])
-        walls_loss = losses.teacher_walls(
-            features.log_profile[photograph_rows],
-            features.log_scale[photograph_rows],
-            torch.where(known, log_distance, torch.nan),
-            logits,
-        )
+        seen_walls = torch.where(known, log_distance, torch.nan)
+        walls_loss = losses.teacher_walls(features.walls.rows(photograph_rows), seen_walls, logits)
         total = settings.photograph_weight * openings_loss + settings.photograph_profile_weight * walls_loss
         return first_rows(features, len(image)), {"photographs": total}
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.nets.image_features import WallModes
 
 # Keeps log and its gradient finite when two latents coincide.
 _MIN_DISTANCE = 1e-4
@@ -58,30 +59,12 @@ def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b
     return ((student - teacher) / spread).abs().mean()
 
 
-def laplace(
-    log_profile: Float[Tensor, "b w"],
-    log_scale: Float[Tensor, "b w"],
-    profile_m: Float[Tensor, "b w"],
-    known: Bool[Tensor, "b w"] | None = None,
-) -> Tensor:
-    """Return the negative log likelihood of true log distances under predicted Laplace distributions, where known."""
-    error = (log_profile - torch.log(profile_m)).abs()
-    loss = error * torch.exp(-log_scale) + log_scale
+def laplace_mixture(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tensor, "b w"] | None = None) -> Tensor:
+    """Return the negative log likelihood of true log distances under mixtures of Laplace distributions, where known."""
+    error = (walls.log_profile - target[..., None]).abs()
+    loss = -torch.logsumexp(walls.log_share - error * torch.exp(-walls.log_scale) - walls.log_scale, dim=2)
     if known is None:
         return loss.mean()
-    return (loss * known).sum() / known.sum().clamp_min(1)
-
-
-def laplace_mixture(
-    log_profile: Float[Tensor, "b w m"],
-    log_scale: Float[Tensor, "b w m"],
-    log_share: Float[Tensor, "b w m"],
-    target: Float[Tensor, "b w"],
-    known: Bool[Tensor, "b w"],
-) -> Tensor:
-    """Return the negative log likelihood of true log distances under mixtures of Laplace distributions, where known."""
-    error = (log_profile - target[..., None]).abs()
-    loss = -torch.logsumexp(log_share - error * torch.exp(-log_scale) - log_scale, dim=2)
     return (loss * known).sum() / known.sum().clamp_min(1)
 
 
@@ -91,20 +74,15 @@ def is_passage(opening_logits: Float[Tensor, "b w c"]) -> Bool[Tensor, "b w"]:
 
 
 def teacher_walls(
-    log_profile: Float[Tensor, "b w"],
-    log_scale: Float[Tensor, "b w"],
-    log_distance: Float[Tensor, "b w"],
-    opening_logits: Float[Tensor, "b w c"],
+    walls: WallModes, log_distance: Float[Tensor, "b w"], opening_logits: Float[Tensor, "b w c"]
 ) -> Tensor:
-    """Return the `laplace` loss of the walls that a teacher sees; its log distance is NaN elsewhere.
+    """Return the `laplace_mixture` loss of the walls that a teacher sees; its log distance is NaN elsewhere.
 
     Azimuths where the student predicts a passage are left out: the teacher sees the wall of the next room, but a room
     ends in the plane of its own wall.
     """
     known = torch.isfinite(log_distance) & ~is_passage(opening_logits)
-    error = (log_profile - log_distance.nan_to_num()).abs()
-    loss = error * torch.exp(-log_scale) + log_scale
-    return (loss * known).sum() / known.sum().clamp_min(1)
+    return laplace_mixture(walls, log_distance.nan_to_num(), known)
 
 
 def opening(

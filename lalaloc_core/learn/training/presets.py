@@ -52,6 +52,7 @@ _TINY = TrainConfig(
         mixer_width=16,
         mixer_blocks=1,
         mixer_heads=2,
+        modes=2,
     ),
     view=ViewEncoderConfig(
         image_height=64,
@@ -104,6 +105,7 @@ PRESETS: dict[str, TrainConfig] = {
     "trunk": TrainConfig(
         name="trunk",
         architecture="trunk",
+        trunk=TrunkEncoderConfig(modes=2),
         layout=_RING_LAYOUT,
         image=ImageStageConfig(
             photometric=1.0,

@@ -193,10 +193,10 @@ class ImageValidation:
         heights = torch.tensor([query.camera.camera_height_m for query in queries], dtype=torch.float32)
         features = encoder(images, heights.to(self.device))
         true = torch.cat([query.layouts(query.pose, self.columns, self.device).profile_m for query in queries])
-        nll = float(losses.laplace(features.log_profile, features.log_scale, true))
+        nll = float(losses.laplace_mixture(features.walls, true.log()))
         latent = layout_encoder.get_submodule("head")(features.ring)
         return _Prediction(
-            latent, features.log_profile, nll * len(queries), true, self._confusion(encoder, features, queries)
+            latent, features.walls.likeliest, nll * len(queries), true, self._confusion(encoder, features, queries)
         )
 
     def _confusion(

@@ -96,13 +96,7 @@ class ViewStage(TrainingStage):
         part = middle(self.config)
         kind = torch.where(seen[rows], batch["opening_kind"][:, part], UNKNOWN)
         self.encoder.update_class_shares(kind, batch["room_type"])
-        walls = losses.laplace_mixture(
-            features.log_profile[rows],
-            features.log_scale[rows],
-            features.log_share[rows],
-            batch["profile_m"][:, part].log(),
-            seen[rows],
-        )
+        walls = losses.laplace_mixture(features.walls.rows(rows), batch["profile_m"][:, part].log(), seen[rows])
         above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
         ceiling = losses.ceiling(structure.log_ceiling[rows], structure.log_ceiling_scale[rows], above_m)
         openings = losses.opening(
@@ -124,14 +118,8 @@ class ViewStage(TrainingStage):
             target[:, part].to(device) for target in (photographs.openings, photographs.log_distance)
         )
         logits = features.structure.opening_logits[rows]
-        known = seen[rows] & torch.isfinite(log_distance) & ~losses.is_passage(logits)
-        walls = losses.laplace_mixture(
-            features.log_profile[rows],
-            features.log_scale[rows],
-            features.log_share[rows],
-            log_distance.nan_to_num(),
-            known,
-        )
+        seen_walls = torch.where(seen[rows], log_distance, torch.nan)
+        walls = losses.teacher_walls(features.walls.rows(rows), seen_walls, logits)
         agreement = losses.teacher_openings(logits[seen[rows]][None], openings[seen[rows]][None])
         return settings.photograph_weight * agreement + settings.photograph_profile_weight * walls
 

@@ -99,12 +99,9 @@ class ViewValidation:
             features = encoder(images.to(self._device), self._heights[part].to(self._device))
             known = features.seen.cpu() >= MIN_SEEN
             target = self._log_profile[part]
-            log_profile, log_scale, log_share = (
-                value.cpu() for value in (features.log_profile, features.log_scale, features.log_share)
-            )
-            nll.append(len(images) * float(losses.laplace_mixture(log_profile, log_scale, log_share, target, known)))
-            best = (log_share - log_scale).argmax(dim=2, keepdim=True)
-            error = (log_profile.gather(2, best)[..., 0] - target).abs()
+            likelihood = losses.laplace_mixture(features.walls, target.to(self._device), known.to(self._device))
+            nll.append(len(images) * float(likelihood))
+            error = (features.walls.likeliest.cpu() - target).abs()
             errors += [float(row[shown].median()) for row, shown in zip(error, known, strict=True)]
             prior = losses.opening_prior(encoder.opening_share, config.image.opening_balance)
             logits = torch.log_softmax(features.structure.opening_logits, dim=2) - prior.log()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from lalaloc_core.localise.bundle import (
 )
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
 
 JOINT = "end-to-end"
 _MODULES = {
@@ -176,7 +178,11 @@ def check_same_networks(stage: str, config: TrainConfig, trained: TrainConfig, w
         parts = {}
     parts["ring" if config.has_ring else config.architecture] = (config.layout_sizes, trained.layout_sizes)
     if stage != "layout":
-        parts[config.architecture] = (config.image_sizes, trained.image_sizes)
+        found, modes = trained.image_sizes, getattr(config.image_sizes, "modes", 1)
+        if isinstance(found, TrunkEncoderConfig) and found.modes == 1:
+            # A single mode can start several.
+            found = dataclasses.replace(found, modes=modes)
+        parts[config.architecture] = (config.image_sizes, found)
     for part, (configured, found) in parts.items():
         if configured != found:
             raise CheckpointError(

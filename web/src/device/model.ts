@@ -17,6 +17,7 @@ export interface Manifest {
   profile_columns: number;
   ring_sectors: number | null;
   room_types: string[];
+  image_config: { modes?: number };
   view: { image_height: number; image_width: number; sectors: number; top_deg: number } | null;
 }
 
@@ -26,8 +27,9 @@ const RUNTIME = "/web/onnxruntime.wasm.gz", RUNTIME_SCRIPT = "/web/onnxruntime.j
 const SPHERES = "image_encoder.onnx", VIEWS = "view_encoder.onnx";
 // As in lalaloc_core: camera heights (m) of the rings, the height of all other outputs, and the patches read at once.
 const HEIGHTS_M = [0.5, 1, 1.5, 2, 3], HEIGHT_M = 1, BATCH = 4;
-const PROFILE = ["log_profile", "log_scale"], STRUCTURE = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"];
-const BY_COLUMN = ["log_profile", "log_scale", "opening_logits"];
+const PROFILE = ["log_profile", "log_scale"], MIXTURE = [...PROFILE, "log_share"];
+const STRUCTURE = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"];
+const BY_COLUMN = [...MIXTURE, "opening_logits"];
 
 export class Model {
   readonly digest: string;
@@ -52,7 +54,8 @@ export class Model {
   async sphere(rgb: Uint8ClampedArray): Promise<Float32Array[]> {
     const { image_height: height, image_width: width, ring_sectors: sectors, room_types: types } = this.manifest;
     if (sectors === null || types.length === 0) throw new InputError(`The service’s model “${this.manifest.name}” gives no features of 360° photographs.`);
-    const size = [height, width, 3], names = [...PROFILE, ...STRUCTURE];
+    const walls = this.manifest.image_config.modes === 2 ? MIXTURE : PROFILE;
+    const size = [height, width, 3], names = [...walls, ...STRUCTURE];
     const both = new Uint8Array(2 * rgb.length);
     both.set(rgb);
     for (let pixel = 0; pixel < height * width; pixel++) {
@@ -70,7 +73,7 @@ export class Model {
 
   /** Return the arrays of level patches. */
   async patches(patches: Uint8Array[]): Promise<Float32Array[]> {
-    const { width, height } = this.patchSize, names = [...PROFILE, "log_share", "seen", ...STRUCTURE];
+    const { width, height } = this.patchSize, names = [...MIXTURE, "seen", ...STRUCTURE];
     const parts: Outputs[] = [];
     for (let first = 0; first < patches.length; first += BATCH) {
       const batch = patches.slice(first, first + BATCH), images = new Uint8Array(4 * width * height * batch.length);
