@@ -17,6 +17,7 @@ from PIL import Image
 
 from lalaloc_core.cli import main
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import export_plan
 from tests.importers.conftest import FLAT, dxf_file
 from tests.importers.test_pictures import open_hall
 
@@ -69,6 +70,13 @@ def test_export_to_dxf_logs_nothing(file: Path, tmp_path: Path):
         "plan", "export", str(file), "--format", "dxf", "--out", str(tmp_path / "flat.dxf"), stderr=subprocess.PIPE
     )
     assert (run.returncode, run.stderr) == (0, b"")
+
+
+def test_plan_without_a_name_is_named_after_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "Ground floor.svg"
+    file.write_bytes(export_plan(FloorPlan.from_dict(json.loads(json.dumps(FLAT))), "svg"))
+    assert main(["plan", "check", str(file)]) == 0
+    assert "'Ground floor': 3 rooms" in capsys.readouterr().out
 
 
 def test_drawing_is_opaque(file: Path, tmp_path: Path):
