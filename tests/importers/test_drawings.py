@@ -167,6 +167,23 @@ def test_slanted_leaves_are_doors_and_not_walls(leaves: str, layer: str):
     assert "on no wall" not in " ".join(plan.report.warnings)
 
 
+def test_names_of_rooms_that_are_not_enclosed_are_warned_of():
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    space = document.modelspace()
+    # The room to the right has an opening of 2.5 m, wider than a door.
+    corners = [(8, 4), (8, 0), (0, 0), (0, 4), (8, 4)]
+    for start, end in [*pairwise(corners[1:]), ((4, 0), (4, 4)), ((8, 0), (8, 1)), ((8, 3.5), (8, 4))]:
+        space.add_line(start, end, dxfattribs={"layer": "WALL"})
+    for text, x, y in (("Bedroom", 1, 2), ("Kitchen", 5, 2), ("12.5 m²", 5, 1), ("Living room", 2, -3)):
+        space.add_text(text, height=0.2).set_placement((x, y))
+    plan = import_plan(dxf_file(document))
+    assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom"]
+    assert [text for text in plan.report.warnings if "is written" in text] == [
+        "no room was found where 'Kitchen' is written; close its walls, or draw the room"
+    ]
+
+
 def test_drawing_without_rooms_names_layers_and_attempts():
     document = new_dxf()
     document.header["$INSUNITS"] = 6

@@ -84,6 +84,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         drawing = replace(drawing, strokes=[*walls.strokes, *others], areas=areas)
         enclosed, source = _enclosed(drawing, budget)
         gaps = enclosed.gaps
+        sketch.drawn = enclosed.walls.envelope
         if leaves:
             builder.notes.append(f"{len(leaves)} leaves of doors and their arcs are not walls")
         if budget.trace is not None:
@@ -93,7 +94,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         builder.notes.append(
             f"rooms are the areas enclosed by {source}; gaps up to {DEFAULT_WALLS.widest_gap:g} m were closed"
         )
-    sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
+    sketch.rooms = named_rooms(shapes, drawing.letterings, builder, sketch.drawn)
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
@@ -212,15 +213,30 @@ def _sides(shape: BaseGeometry) -> tuple[float, float]:
     return float(min(first, second)), float(max(first, second))
 
 
-def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written."""
+def named_rooms(
+    shapes: Sequence[Area],
+    letterings: Sequence[Lettering],
+    builder: ReportBuilder,
+    drawn: BaseGeometry | None = None,
+) -> list[SketchedRoom]:
+    """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written.
+
+    Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
+    """
     tree = shapely.STRtree([area.shape for area in shapes])
     texts: dict[int, list[str]] = {}
+    lost: list[str] = []
     for lettering in letterings:
         inside = tree.query(shapely.Point(lettering.position), predicate="within")
         if len(inside):
             smallest = min(inside, key=lambda index: shapes[index].shape.area)
             texts.setdefault(int(smallest), []).append(lettering.text)
+        elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
+            lost.append(_without_size(lettering.text))
+    if named := [f"'{text}'" for text in dict.fromkeys(lost) if _is_name(text) and room_type_from_name(text)]:
+        builder.warnings.append(
+            f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
+        )
     rooms = []
     for index, area in enumerate(shapes):
         words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
