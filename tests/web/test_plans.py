@@ -50,6 +50,11 @@ def test_areas_without_a_room_are_marked(phone: Visit) -> None:
     expect(page.locator("#plan-warnings")).to_contain_text("set “Ceiling”")
     page.locator("#edit-plan").click()
     expect(page.locator(".no-room")).to_have_count(0)
+    # The editor shows the picture where the room was lost, to x = 9.8 m.
+    expect(page.locator("#plan image")).to_be_visible()
+    script = """() => { const svg = document.getElementById('plan'), box = svg.getBoundingClientRect();
+        return new DOMPoint(9.8, -2.5).matrixTransform(svg.getScreenCTM()).x - box.right; }"""
+    assert page.evaluate(script) < 0.0
 
 
 def test_compass_does_not_cover_the_words_without_a_photograph(phone: Visit) -> None:
@@ -243,6 +248,11 @@ def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, t
     with start_app(tmp_path, inline_grid_poses=0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()
+            page.get_by_text("Plans", exact=True).click()
+            expect(page.locator("#plan-none")).to_have_text("No plan is stored yet.")
+            page.locator("#plan-search").fill("castle")
+            expect(page.locator("#plan-none")).to_have_text("No plan with this name.")
+            page.keyboard.press("Escape")
             visited.find()
             expect(page.locator("#preparing")).to_be_hidden()
             expect(page.locator("#plan-name")).to_have_text("Example flat")

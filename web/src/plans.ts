@@ -266,5 +266,6 @@ export class Plans {
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));
     byId("plan-none").hidden = this.found.length > 0;
+    byId("plan-none").textContent = byId<HTMLInputElement>("plan-search").value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
   }
 }
