@@ -182,17 +182,19 @@ def plan_request(
     if_match: str | None = None,
     idempotency_key: str | None = None,
 ) -> Request:
-    """Return a request that stores a plan: as the document alone, or as a form if there are options."""
+    """Return a request that stores a plan: as a form with the file's name and the options, or as the document alone."""
     if isinstance(document, bytes):
         content = document
     elif isinstance(document, Mapping):
         content = json.dumps(dict(document), allow_nan=False).encode()
     else:
         content = Path(document).read_bytes()
-    if options:
-        # The default name of a venue.
-        name = os.path.basename(document) if isinstance(document, str | os.PathLike) else "venue"
-        media, content = _form("file", [(name, content)], options)
+    is_file = isinstance(document, str | os.PathLike)
+    if options or is_file:
+        # The service names plans and venues without a name after it.
+        default = "venue" if path.startswith("/venues") else "floor plan"
+        name = os.path.basename(document) if is_file else default
+        media, content = _form("file", [(name, content)], options or {})
     else:
         media = _JSON if isinstance(document, Mapping) else _FILE
     headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}

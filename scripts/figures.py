@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.neighbours import markdown as markdown_of_neighbours
+from lalaloc_core.conditions import CONDITIONS, parts_of
 from lalaloc_core.evaluate.reproduce.result import TableResult, markdown
 from lalaloc_core.evaluate.reproduce.tables import TABLES
 
@@ -25,6 +26,7 @@ _ACCURACY_ROWS = {
     "heldout_empty": "out-of-distribution, unfurnished, known heading",
     "layout": "true layout as query, known heading",
 }
+_PHOTOGRAPHS = {"sphere": "sphere", "phone": "80°", "three_phone": "three of 80°"}
 
 
 def accuracy_table() -> str:
@@ -143,6 +145,20 @@ def uninformative_table() -> str:
         found = _bench()["uninformative"][name]
         values = _percent(found["above_half"]), f"{found['median']:.2f}", f"{found['highest']:.2f}", f"{found['n']}"
         rows.append(_row(title, *values))
+    return "\n".join(rows)
+
+
+def localisability_table() -> str:
+    """Return predicted and found shares of photographs, as a Markdown table."""
+    rows = ["| photograph, heading | predicted | found | difference [95 %] | n |", "|---|---|---|---|---|"]
+    group = _bench()["localisability"]
+    for name in CONDITIONS:
+        photograph, heading = parts_of(name)
+        found = group[name]
+        low, high = found["interval"]
+        difference = f"{100 * (found['predicted'] - found['found']):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+        shares = _percent(found["predicted"]), _percent(found["found"])
+        rows.append(_row(f"{_PHOTOGRAPHS[photograph]}, {heading}", *shares, difference, f"{group['n']}"))
     return "\n".join(rows)
 
 

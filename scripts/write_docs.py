@@ -17,6 +17,7 @@ import yaml
 from lalaloc_core.cli import entry_point
 from scripts.figures import (
     accuracy_table,
+    localisability_table,
     neighbours_table,
     paper_tables,
     speed_table,
@@ -157,6 +158,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy_table,
     "terms": terms_table,
     "views": views_table,
+    "localisability": localisability_table,
     "uninformative": uninformative_table,
     "speed": speed_table,
     "neighbours": neighbours_table,

@@ -22,7 +22,7 @@ _OPTIONS = {
     "page": "page of a PDF, from 1",
     "y-axis": "direction of y in the file: up or down",
     "ceiling-height-m": "ceiling height of rooms without one, in metres",
-    "name": "name of the plan",
+    "name": "name of the plan (default: the name in the file, else that of the file)",
 }
 
 

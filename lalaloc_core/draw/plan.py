@@ -133,7 +133,8 @@ def draw_rooms(plan: FloorPlan, no_room: Sequence[Sequence[Sequence[float]]] = (
 
     `no_room` has outlines (m) of areas inside walls that became no room; they are marked.
     """
-    extent = max(_size_m(plan.bounds_m))
+    bounds_m = bounds_with(plan.bounds_m, no_room)
+    extent = max(_size_m(bounds_m))
     wall = 2.0 * max(_WALL_M, extent / 400.0)
     lines = [
         f'<path class="solid" d="{floor_path(plan)}" fill="none" stroke="{INK}" stroke-width="{wall:.4f}" '
@@ -149,7 +150,7 @@ def draw_rooms(plan: FloorPlan, no_room: Sequence[Sequence[Sequence[float]]] = (
         *(_label(room, extent) for room in plan.rooms),
         "</g>",
         *(_mark_no_room(np.array(outline), extent) for outline in no_room),
-        _key(plan),
+        _key(plan, bounds_m),
     ]
     return "\n".join(lines)
 
@@ -283,16 +284,16 @@ def _scale_bar(bounds_m: Bounds) -> str:
     )
 
 
-def _key(plan: FloorPlan) -> str:
-    """Draw the legend of the plan's openings below its right corner."""
+def _key(plan: FloorPlan, bounds_m: Bounds) -> str:
+    """Draw the legend of the plan's openings below the right corner of all that is drawn."""
     kinds = [kind for kind in _GAP_COLOURS if any(opening.kind == kind for opening in plan.openings)]
     if not kinds:
         return ""
-    width_m, height_m = _size_m(plan.bounds_m)
+    width_m, height_m = _size_m(bounds_m)
     # Widths in font sizes: a line and its gap, and the letters.
     widths = [2.6 + 0.62 * len(kind) for kind in kinds]
     size = min(max(width_m, height_m) / 50.0, _KEY_SHARE * width_m / sum(widths))
-    x, y = plan.bounds_m[2] - size * sum(widths), -plan.bounds_m[1] + _MARGIN_M
+    x, y = bounds_m[2] - size * sum(widths), -bounds_m[1] + _MARGIN_M
     parts = []
     for kind, width in zip(kinds, widths, strict=True):
         dashes = f' stroke-dasharray="{0.4 * size:.4f}"' if kind == "passage" else ""

@@ -54,8 +54,8 @@ def import_plans(
         options: options of the import.
         limits: limits of the file and its plans.
         clock: clock for the time limit.
-        building: name for plans of several storeys, unless the options have one: "Duplex – Level 1". Plans in the
-            native format keep their own names.
+        building: name for a plan that has none, and for plans of several storeys, unless the options have one:
+            "Duplex – Level 1". Several plans in the native format keep their own names.
         trace: receives what is read from a drawing or a picture, also of a file that is refused.
 
     Raises:
@@ -78,8 +78,13 @@ def import_plans(
     except MemoryError as error:
         raise InvalidFloorPlanError("the file needs more memory than is available; export a single storey") from error
     building = options.name or building
-    if len(plans) > 1 and building is not None and format.name != "native":
-        plans = [_named_by_level(plan, building) for plan in plans]
+    if building is not None:
+        several = len(plans) > 1
+        plans = [
+            plan if "name" in plan.document and (format.name == "native" or not several)
+            else _named(plan, building, by_level=several)
+            for plan in plans
+        ]  # fmt: skip
     return tuple(_with_option_warnings(plan, format, options) for plan in plans)
 
 
@@ -87,26 +92,33 @@ def import_plan(
     content: bytes,
     options: ImportOptions = DEFAULT_OPTIONS,
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
+    *,
+    building: str | None = None,
 ) -> ImportedPlan:
-    """Return the only plan in a file.
+    """Return the only plan in a file; `building` names it if the file does not.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
         MissingExtraError: a library of its format is not installed.
         SeveralLevelsError: the file has several storeys and the option `level` is not set.
     """
-    plans = import_plans(content, options, limits)
+    plans = import_plans(content, options, limits, building=building)
     if len(plans) > 1:
         raise SeveralLevelsError([plan.level.name for plan in plans if plan.level is not None])
     return next(iter(plans))
 
 
 def import_if_native(
-    content: bytes, options: ImportOptions = DEFAULT_OPTIONS, limits: ImportLimits = DEFAULT_IMPORT_LIMITS
+    content: bytes,
+    options: ImportOptions = DEFAULT_OPTIONS,
+    limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
+    *,
+    building: str | None = None,
 ) -> ImportedPlan | None:
     """Return the plan in a file, None if the file is not in the native format or has several plans.
 
-    It loads no library of another format, so a caller can leave the other formats to a worker process.
+    `building` names the plan if the file does not. No library of another format is loaded, so a caller can leave the
+    other formats to a worker process.
 
     Raises:
         InvalidFloorPlanError: the file is invalid JSON or an invalid plan.
@@ -118,6 +130,8 @@ def import_if_native(
     if format.name != "native" or PLANS in document:
         return None
     (plan,) = format.read(document, options, Budget(limits))
+    if building is not None and "name" not in plan.document:
+        plan = _named(plan, building)
     return _with_option_warnings(plan, format, options)
 
 
@@ -232,12 +246,13 @@ def _format_by_magic(content: bytes) -> Format:
     raise InvalidFloorPlanError(f"the file is {found}; supported formats are {titles}")
 
 
-def _named_by_level(plan: ImportedPlan, name: str) -> ImportedPlan:
-    """Return the plan of one of several storeys, named "Duplex – Level 1"."""
-    level = "" if plan.level is None else f" – {plan.level.title}"
+def _named(plan: ImportedPlan, name: str, *, by_level: bool = False) -> ImportedPlan:
+    """Return a plan with a name; one of several storeys is named "Duplex – Level 1"."""
+    level = f" – {plan.level.title}" if by_level and plan.level is not None else ""
     longest = DEFAULT_LIMITS.max_name_length
     name = f"{name[: max(longest - len(level), 0)]}{level}"[:longest]
-    return replace(plan, document=plan.document | {"name": name}, checked=None)
+    checked = plan.checked and (plan.checked[0], replace(plan.checked[1], name=name))
+    return replace(plan, document={"name": name} | plan.document | {"name": name}, checked=checked)
 
 
 def _with_option_warnings(plan: ImportedPlan, format: Format, options: ImportOptions) -> ImportedPlan:

@@ -89,7 +89,7 @@ class Converter:
             options: options of the import.
             client: client of the upload.
             every_level: return the plans of all levels, lowest first.
-            building: name for the plans of several levels, see `import_plans`.
+            building: name for plans that have none, and for those of several levels, see `import_plans`.
 
         Raises:
             InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.

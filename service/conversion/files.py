@@ -63,6 +63,7 @@ def _seems_native(content: bytes) -> bool:
 def convert(
     content: bytes,
     options: ImportOptions,
+    name: str | None,
     converter: Converter,
     settings: Settings,
     client: str,
@@ -73,6 +74,7 @@ def convert(
     Args:
         content: the file.
         options: options of the import.
+        name: name for a plan that has none.
         converter: workers for files that are not in the native format.
         settings: the settings.
         client: client of the upload.
@@ -87,9 +89,9 @@ def convert(
         ConverterNotReadyError: no worker is running.
         StoppingError: the service is shutting down.
     """
-    if (native := _convert_native(content, options, settings, client, permits)) is not None:
+    if (native := _convert_native(content, options, name, settings, client, permits)) is not None:
         return native
-    (imported,) = converter.read(content, options, client)
+    (imported,) = converter.read(content, options, client, building=name)
     return _plan_file(imported, client, permits)
 
 
@@ -107,7 +109,7 @@ def convert_levels(
     Args:
         content: the file.
         options: options of the import.
-        building: name for the plans of several levels, unless the options have one.
+        building: name for plans that have none, and for those of several levels, unless the options have one.
         converter: as for `convert`; so are the other arguments.
         settings: the settings.
         client: client of the upload.
@@ -117,14 +119,19 @@ def convert_levels(
         InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
         MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `convert`.
     """
-    if (native := _convert_native(content, options, settings, client, permits)) is not None:
+    if (native := _convert_native(content, options, building, settings, client, permits)) is not None:
         return [native]
     levels = converter.read(content, options, client, every_level=True, building=building)
     return [_plan_file(imported, client, permits) for imported in levels]
 
 
 def _convert_native(
-    content: bytes, options: ImportOptions, settings: Settings, client: str, permits: FairSemaphore
+    content: bytes,
+    options: ImportOptions,
+    name: str | None,
+    settings: Settings,
+    client: str,
+    permits: FairSemaphore,
 ) -> PlanFile | None:
     """Convert a small native plan; None leaves other files, of formats that are supported, to the workers."""
     if not content.strip():
@@ -132,7 +139,7 @@ def _convert_native(
     limits = settings.plans.import_limits
     if _seems_native(content):
         with permits.hold(client):
-            imported = import_if_native(content, options, limits)
+            imported = import_if_native(content, options, limits, building=name)
             if imported is not None:
                 return PlanFile(imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native"))
     elif not is_json(content):

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response, status
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.importers import building_name
 from service.conversion import PlanFile, convert
 from service.errors import (
     IdempotencyInProgressError,
@@ -220,7 +221,8 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
 def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[PlanFile, Original, ComputedGrid | None]:
     """Return the plan in an uploaded file, the file as stored, and the pose grid if it is computed at once."""
     content = uploaded.file.read()
-    file = convert(content, uploaded.options, runtime.converter, runtime.settings, client, runtime.permits)
+    name = building_name(uploaded.file.name)
+    file = convert(content, uploaded.options, name, runtime.converter, runtime.settings, client, runtime.permits)
     runtime.grids.check_size(file.plan)
     original = Original(content, file.media_type, file.report)
     return file, original, runtime.grids.prepare(file.plan, client)

@@ -40,7 +40,9 @@ class ImportForm(_FileOptions):
     """Form fields beside the plan file; an empty field counts as left out."""
 
     level: str | None = Field(None, description="Name or number of the storey to read, for files with several.")
-    name: str | None = Field(None, max_length=200, description="Name of the plan.")
+    name: str | None = Field(
+        None, max_length=200, description="Name of the plan. Default: the name in the file, else that of the file."
+    )
 
 
 class LevelsForm(_FileOptions):

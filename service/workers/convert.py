@@ -42,7 +42,7 @@ class ImportJob:
         options: the options.
         step_m: grid step of descriptions.
         every_level: import all levels of the file, not the only one.
-        building: name for the plans of several levels, see `import_plans`.
+        building: name for plans that have none, and for those of several levels, see `import_plans`.
     """
 
     content: bytes
@@ -176,7 +176,7 @@ def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionRes
 
 def _import(job: ImportJob, limits: ImportLimits) -> tuple[Imported, ...]:
     if not job.every_level:
-        return (_imported(import_plan(job.content, job.options, limits), job, limits),)
+        return (_imported(import_plan(job.content, job.options, limits, building=job.building), job, limits),)
     plans = import_plans(job.content, job.options, limits, building=job.building)
     return tuple(_imported(plan, job, limits) for plan in plans)
 

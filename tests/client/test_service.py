@@ -54,6 +54,13 @@ def test_plan_is_stored_listed_and_deleted(service: Any, tmp_path: Path) -> None
     assert caught.value.request_id
 
 
+def test_plan_without_a_name_is_named_after_its_file(service: Any, tmp_path: Path) -> None:
+    file = tmp_path / "Ground floor.json"
+    file.write_text(json.dumps({key: value for key, value in FLAT.items() if key != "name"}))
+    plan = service.upload_floorplan(file)
+    assert (plan.name, service.replace_floorplan(plan.id, str(file)).name) == ("Ground floor", "Ground floor")
+
+
 def test_plan_is_replaced_unless_it_has_changed(service: Any, panorama: bytes) -> None:
     first = service.upload_floorplan(FLAT)
     second = service.replace_floorplan(first.id, FLAT | {"name": "rebuilt"}, if_match=first.etag)

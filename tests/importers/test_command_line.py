@@ -16,7 +16,9 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.cli import main
+from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import export_plan
 from tests.importers.conftest import FLAT, dxf_file
 from tests.importers.test_pictures import open_hall
 
@@ -69,6 +71,13 @@ def test_export_to_dxf_logs_nothing(file: Path, tmp_path: Path):
         "plan", "export", str(file), "--format", "dxf", "--out", str(tmp_path / "flat.dxf"), stderr=subprocess.PIPE
     )
     assert (run.returncode, run.stderr) == (0, b"")
+
+
+def test_plan_without_a_name_is_named_after_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "Ground floor.svg"
+    file.write_bytes(export_plan(FloorPlan.from_dict(json.loads(json.dumps(FLAT))), "svg"))
+    assert main(["plan", "check", str(file)]) == 0
+    assert "'Ground floor': 3 rooms" in capsys.readouterr().out
 
 
 def test_drawing_is_opaque(file: Path, tmp_path: Path):
@@ -126,6 +135,12 @@ def test_area_without_a_room_is_drawn(tmp_path: Path):
     # The view shows the whole area, to x = 9.8 m.
     left, _, width, _ = (float(value) for value in re.findall(r'viewBox="([^"]*)"', drawn)[0].split())
     assert left + width > 9.8
+
+
+def test_legend_lies_below_areas_without_a_room():
+    plan = FloorPlan.from_dict(json.loads(json.dumps(FLAT)))
+    drawn = plan_svg(plan, no_room=[[(2.0, -6.0), (7.0, -6.0), (7.0, -1.0), (2.0, -1.0)]])
+    assert float(re.findall(r'class="key".*?<path d="M[-\d.]+ ([-\d.]+)h', drawn)[0]) > 6.0
 
 
 def test_debug_draws_a_drawing_that_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from ezdxf.filemanagement import new as new_dxf
@@ -108,37 +109,79 @@ def test_german_wall_lines_become_rooms():
     assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "door swings")} <= used
 
 
-def _single_lines():
-    """Draw walls of single lines on one layer in metres, 3 rooms above a corridor, with half open leaves and arcs."""
+def _single_lines(leaves: str, layer: str):
+    """Draw walls of single lines in millimetres, 3 rooms above a corridor, with half open doors and axes."""
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
+    document.header["$INSUNITS"] = 4
     space = document.modelspace()
-    # The upper left corner stays open by 3 cm.
-    space.add_line((0.03, 6), (12, 6))
-    space.add_line((0, 0), (0, 5.97))
-    space.add_line((0, 0), (12, 0))
-    space.add_line((12, 0), (12, 6))
-    for x in (4, 8):
-        space.add_line((x, 2), (x, 6))
-    start = 0.0
-    for hinge, angle in ((1.0, 40.0), (5.0, 65.0), (9.0, 90.0)):
-        space.add_line((start, 2), (hinge, 2))
-        turn = math.radians(angle)
-        space.add_line((hinge, 2), (hinge + 0.9 * math.cos(turn), 2 + 0.9 * math.sin(turn)))
-        space.add_arc((hinge, 2), 0.9, 0, angle)
-        start = hinge + 0.9
-    space.add_line((start, 2), (12, 2))
+    # The upper left corner stays open by 3 cm, the wall to the right of the first room by 12 cm.
+    space.add_line((30, 6000), (12000, 6000))
+    space.add_line((0, 0), (0, 5970))
+    space.add_line((0, 0), (12000, 0))
+    space.add_line((12000, 0), (12000, 6000))
+    space.add_line((4000, 2120), (4000, 6000))
+    space.add_line((8000, 2000), (8000, 6000))
+    for x in (0, 6000, 12000):
+        space.add_line((x, -1500), (x, 7500), dxfattribs={"layer": "EJES"})
+    start = 0
+    for hinge, angle in ((1000, 40.0), (5000, 65.0), (9000, 90.0)):
+        space.add_line((start, 2000), (hinge, 2000))
+        _add_leaf(space, leaves, hinge, angle, {"layer": layer})
+        start = hinge + 900
+    space.add_line((start, 2000), (12000, 2000))
     return document
 
 
-def test_slanted_leaves_are_doors_and_not_walls():
-    plan = import_plan(dxf_file(_single_lines()))
+def _add_leaf(space: Any, leaves: str, hinge: float, angle: float, attributes: dict[str, str]) -> None:
+    x, y = 900 * math.cos(math.radians(angle)), 900 * math.sin(math.radians(angle))
+    tip = (hinge + x, 2000 + y)
+    if leaves == "polyline":
+        bulge = -math.tan(math.radians(angle) / 4)
+        points = [(hinge, 2000, 0), (*tip, bulge), (hinge + 900, 2000, 0)]
+        space.add_lwpolyline(points, format="xyb", dxfattribs=attributes)
+        return
+    if leaves == "rectangle":
+        aside = (-0.045 * y, 0.045 * x)
+        corners = [(hinge, 2000), tip]
+        corners += [(px + aside[0], py + aside[1]) for px, py in reversed(corners)]
+        space.add_lwpolyline(corners, close=True, dxfattribs=attributes)
+    else:
+        space.add_line((hinge, 2000), tip, dxfattribs=attributes)
+    if leaves != "line alone":
+        space.add_arc((hinge, 2000), 900, 0, angle, dxfattribs=attributes)
+
+
+@pytest.mark.parametrize(
+    ("leaves", "layer"),
+    [*((leaves, layer) for leaves in ("line", "polyline", "rectangle") for layer in ("0", "PUERTAS")),
+     ("line alone", "PUERTAS")],
+)  # fmt: skip
+def test_slanted_leaves_are_doors_and_not_walls(leaves: str, layer: str):
+    plan = import_plan(dxf_file(_single_lines(leaves, layer)))
     areas = sorted(room.area for room in shapes(plan.document))
     assert areas == pytest.approx([16.0, 16.0, 16.0, 24.0], rel=0.01)
     doors = sorted(lines(plan.document, "door"), key=lambda line: line.bounds)
     assert [door.bounds[0] for door in doors] == pytest.approx([1.0, 5.0, 9.0], abs=0.01)
     assert [door.length for door in doors] == pytest.approx([0.9] * 3, abs=0.02)
     assert not lines(plan.document, "passage")
+    assert "on no wall" not in " ".join(plan.report.warnings)
+
+
+def test_names_of_rooms_that_are_not_enclosed_are_warned_of():
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    space = document.modelspace()
+    # The room to the right has an opening of 2.5 m, wider than a door.
+    corners = [(8, 4), (8, 0), (0, 0), (0, 4), (8, 4)]
+    for start, end in [*pairwise(corners[1:]), ((4, 0), (4, 4)), ((8, 0), (8, 1)), ((8, 3.5), (8, 4))]:
+        space.add_line(start, end, dxfattribs={"layer": "WALL"})
+    for text, x, y in (("Bedroom", 1, 2), ("Kitchen", 5, 2), ("12.5 m²", 5, 1), ("Living room", 2, -3)):
+        space.add_text(text, height=0.2).set_placement((x, y))
+    plan = import_plan(dxf_file(document))
+    assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom"]
+    assert [text for text in plan.report.warnings if "is written" in text] == [
+        "no room was found where 'Kitchen' is written; close its walls, or draw the room"
+    ]
 
 
 def test_drawing_without_rooms_names_layers_and_attempts():

@@ -92,6 +92,17 @@ def test_several_plans_keep_their_names_and_are_ordered_by_level():
         import_plan(content)
 
 
+def test_plans_without_names_are_named_after_the_file():
+    content = json.dumps(
+        {"plans": [{**FLAT, "name": "home"}, {"rooms": FLAT["rooms"], "ceiling_height_m": 2.5}]}
+    ).encode()
+    plans = import_plans(content, building="street")
+    assert [(plan.document["name"], plan.plan().name) for plan in plans] == [
+        ("home", "home"),
+        ("street – plan 1", "street – plan 1"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("document", "words"),
     [

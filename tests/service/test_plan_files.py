@@ -106,6 +106,22 @@ def test_picture_needs_a_scale_and_is_a_draft(client: httpx.Client) -> None:
     assert client.get(f"/floorplans/{plan['id']}/original").headers["content-type"] == "image/png"
 
 
+@pytest.mark.parametrize("format", ["native", "geojson", "dxf", "svg", "imdf", "pdf"])
+def test_plan_without_a_name_is_named_after_its_file(client: httpx.Client, format: str) -> None:
+    if format in ("native", "geojson"):
+        unnamed = {key: value for key, value in json.loads(plan_file(format)).items() if key != "name"}
+        content = json.dumps(unnamed).encode()
+    else:
+        content = vector_pdf() if format == "pdf" else plan_file(format)
+
+    def name_of(**form: Any) -> str:
+        return client.post("/floorplans", **form).json()["plan"]["name"]
+
+    assert name_of(files={"file": ("C:\\plans\\ground floor.v2.x", content)}) == "ground floor.v2"
+    assert name_of(files={"file": ("ground floor.x", content)}, data={"name": "Home"}) == "Home"
+    assert name_of(content=content, headers={"content-type": "application/octet-stream"}) == "floor plan"
+
+
 def test_preview_marks_what_became_no_room(client: httpx.Client) -> None:
     plan = store_plan(client, open_hall(), metres_per_pixel=0.01)
     (outline,) = plan["import_report"]["no_room"]

@@ -144,7 +144,7 @@ def test_file_without_levels_becomes_a_venue_of_one_plan(client: httpx.Client) -
     for file, name, plan_name, level in (
         (content, "house", "Flat 3", 0.0),
         (ifc_flat().content(), "house", "EG", 0.0),
-        (geojson(room("2")), "house", "floor plan", 2.0),
+        (geojson(room("2")), "house", "house", 2.0),
     ):
         venue = send(client, file, "house.x").json()
         [entry] = plans_of(client, venue["id"])

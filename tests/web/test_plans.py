@@ -15,6 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from service.storage.store import Store
 from tests.importers.test_lettering import AREAS_M2, PrintedPlan
+from tests.importers.test_pictures import open_hall
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key
 from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
@@ -34,6 +35,38 @@ def test_uploaded_plan_is_drawn_with_its_warnings(desktop: Visit, tmp_path: Path
     expect(page.locator("#plan-name")).to_have_text("Overlap")
     expect(page.locator("#plan .room")).to_have_count(2)
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
+
+
+def test_areas_without_a_room_are_marked(phone: Visit) -> None:
+    file, form = ("Open hall.png", open_hall()), {"metres_per_pixel": "0.01"}
+    phone.client.post("/floorplans", files={"file": file}, data=form).raise_for_status()
+    page = phone.open()
+    choose_plan(page, "Open hall")
+    area, view = page.locator(".no-room").bounding_box(), page.locator("#plan").bounding_box()
+    assert area is not None
+    assert view is not None
+    assert view["x"] < area["x"] < area["x"] + area["width"] < view["x"] + view["width"]
+    expect(page.locator("#plan .name", has_text="no room")).to_have_count(1)
+    expect(page.locator("#plan-warnings")).to_contain_text("set “Ceiling”")
+    page.locator("#edit-plan").click()
+    expect(page.locator(".no-room")).to_have_count(0)
+    # The editor shows the picture where the room was lost, to x = 9.8 m.
+    expect(page.locator("#plan image")).to_be_visible()
+    script = """() => { const svg = document.getElementById('plan'), box = svg.getBoundingClientRect();
+        return new DOMPoint(9.8, -2.5).matrixTransform(svg.getScreenCTM()).x - box.right; }"""
+    assert page.evaluate(script) < 0.0
+
+
+def test_compass_does_not_cover_the_words_without_a_photograph(phone: Visit) -> None:
+    upload(phone.client, FLAT | {"name": "Without a photograph"})
+    page = phone.open()
+    choose_plan(page, "Without a photograph")
+    expect(page.locator("#photo-none")).to_be_visible()
+    script = """() => { const words = document.createRange();
+        words.selectNodeContents(document.getElementById('photo-none'));
+        const { bottom } = document.querySelector('.compass').getBoundingClientRect();
+        return words.getBoundingClientRect().top - bottom; }"""
+    assert page.evaluate(script) >= 0.0
 
 
 def test_late_example_does_not_replace_an_upload(desktop: Visit, tmp_path: Path) -> None:
@@ -215,6 +248,11 @@ def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, t
     with start_app(tmp_path, inline_grid_poses=0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()
+            page.get_by_text("Plans", exact=True).click()
+            expect(page.locator("#plan-none")).to_have_text("No plan is stored yet.")
+            page.locator("#plan-search").fill("castle")
+            expect(page.locator("#plan-none")).to_have_text("No plan with this name.")
+            page.keyboard.press("Escape")
             visited.find()
             expect(page.locator("#preparing")).to_be_hidden()
             expect(page.locator("#plan-name")).to_have_text("Example flat")

@@ -32,8 +32,9 @@ export function showAll(photos: readonly Photo[], choose: (photo: Photo) => void
     h("div", { class: "sharing" },
       button("Save CSV", () => download(new Blob([csvOf(found)], { type: "text/csv" }), "lalaloc.csv"), { id: "save-csv" }),
       // GeoJSON needs places on Earth, which only plans with an anchor have.
-      features.length === found.length && button("Save GeoJSON", () =>
-        download(new Blob([JSON.stringify({ type: "FeatureCollection", features })], { type: "application/geo+json" }), "lalaloc.geojson"), { id: "save-geojson" })));
+      features.length === found.length ? button("Save GeoJSON", () =>
+        download(new Blob([JSON.stringify({ type: "FeatureCollection", features })], { type: "application/geo+json" }), "lalaloc.geojson"), { id: "save-geojson" }) :
+        h("p", { class: "hint" }, "GeoJSON can be saved for plans whose place on Earth is known.")));
 }
 
 const nameOf = (photo: Photo): string => photo.file.name.replace(/^example-/, "");

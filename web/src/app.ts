@@ -18,13 +18,13 @@ import { clearError, InputError, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { connectSaveMap, savePicture } from "./pictures";
-import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
+import { type Box, boxOf, drawNames, drawPlan, lostAreas } from "./plan_drawing";
 import { showWarnings } from "./plan_warnings";
 import { Plans } from "./plans";
 import { PoseMarker, showCursor } from "./pose_marker";
 import { askSingle, askTogether } from "./query";
 import { LiveSession } from "./session";
-import type { Answer, Layout, Plan, PlanDocument, Pose, Venue } from "./types";
+import type { Answer, Layout, Plan, PlanDocument, Point, Pose, Venue } from "./types";
 import { Venues } from "./venues";
 import { Viewport } from "./viewport";
 
@@ -206,24 +206,24 @@ class Page {
   }
 
   private drawBase(): void {
-    const empty: PlanDocument = { rooms: [] };
-    this.box = boxOf(this.document ?? empty);
+    const drawn: PlanDocument = this.document ?? { rooms: [] }, lost = lostAreas(this.plan);
+    this.box = boxOf(drawn, lost);
     this.viewport.fit(this.box);
-    this.drawRooms(this.document ?? empty);
+    this.drawRooms(drawn, lost);
     this.session.drawOn(this.plan?.id, this.box);
     byId<HTMLButtonElement>("edit-plan").disabled = this.plan === null;
   }
 
-  private drawRooms(plan: PlanDocument): void {
-    drawPlan(this.base, plan);
-    drawNames(this.names, plan, this.viewport.current);
+  private drawRooms(plan: PlanDocument, lost: Point[][] = []): void {
+    drawPlan(this.base, plan, lost);
+    drawNames(this.names, plan, this.viewport.current, lost);
   }
 
   /** Redraw handles and names, whose size on the screen is constant. */
   private onViewChanged(): void {
     this.hints.draw(this.viewport.current);
     if (this.editor.isOpen) this.editor.redraw();
-    else if (this.document !== null) drawNames(this.names, this.document, this.viewport.current);
+    else if (this.document !== null) drawNames(this.names, this.document, this.viewport.current, lostAreas(this.plan));
   }
 
   private edit(plan: Plan | null): void {

@@ -16,13 +16,7 @@ const FIELDS: [string, string, string][] = [
 ];
 // The other fields do not apply to pictures.
 const OF_PICTURES = ["metres_per_pixel", "scale", "ceiling_height_m"];
-const MAX_NAME_LENGTH = 200;
 const PICTURES = /^image\/(png|jpeg)$/;
-const NAMELESS = /\.(png|jpe?g|pdf|svg|dxf|dwg)$/i;
-
-/** Name a plan after its file, if the format has no name of a plan. */
-export const nameAfter = (file: File): Record<string, string> =>
-  NAMELESS.test(file.name) ? { name: file.name.replace(NAMELESS, "").slice(0, MAX_NAME_LENGTH) || file.name } : {};
 
 export class ImportForm {
   private readonly inputs = new Map<string, HTMLInputElement | HTMLSelectElement>();

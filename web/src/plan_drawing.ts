@@ -2,7 +2,7 @@
 
 import { s, show } from "./dom";
 import { inside } from "./layout";
-import type { OpeningDocument, PlanDocument, Point } from "./types";
+import type { OpeningDocument, Plan, PlanDocument, Point } from "./types";
 
 export interface Box {
   x: number;
@@ -15,9 +15,12 @@ const MARGIN = 0.06;
 // Half of the drawn thickness of a wall between two rooms.
 const WALL_M = 0.12;
 
-/** Return the box around a plan, with a margin. */
-export function boxOf(plan: PlanDocument): Box {
-  const points = plan.rooms.flatMap((room) => room.polygon);
+/** Return the areas of the plan's file that became no room. */
+export const lostAreas = (plan: Plan | null): Point[][] => plan?.import_report?.no_room ?? [];
+
+/** Return the box around a plan and areas that became no room, with a margin. */
+export function boxOf(plan: PlanDocument, lost: Point[][] = []): Box {
+  const points = [...plan.rooms.map((room) => room.polygon), ...lost].flat();
   if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
   const xs = points.map(([x]) => x), ys = points.map(([, y]) => -y);
   const x = Math.min(...xs), y = Math.min(...ys);
@@ -32,8 +35,8 @@ export const path = (polygon: Point[]): string =>
 /** Return the unit for texts and handles, which have the same size on every plan. */
 export const unitOf = (box: Box): number => Math.max(box.width, box.height) / 100;
 
-/** Draw rooms and openings into a group. */
-export function drawPlan(group: SVGGElement, plan: PlanDocument): void {
+/** Draw rooms, openings and areas that became no room into a group. */
+export function drawPlan(group: SVGGElement, plan: PlanDocument, lost: Point[][]): void {
   const rooms = plan.rooms.map((room) => {
     const whole = path(room.polygon) + (room.holes ?? []).map(path).join("");
     return s("path", { class: `room ${room.type ?? "unknown"}`, d: whole, "fill-rule": "evenodd" });
@@ -42,15 +45,14 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument): void {
     s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })));
   // Walls are strokes around floors; the strokes of adjacent rooms meet.
   const solid = s("path", { class: "solid", d: plan.rooms.map((room) => path(room.polygon)).join(""), "stroke-width": 2 * WALL_M });
-  show(group, solid, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
+  show(group, ...lost.map((area) => s("path", { class: "no-room", d: path(area) })), solid, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
 }
 
 /** Draw names, north arrow and scale bar into a group on top of the drawing. */
-export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box): void {
-  const unit = unitOf(box);
-  show(group, ...plan.rooms.flatMap((room, index) => {
-    const { place: [x, y], clearance } = labelPlace(room.polygon);
-    const name = room.name || `room ${index + 1}`;
+export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost: Point[][]): void {
+  const unit = unitOf(box), named = plan.rooms.map((room, index): [Point[], string] => [room.polygon, room.name || `room ${index + 1}`]);
+  show(group, ...[...named, ...lost.map((area): [Point[], string] => [area, "no room"])].flatMap(([polygon, name]) => {
+    const { place: [x, y], clearance } = labelPlace(polygon);
     const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
     return size < 0.8 * unit ? [] : [s("text", { class: "name", x, y: -y + 0.35 * size, "font-size": size.toFixed(3) }, name)];
   }), scaleBar(box), north(plan, box));

@@ -4,7 +4,7 @@ import { api, ServiceError } from "./api";
 import { button, byId, h, show } from "./dom";
 import { followPlan } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
-import { ImportForm, nameAfter } from "./import_form";
+import { ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
 import { acceptDrops } from "./photos";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
@@ -160,7 +160,7 @@ export class Plans {
     const state = byId("plan-state");
     state.textContent = `Importing “${file.name}” …`;
     try {
-      const plan = await api.uploadPlan(file, { ...nameAfter(file), ...fields });
+      const plan = await api.uploadPlan(file, fields);
       if (request === this.requests) {
         this.actions.picked();
         this.take(plan);
@@ -266,5 +266,6 @@ export class Plans {
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));
     byId("plan-none").hidden = this.found.length > 0;
+    byId("plan-none").textContent = byId<HTMLInputElement>("plan-search").value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
   }
 }

@@ -106,7 +106,8 @@ def assemble(
         )
     if placed.overlapping:
         builder.notes.append(f"{placed.overlapping} openings that overlap other openings were left out")
-    document: dict[str, Any] = {"name": options.name or clean_name(sketch.name) or "floor plan"}
+    name = options.name or clean_name(sketch.name)
+    document: dict[str, Any] = {} if name is None else {"name": name}
     if sketch.north_deg is not None:
         document["north_deg"] = round(sketch.north_deg % 360.0, 6)
     anchor = _shifted_anchor(sketch.anchor, shift, builder)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
@@ -77,6 +78,7 @@ class Sketch:
         north_deg: direction of north, clockwise from +y.
         anchor: place of the origin on Earth.
         opening_kinds: kinds of openings that the source shows completely; None for those that occur.
+        drawn: box around the drawn walls, if rooms were found between them.
     """
 
     rooms: list[SketchedRoom] = field(default_factory=list)
@@ -88,6 +90,7 @@ class Sketch:
     level: Level | None = None
     anchor: Anchor | None = None
     opening_kinds: tuple[str, ...] | None = None
+    drawn: BaseGeometry | None = None
 
 
 def chosen_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:

@@ -20,9 +20,9 @@ _ROLES: tuple[tuple[Role, str], ...] = (
         "ignored",
         "furniture furnishing furn mobel moebel mobilier mobiliario arredi meubel meubles dim dims dimension "
         "dimensions dimensiones bemassung massketten masse cotation cotes cotas quote grid grids axis axes "
-        "achse achsen title titleblock viewport defpoints border rahmen legend sanitary sanitar sanitaires "
-        "plumbing electrical elec lights appliance appliances equipment equip symbol symbols northarrow north "
-        "scale stair stairs treppe treppen escalier escaleras flor ceiling clng",
+        "achse achsen eje ejes asse assi title titleblock viewport defpoints border rahmen legend sanitary sanitar "
+        "sanitaires plumbing electrical elec lights appliance appliances equipment equip symbol symbols northarrow "
+        "north scale stair stairs treppe treppen escalier escaleras flor ceiling clng",
     ),
     (
         "door",

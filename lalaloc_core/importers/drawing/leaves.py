@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import shapely
 
 from lalaloc_core.importers.common.geometry import point_xy
-from lalaloc_core.importers.drawing.shapes import Stroke, Swing, fit_swing
+from lalaloc_core.importers.drawing.shapes import Area, Drawing, Stroke, Swing, fit_swing
 
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
 LEAF_M = (0.45, 1.6)
@@ -19,6 +19,8 @@ LEAF_M = (0.45, 1.6)
 _ARC_DEG = (8.0, 125.0)
 # Smallest angle between a slanted leaf and the walls.
 _SLANTED_DEG = 8.0
+# Thickest leaf that is drawn as a rectangle.
+_THICK_LEAF_M = 0.08
 # Ends of lines nearer than this touch (m).
 _TOUCH_M = 0.03
 
@@ -51,6 +53,39 @@ def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing]) -> Leaves:
         elif not any(math.dist(leaf.hinge, arc.hinge) <= 5 * _TOUCH_M for arc in turning):
             leaves.append(leaf)
     return Leaves(kept, leaves)
+
+
+def with_half_open_doors(drawing: Drawing) -> Drawing:
+    """Return a drawing in metres whose lines on layers of doors that are arcs of leaves are swings."""
+    arcs = [_arc(stroke) if stroke.role == "door" else None for stroke in drawing.strokes]
+    return replace(
+        drawing,
+        strokes=[stroke for stroke, arc in zip(drawing.strokes, arcs, strict=True) if arc is None],
+        swings=[*drawing.swings, *filter(None, arcs)],
+    )
+
+
+def drawn_leaves(drawing: Drawing) -> list[Swing]:
+    """Return the lines on layers of doors that are as long as leaves, once about each end: either can be the hinge."""
+    lines = [shapely.get_coordinates(stroke.line) for stroke in drawing.strokes if stroke.role == "door"]
+    ends = [(point_xy(points[0]), point_xy(points[-1])) for points in lines if len(points) == 2]
+    leaves = [(a, b) for a, b in ends if LEAF_M[0] <= math.dist(a, b) <= LEAF_M[1]]
+    return [Swing(hinge, tip, tip) for a, b in leaves for hinge, tip in ((a, b), (b, a))]
+
+
+def without_leaves(areas: Sequence[Area], swings: Sequence[Swing]) -> list[Area]:
+    """Return the areas that are no door leaves: thin rectangles at the hinge of an arc, as long as its radius."""
+    return [area for area in areas if not any(_is_leaf(area.shape, swing) for swing in swings)]
+
+
+def _is_leaf(shape: shapely.Polygon, swing: Swing) -> bool:
+    if shapely.distance(shape, shapely.Point(swing.hinge)) > 5 * _TOUCH_M:
+        return False
+    points = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
+    thin, long = sorted(math.dist(points[k], points[k + 1]) for k in (0, 1)) if len(points) == 5 else (0.0, 0.0)
+    tip = min(shapely.distance(shape, shapely.Point(end)) for end in (swing.first, swing.last))
+    has_size = thin <= _THICK_LEAF_M and abs(long - swing.radius) <= 0.1 * swing.radius
+    return has_size and bool(tip <= 5 * _TOUCH_M)
 
 
 def _arc(stroke: Stroke) -> Swing | None:

@@ -24,7 +24,13 @@ from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOp
 from lalaloc_core.importers.common.trace import Trace, TracePart
 from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
 from lalaloc_core.importers.drawing.dimensions import check_areas
-from lalaloc_core.importers.drawing.leaves import LEAF_M, take_leaves
+from lalaloc_core.importers.drawing.leaves import (
+    LEAF_M,
+    drawn_leaves,
+    take_leaves,
+    with_half_open_doors,
+    without_leaves,
+)
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
 
@@ -60,6 +66,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         InvalidFloorPlanError: the drawing has too many lines that could be walls, or the time is over.
     """
     sketch = Sketch()
+    drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     rooms = [area for area in drawing.areas if area.role == "room"]
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
@@ -73,9 +80,11 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         walls = take_leaves([stroke for stroke in drawing.strokes if stroke.role in (None, "wall")], drawing.swings)
         others = [stroke for stroke in drawing.strokes if stroke.role not in (None, "wall")]
         leaves = walls.swings
-        drawing = replace(drawing, strokes=[*walls.strokes, *others])
+        areas = without_leaves(drawing.areas, [*drawing.swings, *leaves])
+        drawing = replace(drawing, strokes=[*walls.strokes, *others], areas=areas)
         enclosed, source = _enclosed(drawing, budget)
         gaps = enclosed.gaps
+        sketch.drawn = enclosed.walls.envelope
         if leaves:
             builder.notes.append(f"{len(leaves)} leaves of doors and their arcs are not walls")
         if budget.trace is not None:
@@ -85,12 +94,12 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         builder.notes.append(
             f"rooms are the areas enclosed by {source}; gaps up to {DEFAULT_WALLS.widest_gap:g} m were closed"
         )
-    sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
+    sketch.rooms = named_rooms(shapes, drawing.letterings, builder, sketch.drawn)
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
-    closing = [swing for swing in leaves if _gap_of(swing, gaps) is not None]
-    sketch.openings = [*_symbols(drawing), *_swings([*drawing.swings, *closing], gaps, shapes)]
+    closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if _gap_of(swing, gaps) is not None]
+    sketch.openings = [*_symbols(drawing, closing), *_swings([*drawing.swings, *closing], gaps, shapes)]
     taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
     for gap in gaps:
         line = shapely.LineString([gap.start, gap.end])
@@ -204,15 +213,30 @@ def _sides(shape: BaseGeometry) -> tuple[float, float]:
     return float(min(first, second)), float(max(first, second))
 
 
-def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written."""
+def named_rooms(
+    shapes: Sequence[Area],
+    letterings: Sequence[Lettering],
+    builder: ReportBuilder,
+    drawn: BaseGeometry | None = None,
+) -> list[SketchedRoom]:
+    """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written.
+
+    Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
+    """
     tree = shapely.STRtree([area.shape for area in shapes])
     texts: dict[int, list[str]] = {}
+    lost: list[str] = []
     for lettering in letterings:
         inside = tree.query(shapely.Point(lettering.position), predicate="within")
         if len(inside):
             smallest = min(inside, key=lambda index: shapes[index].shape.area)
             texts.setdefault(int(smallest), []).append(lettering.text)
+        elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
+            lost.append(_without_size(lettering.text))
+    if named := [f"'{text}'" for text in dict.fromkeys(lost) if _is_name(text) and room_type_from_name(text)]:
+        builder.warnings.append(
+            f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
+        )
     rooms = []
     for index, area in enumerate(shapes):
         words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
@@ -241,12 +265,12 @@ def _is_name(text: str) -> bool:
     return letters >= 2 and letters > digits
 
 
-def _symbols(drawing: Drawing) -> list[SketchedOpening]:
-    """Return the openings on layers named after them, one per cluster of shapes."""
+def _symbols(drawing: Drawing, closing: Sequence[Swing]) -> list[SketchedOpening]:
+    """Return the openings on layers named after them, one per cluster of shapes, without leaves that close a gap."""
     found = []
     for kind in ("door", "window", "passage"):
         shapes: list[BaseGeometry] = [area.shape for area in drawing.areas if area.role == kind]
-        swinging = [swing for swing in drawing.swings if kind == "door"]
+        swinging = [*drawing.swings, *closing] if kind == "door" else []
         hinges = shapely.MultiPoint([swing.hinge for swing in swinging]) if swinging else None
         shapes += [stroke.line for stroke in drawing.strokes if stroke.role == kind]
         for cluster in clusters(shapes, _SYMBOL_M):

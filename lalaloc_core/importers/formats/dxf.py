@@ -21,6 +21,7 @@ from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dxfentity import DXFEntity
 from ezdxf.entities.dxfgfx import DXFGraphic
 from ezdxf.entities.insert import Insert
+from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
 from jaxtyping import Float
@@ -254,7 +255,12 @@ def _add(
         drawing.areas += [Area(shape, context.layer, role, is_dark=is_solid) for shape in shapes]
         builder.use(context.layer, f"hatches: {role or 'possible walls'}", max(len(shapes), 1))
     elif kind in _LINES:
-        _add_line(entity, context, drawing, builder, sag)
+        parts: Iterable[DXFGraphic] = (entity,)
+        if isinstance(entity, LWPolyline) and entity.has_arc and not entity.closed and role in (None, "wall", "door"):
+            # A leaf and its arc can be one polyline.
+            parts = entity.virtual_entities()
+        for part in parts:
+            _add_line(part, context, drawing, builder, sag)
     else:
         builder.use(context.layer, f"ignored ({kind})")
 

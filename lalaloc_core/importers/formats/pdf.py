@@ -71,7 +71,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             # Searchable scans contain text over the picture.
             own = found.drawing.scaled(factor, flip_y=False).letterings
             rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-            sketch.rooms = named_rooms(rooms, own or scan.placed(factor), builder)
+            sketch.rooms = named_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
     finally:
         document.close()
     plan = assemble(

@@ -60,7 +60,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "scale), and that walls are dark or drawn with two lines"
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-    sketch.rooms = named_rooms(rooms, texts.placed(factor), builder)
+    sketch.rooms = named_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
     return (
         assemble(
             sketch,

@@ -104,7 +104,7 @@ def sketch_picture(
             "openings are drawn but not used for localisation; set opening_kinds to the kinds that are complete"
         )
     # A missed or misclassified opening would count against the right pose.
-    return Sketch(rooms=rooms, openings=openings, opening_kinds=())
+    return Sketch(rooms=rooms, openings=openings, opening_kinds=(), drawn=best.enclosed.walls.envelope)
 
 
 def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:

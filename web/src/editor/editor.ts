@@ -3,7 +3,7 @@
 import { api, ServiceError } from "../api";
 import { button, byId, h, show } from "../dom";
 import { clearError, InputError, say, showError } from "../notices";
-import { type Box, boxOf, unitOf } from "../plan_drawing";
+import { type Box, boxOf, lostAreas, unitOf } from "../plan_drawing";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
 import { setFormPlan, showForm } from "./forms";
@@ -82,7 +82,7 @@ export class Editor {
     this.underlay.remove();
     clearError(this.error);
     this.tools.choose(plan === null ? "room" : "select");
-    this.host.fit(boxOf(this.saved));
+    this.host.fit(boxOf(this.saved, lostAreas(plan)));
     this.drawBar();
     this.redraw();
     if (plan !== null) void this.layOriginal(plan);
