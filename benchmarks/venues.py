@@ -11,7 +11,7 @@ Times are processor times of one thread.
 other ceilings, turned by quarters and mirrored at random. Their prototypes are computed from those of the home, exactly
 up to interpolation between azimuths. Brute force compares all prototypes under all hypotheses where that is at most
 `--exact` pairs (half a minute for every 100 million); beyond, it compares all of them by codes and the best million
-exactly.
+exactly. It aligns the best hundred thousand.
 
 `search` localises each query twice with the production search and LPO: among the plans that the index chooses, as the
 service does, and among all plans.
@@ -62,6 +62,8 @@ _FIRST = 20
 _MAX_STRETCH = 0.1
 # Pairs that brute force compares exactly where it compares all pairs by codes.
 _MAX_COMPARED = 1_000_000
+# Pairs that brute force aligns.
+_MAX_ALIGNED = 100_000
 _STEP_M = 0.5
 # Homes that `recall` generates at most; further plans are variants of them. Ranks within which it counts right plans.
 _HOMES, _RANKS = 2500, (1, 20, 128)
@@ -197,7 +199,8 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
         for number, name, query in queries(bundle, homes, options.seed):
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
             reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
-            exact = _ranked(index.log_masses(query, weights, config, compared=compared, scanned=10**15))
+            limits = {"compared": compared, "scanned": 10**15, "aligned": _MAX_ALIGNED}
+            exact = _ranked(index.log_masses(query, weights, config, **limits))
             for scanned in options.scanned:
                 begin, began = time.process_time(), time.perf_counter()
                 mass = index.log_masses(query, weights, config, compared=options.compared, scanned=int(scanned))

@@ -13,6 +13,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import (
     PoseGrid,
@@ -25,6 +26,7 @@ from lalaloc_core.localise.poses import (
 )
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
+from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
 from lalaloc_core.localise.venue.prototype_codes import CodeScan, lookup_tables, product_codes
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
@@ -38,7 +40,7 @@ from lalaloc_core.localise.venue.prototypes import (
     share_searched,
     unpacked_openings,
 )
-from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.render.sampling import PoseSet, pose_grid
 from lalaloc_core.render.sweep import profiles_at
 from tests.strategies import plan_document, present, rectangle
 
@@ -231,14 +233,105 @@ def test_scan_finds_the_lowest_codes_of_the_given_lists() -> None:
     assert (found[2] == -1).all()
 
 
+def seen_query(plan: FloorPlan, position_m: tuple[float, float], *, hypotheses: int = 1, turn: float = 0.0) -> Query:
+    """Return the exact prediction of walls and openings in a plan's first room; the first heading is off by `turn`."""
+    pose = PoseSet(np.array([position_m]), np.zeros(1, int))
+    layouts = layouts_at(plan, pose, np.array([turn]), COLUMNS)
+    kind = np.zeros(COLUMNS, int) if layouts.kind is None else layouts.kind[0]
+    log_probability = np.log(np.where(kind[:, None] == np.arange(CLASSES), 0.85, 0.05))
+    shifts = np.arange(hypotheses) * COLUMNS // hypotheses
+    profile = PredictedProfile(layouts.log_profile.astype(float), np.full((1, COLUMNS), np.log(0.03)))
+    return Query(
+        np.zeros((hypotheses, 1)),
+        shifts * 2.0 * np.pi / COLUMNS,
+        0.0,
+        hypotheses == 1,
+        CameraHeight(1.5),
+        profile.moved(shifts),
+        PredictedOpenings(rolled(log_probability, shifts), np.array([0.5, 0.2, 0.2, 0.1])),
+    )
+
+
+@pytest.mark.parametrize("turn_deg", [-5.0, 0.0, 5.0])
+@pytest.mark.parametrize("moved_m", [(0.25, -0.2), (-0.3, 0.1), (0.0, 0.35)])
+def test_alignment_finds_the_camera_beside_a_prototype(moved_m: tuple[float, float], turn_deg: float) -> None:
+    plan, height_offset = two_rooms(4.3, 3.4), 0.04
+    grid = grid_of(plan)
+    prototypes, square = prototypes_of(grid, plan), np.rint(grid.poses.position_m / STEP_M).astype(int).sum(axis=1)
+    position_m = grid.poses.position_m[square % 2 == 0]
+    number = int(np.linalg.norm(position_m - (2.0, 1.5), axis=1).argmin())
+    x_m, y_m = position_m[number] + moved_m
+    query = seen_query(plan, (x_m, y_m), hypotheses=32, turn=np.radians(turn_deg))
+    # The camera stood higher than stated, so predicted distances are too small.
+    query = query.scaled(-height_offset)
+    # At a high temperature, the prior of the unknowns hardly counts.
+    weights, pair = replace(WEIGHTS, temperature=1000.0), (prototypes.rows[[number]], np.array([0]), np.array([0]))
+    cost, step = PrototypeAlignment(PrototypeCosts(query, STEP_M, weights, CONFIG)).pairs(*pair)
+    np.testing.assert_allclose(step[0, :2], moved_m, atol=0.08)
+    assert step[0, 2] == pytest.approx(np.radians(turn_deg), abs=np.radians(1.5))
+    assert step[0, 3] == pytest.approx(height_offset, abs=0.03)
+    # Alignment compares with half of the reach.
+    unmoved = PrototypeCosts(query, 0.5 * STEP_M, weights, CONFIG).pairs(*pair)
+    assert cost[0] < 0.6 * unmoved[0]
+
+
+def test_known_values_are_not_aligned(prototype_sets: list[Prototypes]) -> None:
+    rows, rng = prototype_sets[0].rows[:5], np.random.default_rng(13)
+    query = replace(query_at(prototype_sets[0], 3, rng), camera_height=CameraHeight(1.5, 0.0))
+    costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
+    step = PrototypeAlignment(costs).pairs(rows, np.zeros(5, int), np.zeros(5, int)).step
+    assert np.abs(step[:, :2]).max() > 0.01
+    np.testing.assert_array_equal(step[:, 2:], 0.0)
+
+
+def furnished_plan(number: int) -> FloorPlan:
+    """Return a plan of the same walls for every number, with a door and a window in other places of the first room."""
+    document = plan_document(rectangle(4.4, 3.3), rectangle(2.9, 3.0, corner=(4.5, 0.0)), ceiling_m=2.5)
+    door_m, window_m, side_m = 0.2 + 0.9 * (number % 3), 0.3 + 1.4 * (number // 3), 3.3 if number % 2 else 0.0
+    document["openings"] = [
+        {"kind": "door", "line": [[4.45, door_m], [4.45, door_m + 0.9]]},
+        {"kind": "window", "line": [[window_m, side_m], [window_m + 1.1, side_m]], "sill_m": 0.9, "head_m": 2.0},
+    ]
+    return FloorPlan.from_dict(document)
+
+
+@pytest.mark.parametrize("hypotheses", [1, 32])
+def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> None:
+    plans, rng, cells = [furnished_plan(number) for number in range(9)], np.random.default_rng(14), shipped_cells()
+    parts = [prototypes_of(grid_of(plan), plan) for plan in plans]
+    rows, count = joined(parts).rows.copy(), np.array([len(part) for part in parts])
+    rows["cell"] = cells.assign(rows)
+    begin, limits = np.cumsum(count) - count, {"compared": 4000, "aligned": 1000}
+    index = PlanIndex.build(rows, begin, count, step_m=STEP_M, cells=cells)
+    # The same plans, a third of them added later.
+    grown = PlanIndex.build(rows, begin[:6], count[:6], step_m=STEP_M, cells=cells).updated(
+        np.arange(6), np.arange(6, 9), lambda numbers: (rows, begin[numbers], count[numbers])
+    )
+    ranks, grown_ranks = list[int](), list[int]()
+    for number, plan in enumerate(plans):
+        # Cameras between prototypes, and between hypotheses of the heading.
+        x_m, y_m = rng.uniform((1.2, 1.2), (3.2, 2.2)).tolist()
+        query = seen_query(plan, (x_m, y_m), hypotheses=hypotheses, turn=0.08 if hypotheses > 1 else 0.0)
+        mass, grown_mass = (each.log_masses(query, WEIGHTS, CONFIG, **limits) for each in (index, grown))
+        ranks.append(int((mass > mass[number]).sum()))
+        grown_ranks.append(int((grown_mass > grown_mass[number]).sum()))
+    assert ranks.count(0) >= 7
+    assert max(ranks) <= 2
+    assert grown_ranks == ranks
+    # By walls alone, all plans are equal.
+    walls = index.log_masses(query, WEIGHTS, replace(CONFIG, use_openings=False), compared=10**9, aligned=10**9)
+    np.testing.assert_allclose(walls, walls[0], atol=1e-3)
+
+
 def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototypes]) -> None:
     few, rng = prototype_sets[:4], np.random.default_rng(4)
     query = query_at(few[1], 3, rng, hypotheses=4)
-    costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
+    alignment = PrototypeAlignment(PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG))
     index = PlanIndex.from_prototypes(few, shipped_cells())
     expected = []
     for part in few:
-        cost = np.stack([costs.pairs(part.rows, np.full(len(part), k), np.zeros(len(part), int)) for k in range(4)])
+        offset = np.zeros(len(part), int)
+        cost = np.stack([alignment.pairs(part.rows, np.full(len(part), k), offset).cost for k in range(4)])
         weighed = part.rows["log_area"] - WEIGHTS.temperature * cost.astype(float)
         expected.append(np.logaddexp.reduce(weighed, axis=None))
     found = index.log_masses(query, WEIGHTS, CONFIG)

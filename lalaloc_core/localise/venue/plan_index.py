@@ -1,7 +1,7 @@
 """Index of the prototypes of many plans; gives every plan a probability for a panorama.
 
 It works like an inverted file with product codes and re-ranking (IVF-PQ in faiss). A query compares *pairs* of a
-prototype and a hypothesis of the heading and the camera height. Three stages, each on fewer pairs than the one before:
+prototype and a hypothesis of the heading and the camera height. Four stages, each on fewer pairs than the one before:
 
 1. **Inverted file.** A coarse quantiser assigns each prototype to a cell (`prototype_cells`). The query computes the
    cost of every cell under every hypothesis and probes the cheapest ones.
@@ -9,11 +9,13 @@ prototype and a hypothesis of the heading and the camera height. Three stages, e
    hypothesis (`prototype_codes`).
 3. **Exact comparison.** The cheapest pairs of the scan get their exact cost (`prototype_costs`) and are summed to the
    masses of their plans. All other pairs count as zero.
+4. **Alignment.** The cheapest of these get the cost at the best pose nearby (`prototype_alignment`), whose sums replace
+   the masses of their plans. All other masses change by the median factor.
 
-Small indexes skip stages: if the query has at most `scanned` pairs all cells are probed, and if it has at most
-`compared` pairs all are compared exactly, so that the masses are exact. Equal prototypes of a segment are stored and
-compared once, for all plans that own them. Pairs of equal cost are kept or left out together, so copies of a plan have
-equal masses.
+Small indexes skip stages: if the query has at most `scanned` pairs all cells are probed, if it has at most `compared`
+pairs all are compared exactly, and if it has at most `aligned` pairs all are aligned. Equal prototypes of a segment are
+stored and compared once, for all plans that own them. Pairs of equal cost are kept or left out together, so copies of a
+plan have equal masses.
 
 An index never changes, so queries need no lock. `PlanIndex.updated` returns a new one that shares the segments of the
 old one: plans that were added are in a new segment, plans that were removed are left out of the sums. Segments are
@@ -23,8 +25,9 @@ merged so that each has at least twice as many plans as the next (the logarithmi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,14 +35,15 @@ from jaxtyping import Bool, Float, Int
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of
 from lalaloc_core.localise.venue.prototype_codes import lookup_tables
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import Prototypes, joined
 from lalaloc_core.localise.venue.segment import Segment, by_family
 
-# Default numbers of pairs per query in the code scan and in the exact comparison.
-SCANNED, COMPARED = 40_000_000, 20_000
+# Default numbers of pairs per query in the code scan, in the exact comparison, and in the alignment.
+SCANNED, COMPARED, ALIGNED = 40_000_000, 20_000, 4_000
 # The scan returns this multiple of each hypothesis's share, as the best pairs are spread unevenly over hypotheses.
 _OVERFETCH = 6
 # Pairs compared at a time, to bound memory.
@@ -88,6 +92,56 @@ class _Part:
             return np.ones(len(prototype), bool)
         place = np.minimum(np.searchsorted(self.dead, prototype), len(self.dead) - 1)
         return self.dead[place] != prototype
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of a distinct prototype of a segment, a heading hypothesis and a height hypothesis, by number."""
+
+    part: _Part
+    prototype: Int[np.ndarray, "n"]
+    hypothesis: Int[np.ndarray, "n"]
+    offset: Int[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.prototype)
+
+    def chosen(self, place: Int[np.ndarray, "m"]) -> _Pairs:
+        """Return some of the pairs."""
+        return _Pairs(self.part, self.prototype[place], self.hypothesis[place], self.offset[place])
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Records of the prototypes."""
+        return self.part.segment.records(self.prototype)
+
+
+class _Masses:
+    """Sums of the masses of p plans over pairs."""
+
+    def __init__(self, plans: int, temperature: float) -> None:
+        self._mass, self._temperature, self._lowest = np.zeros(plans), temperature, np.inf
+
+    def add(self, pairs: _Pairs, cost: Float[np.ndarray, "n"]) -> None:
+        """Add pairs with their costs."""
+        part, temperature = pairs.part, self._temperature
+        # Masses are relative to the lowest cost so far, so that relevant ones do not underflow.
+        lowest = min(self._lowest, float(cost.min()))
+        self._mass *= np.exp(-temperature * (self._lowest - lowest)) if np.isfinite(self._lowest) else 1.0
+        self._lowest = lowest
+        weight = np.exp(pairs.rows["log_area"] - temperature * (cost.astype(np.float64) - lowest))
+        count, owner = part.segment.owners(pairs.prototype)
+        plan, each = part.plan[owner], np.repeat(weight, count)
+        # Removed plans can share prototypes with those that are left.
+        left = plan >= 0
+        if not left.all():
+            plan, each = plan[left], each[left]
+        self._mass += np.bincount(plan, each, minlength=len(self._mass))
+
+    def log(self) -> Float[np.ndarray, "p"]:
+        """Return the log masses; -inf for plans without pairs."""
+        with np.errstate(divide="ignore"):
+            return np.log(self._mass) - self._temperature * self._lowest
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -177,49 +231,40 @@ class PlanIndex:
         *,
         compared: int = COMPARED,
         scanned: int = SCANNED,
+        aligned: int = ALIGNED,
     ) -> Float[np.ndarray, "p"]:
         """Return the log of each plan's mass (see `prototypes`); -inf if none of its prototypes was compared exactly.
 
-        About `compared` pairs are compared exactly, as pairs of equal cost are kept together. About `scanned` pairs are
-        in the code scan, as the last probed cell is scanned whole.
+        About `compared` pairs are compared exactly and about `aligned` pairs are aligned, as pairs of equal cost are
+        kept together. About `scanned` pairs are in the code scan, as the last probed cell is scanned whole.
         """
         costs = PrototypeCosts(query, self.step_m, weights, config)
         k, j = costs.shape
         compares_all = len(self) * k * j <= compared
         pairs = self._all_pairs(k, j) if compares_all else self._best_pairs(costs, compared, scanned)
-        mass, lowest = np.zeros(self.plan_count), np.inf
-        for part, prototype, hypothesis, offset in pairs:
-            rows = part.segment.records(prototype)
-            cost = costs.pairs(rows, hypothesis, offset)
-            # Masses are relative to the lowest cost so far, so that relevant ones do not underflow.
-            new_lowest = min(lowest, float(cost.min()))
-            mass *= np.exp(-weights.temperature * (lowest - new_lowest)) if np.isfinite(lowest) else 1.0
-            lowest = new_lowest
-            weight = np.exp(rows["log_area"] - weights.temperature * (cost.astype(np.float64) - lowest))
-            count, owner = part.segment.owners(prototype)
-            plan, each = part.plan[owner], np.repeat(weight, count)
-            # Removed plans can share prototypes with those that are left.
-            left = plan >= 0
-            if not left.all():
-                plan, each = plan[left], each[left]
-            mass += np.bincount(plan, each, minlength=self.plan_count)
-        with np.errstate(divide="ignore"):
-            return np.log(mass) - weights.temperature * lowest
+        compared_masses, aligned_masses = (_Masses(self.plan_count, weights.temperature) for _ in range(2))
+        alignment = PrototypeAlignment(costs)
+        for batch in _cheapest_pairs(costs, pairs, aligned, compared_masses):
+            aligned_masses.add(batch, alignment.pairs(batch.rows, batch.hypothesis, batch.offset).cost)
+        compared_mass, aligned_mass = compared_masses.log(), aligned_masses.log()
+        is_aligned = np.isfinite(aligned_mass)
+        if not is_aligned.any():
+            return compared_mass
+        change = np.median(aligned_mass[is_aligned] - compared_mass[is_aligned])
+        return np.where(is_aligned, aligned_mass, compared_mass + change)
 
-    def _all_pairs(self, k: int, j: int) -> Iterator[tuple[_Part, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield all pairs in batches: distinct prototypes, heading hypotheses and height hypotheses, by number."""
+    def _all_pairs(self, k: int, j: int) -> Iterator[_Pairs]:
+        """Yield all pairs in batches."""
         for part in self.parts:
             number = np.arange(len(part.segment))
             number = number[part.alive(number)]
             for begin in range(0, len(number) * k * j, _BATCH_SIZE):
                 pair = np.arange(begin, min(begin + _BATCH_SIZE, len(number) * k * j))
                 place, hypothesis, offset = np.unravel_index(pair, (len(number), k, j))
-                yield part, number[place], hypothesis, offset
+                yield _Pairs(part, number[place], hypothesis, offset)
 
-    def _best_pairs(
-        self, costs: PrototypeCosts, compared: int, scanned: int
-    ) -> Iterator[tuple[_Part, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield about the `compared` pairs that are cheapest by their codes, in batches as `_all_pairs` does."""
+    def _best_pairs(self, costs: PrototypeCosts, compared: int, scanned: int) -> Iterator[_Pairs]:
+        """Yield about the `compared` pairs that are cheapest by their codes, in batches."""
         k, j = costs.shape
         probed = self._probed_cells(costs, scanned)
         families = {family for part in self.parts for family in part.segment.nonempty_cells}
@@ -236,10 +281,9 @@ class PlanIndex:
             prototype, joint = prototype[cost <= highest], joint[cost <= highest]
             # Rows are read fastest in the order of memory.
             order = np.argsort(prototype, kind="stable")
-            prototype, (hypothesis, offset) = prototype[order], np.divmod(joint[order], j)
-            for begin in range(0, len(prototype), _BATCH_SIZE):
-                batch = slice(begin, begin + _BATCH_SIZE)
-                yield part, prototype[batch], hypothesis[batch], offset[batch]
+            found_pairs = _Pairs(part, prototype[order], *np.divmod(joint[order], j))
+            for begin in range(0, len(found_pairs), _BATCH_SIZE):
+                yield found_pairs.chosen(np.arange(begin, min(begin + _BATCH_SIZE, len(found_pairs))))
 
     def _probed_cells(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l q"]] | None:
         """Return for each family which of its cells are probed under which hypotheses; None for all."""
@@ -265,6 +309,34 @@ class PlanIndex:
         for (family, cell), part in zip(nonempty.items(), np.split(chosen, ends[:-1]), strict=True):
             probed[family][cell % per_family] = part.reshape(-1, k * j)
         return probed
+
+
+def _cheapest_pairs(costs: PrototypeCosts, pairs: Iterable[_Pairs], count: int, masses: _Masses) -> list[_Pairs]:
+    """Add all pairs to the masses, and return about the `count` cheapest ones, by their exact costs.
+
+    Pairs of equal cost are kept together.
+    """
+    kept, total, highest = list[tuple[_Pairs, np.ndarray]](), 0, np.inf
+    for batch in pairs:
+        if not len(batch):
+            continue
+        cost = costs.pairs(batch.rows, batch.hypothesis, batch.offset)
+        masses.add(batch, cost)
+        kept.append((batch, cost))
+        total += len(batch)
+        if total > count + _BATCH_SIZE:
+            highest = _highest(kept, count, highest)
+            kept = [(batch.chosen(low), cost[low]) for batch, cost in kept for low in [np.flatnonzero(cost <= highest)]]
+            total = sum(len(batch) for batch, _ in kept)
+    highest = _highest(kept, count, highest) if kept else highest
+    chosen = [batch.chosen(np.flatnonzero(cost <= highest)) for batch, cost in kept]
+    return [batch for batch in chosen if len(batch)]
+
+
+def _highest(pairs: Sequence[tuple[_Pairs, np.ndarray]], count: int, highest: float) -> float:
+    """Return the highest cost of the `count` cheapest pairs."""
+    cost = np.concatenate([cost for _, cost in pairs])
+    return highest if len(cost) <= count else min(highest, float(np.partition(cost, count - 1)[count - 1]))
 
 
 def _part(rows: np.ndarray, begin: np.ndarray, count: np.ndarray, numbers: Int[np.ndarray, "p"], cells: Cells) -> _Part:

@@ -6,18 +6,20 @@ Differences to the matching cost of grid poses:
 * The reach is that of a grid with the prototypes' spacing.
 * Views through openings are ignored.
 * Openings have less weight, as they appear displaced from a prototype up to half a metre away from the camera.
+  `prototype_alignment` solves for the displacement.
 * The openings' term is relative to the best class of a plan that claims all classes, so that plans with different
   claims can be compared. Classes that a plan does not claim are merged with the wall.
 """
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, column_azimuths
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.cost_terms import (
     ceiling_costs,
@@ -51,6 +53,7 @@ class PrototypeCosts:
     Attributes:
         centre: (k, a) predicted log wall profile (m) at the prototypes' azimuths.
         precision: (k, a) factors that turn differences of log distance into residuals.
+        reach_m: distance (m) of the camera from the best prototype, at most.
         offsets: (j,) logs of true over stated camera height.
         penalty: (j,) prior cost of each height.
     """
@@ -61,11 +64,9 @@ class PrototypeCosts:
         self._columns = azimuths(query.profile.log_m.shape[1])
         # Hypotheses closer than two azimuths of the prototypes cannot be distinguished.
         self._every = max(1, len(query.roll) // AZIMUTHS)
-        self._reach_m = config.grid_reach * STEPS * step_m
+        self.reach_m = config.grid_reach * STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
-        self.precision = precisions(query.profile.log_m, query.profile.log_scale, self._reach_m, weights.tail)[
-            :: self._every, self._columns
-        ].astype(np.float32)
+        self.precision = self.precisions(self.reach_m)
         self.offsets = _offsets(query)
         self.penalty = query.camera_height.penalty(self.offsets) / weights.temperature
 
@@ -73,6 +74,34 @@ class PrototypeCosts:
     def shape(self) -> tuple[int, int]:
         """Numbers of hypotheses of the heading and of the height."""
         return len(self.centre), len(self.offsets)
+
+    @property
+    def temperature(self) -> float:
+        """Factor that turns costs into negative log likelihoods."""
+        return self._weights.temperature
+
+    @property
+    def azimuths(self) -> Float[np.ndarray, "a"]:
+        """Azimuths (radians) that are compared."""
+        assert self._query.profile is not None
+        return column_azimuths(self._query.profile.log_m.shape[1])[self._columns]
+
+    @property
+    def sector(self) -> float:
+        """Angle (radians) between neighbouring hypotheses; 0 for a single one."""
+        return self._every * self._query.sector
+
+    @property
+    def height_spread(self) -> float:
+        """Standard deviation of the log of the true height over that of the best hypothesis."""
+        return min(self._query.camera_height.log_std, _OFFSET_SPACING / math.sqrt(12.0))
+
+    def precisions(self, reach_m: float) -> Float[np.ndarray, "k a"]:
+        """Return the factors of differences of log distance for a camera within a reach (m)."""
+        profile = self._query.profile
+        assert profile is not None
+        precision = precisions(profile.log_m, profile.log_scale, reach_m, self._weights.tail)
+        return precision[:: self._every, self._columns].astype(np.float32)
 
     def pairs(
         self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]
@@ -90,14 +119,15 @@ class PrototypeCosts:
 
     def _pairs(self, rows: np.ndarray, hypothesis: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
         log_profile = rows["log_profile"].astype(np.float32)
-        cost = _walls(log_profile - self._shifted[hypothesis, offset], self.precision[hypothesis])
-        cost += self._room_costs(rows, offset)
+        cost = _walls(log_profile - self.shifted[hypothesis, offset], self.precision[hypothesis])
+        cost += self.room_costs(rows, offset)
         if self.opening_loss is not None:
             cost += self._openings(rows, hypothesis)
         return cost
 
     @cached_property
-    def _shifted(self) -> Float[np.ndarray, "k j a"]:
+    def shifted(self) -> Float[np.ndarray, "k j a"]:
+        """Predicted log wall profile (m) under every hypothesis."""
         return self.centre[:, None] + self.offsets[None, :, None].astype(np.float32)
 
     def ceilings(self, ceiling_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "j n"]:
@@ -113,7 +143,7 @@ class PrototypeCosts:
             return np.zeros(len(ROOM_TYPES))
         return self._weights.room_type * room_type_losses(self._query.room_type, self._config.floor)
 
-    def _room_costs(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
+    def room_costs(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the cost of each prototype's room type and ceiling, and the penalty of its height hypothesis."""
         cost = self.penalty[offset] + self.room_types[rows["room_type"]]
         if self._query.ceiling is not None and self._config.use_ceiling:
@@ -135,15 +165,20 @@ class PrototypeCosts:
 
     @cached_property
     def opening_loss(self) -> Float[np.ndarray, "m k a c"] | None:
-        """Weighted cost of each opening class by claims (m of them, as in `prototypes.ROW`), hypothesis and azimuth.
+        """The `opening_losses` of prototypes."""
+        return self.opening_losses(self.reach_m, _OPENINGS_SHARE)
 
-        The openings' term is the sum over the azimuths. None if openings are not compared.
+    def opening_losses(self, reach_m: float, share: float) -> Float[np.ndarray, "m k a c"] | None:
+        """Return the weighted cost of each opening class by claims, hypothesis and azimuth.
+
+        The openings' term is the sum over the azimuths. There are m claims, see `prototypes.ROW`. Openings appear
+        displaced by up to `reach_m`; their weight is a share of the matching cost's. None if openings are not compared.
         """
         predicted = self._query.openings
         if predicted is None or not self._config.use_openings:
             return None
         probability = np.exp(predicted.log_probability[:: self._every])
-        spread = self._reach_m / median_distance_m(self.centre[0], self.precision[0])
+        spread = reach_m / median_distance_m(self.centre[0], self.precision[0])
         probability = smoothed(probability, spread)[:, self._columns]
         loss = np.stack(
             [
@@ -159,7 +194,7 @@ class PrototypeCosts:
         ).astype(np.float32)
         # Costs are relative to the best class for a plan that claims all classes.
         loss -= loss[-1].min(axis=-1, keepdims=True)
-        return loss * np.float32(_OPENINGS_SHARE * self._weights.openings / AZIMUTHS)
+        return loss * np.float32(share * self._weights.openings / AZIMUTHS)
 
     @cached_property
     def _byte_losses(self) -> Float[np.ndarray, "t"]:
