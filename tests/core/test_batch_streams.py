@@ -113,6 +113,7 @@ class TestStream:
         resumed = colours(list(itertools.islice(stage.batches(6, 0), 6)))
         assert not set(seen) & set(resumed)
 
+    @pytest.mark.slow
     def test_camera_height_error_has_the_configured_spread(self) -> None:
         exact, off = batches(), batches(camera_height_error_m=0.05)
         # The error is drawn after the rotation, so only the first picture of a home is the same.
@@ -172,6 +173,7 @@ def test_deferred_batches_equal_rendered_ones(uses: int, neighbours: bool, worke
         assert (a["image"].int() - b["image"].int()).abs().max() <= 1
 
 
+@pytest.mark.slow
 def test_scenes_are_rendered_once_and_evicted() -> None:
     config = config_of(3)
     source = GeneratedSource(config, deferred=True)

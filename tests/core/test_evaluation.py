@@ -94,6 +94,7 @@ class TestRunning:
             assert prediction.facts == tuple(sorted(facts_of(photograph.shot)))
         assert any(prediction.facts for prediction in predictions)
 
+    @pytest.mark.slow
     def test_workers_do_not_change_predictions(self, layout_run: RunInfo, tmp_path: Path) -> None:
         here = run_evaluation(RunFolder(tmp_path / "here"), layout_run, workers=0)
         there = run_evaluation(RunFolder(tmp_path / "there"), layout_run, workers=2)

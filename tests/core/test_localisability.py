@@ -74,6 +74,7 @@ def test_equal_rooms_are_confused_and_a_room_hint_helps(manifest: Manifest) -> N
     assert found.gains["doors"] is None
 
 
+@pytest.mark.slow
 def test_room_alone_is_found_more_often_than_among_equal_rooms(manifest: Manifest) -> None:
     alone = localisability(_rooms((0.0, 4.0, 3.0)), manifest)
     among = localisability(_rooms((0.0, 4.0, 3.0), (10.0, 4.0, 3.0), (20.0, 4.0, 3.0)), manifest)

@@ -236,6 +236,7 @@ class TestProfiles:
 
 
 class TestContainment:
+    @pytest.mark.slow
     @pytest.mark.parametrize("config", [LM, ADAM], ids=["lm", "adam"])
     @given(room=room_polygons(), target_room=room_polygons(), seed=seeds(), heading_known=st.booleans())
     @settings(max_examples=15)

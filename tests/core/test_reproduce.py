@@ -275,6 +275,7 @@ class TestTraining:
         assert train("layout-log-ratio", tmp_path).sha256 == bundle.sha256
         assert written(tmp_path)["layout-log-ratio/layout.pt"] == before
 
+    @pytest.mark.slow
     def test_variant_resumes_on_its_own_data_set_only(self, tmp_path: Path) -> None:
         config = ablations.ABLATIONS["layout-mlp"].config["small"]
         shorter = config.with_settings({"layout.steps": 2})

@@ -391,6 +391,7 @@ class TestStages:
         with torch.no_grad():
             return float(sum(stage.losses(batch).values()))
 
+    @pytest.mark.slow
     def test_layout_loss_falls_on_unseen_layouts(self, tmp_path: Path) -> None:
         stage = layout_stage()
         unseen = next(stage.batches(1000, 0))
@@ -518,6 +519,7 @@ class TestStages:
         with pytest.raises(ConfigError, match="'ring'"):
             EndToEndStage(TINY, GeneratedSource(TINY))
 
+    @pytest.mark.slow
     def test_end_to_end_run_is_exported(self, tmp_path: Path) -> None:
         config = changed("image", small_paper(), steps=1)
         stage = EndToEndStage(config, GeneratedSource(config))

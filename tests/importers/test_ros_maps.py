@@ -113,6 +113,7 @@ def test_large_plan_has_larger_cells():
     assert len(files["map.pgm"]) < 4.1e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.0, 0.4, -2.0])
 def test_origin_and_rotation_of_a_map_are_kept(flat: FloorPlan, yaw: float):
     frame = MapFrame(0.04, (-7.3, -9.1, yaw), (800, 800))

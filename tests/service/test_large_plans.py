@@ -105,6 +105,7 @@ def test_packed_plan_is_the_same() -> None:
     assert max(len(piece) for pieces in packed.pieces for piece in pieces) < 64 * 1024
 
 
+@pytest.mark.slow
 def test_stored_large_plan_is_parsed_by_a_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = FloorPlan.from_dict(large_plan())
     stored = PlanDocument.from_plan(plan)

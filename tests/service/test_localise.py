@@ -365,6 +365,7 @@ def test_queries_beyond_the_limit_are_rejected(start_app: StartApp, tmp_path: Pa
         assert waiting.result().status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_hanging_database_does_not_block_known_plans(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes

@@ -177,6 +177,7 @@ def test_job_cancelled_during_submission_is_not_started(log: Path, gate: Path) -
         assert _count(log, "echo") == 0
 
 
+@pytest.mark.slow
 def test_random_kills_lose_and_mix_up_no_result(log: Path) -> None:
     """Results are larger than a pipe's buffer, so that workers also die in the middle of a message."""
     rng = random.Random(5)

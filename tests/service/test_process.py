@@ -109,6 +109,7 @@ def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, pa
         assert localise(client, plan_id, panorama, refine="none").json()["candidates"] == coarse["candidates"]
 
 
+@pytest.mark.slow
 def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
     rng = random.Random(3)
     environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="2", MAX_QUERIES="8")
@@ -140,6 +141,7 @@ def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panor
         assert 'lalaloc_pool_restarts_total{pool="lpo"} 0.0' not in client.get("/metrics").text
 
 
+@pytest.mark.slow
 def test_killed_service_leaves_no_workers_and_resumes(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data")
     with _uvicorn(environment, tmp_path / "log") as (process, client):

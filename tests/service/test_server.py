@@ -132,6 +132,7 @@ def test_only_named_proxies_are_trusted(monkeypatch: pytest.MonkeyPatch, proxies
     assert answer.json() == client_host
 
 
+@pytest.mark.slow
 def test_descriptor_limit_bounds_connections() -> None:
     code = (
         "import resource, sys\n"

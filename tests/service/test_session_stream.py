@@ -193,6 +193,7 @@ def test_connections_are_limited(start_app: StartApp, tmp_path: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 def test_idle_connection_is_closed(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, session_ttl_s=10.0) as client:
         session_id = begin(client, upload(client))
@@ -230,6 +231,7 @@ def assert_too_large(error: ConnectionClosed) -> None:
 class TestProcess:
     """`python -m service`, whose server bounds connections and messages."""
 
+    @pytest.mark.slow
     def test_fast_client_is_slowed_down(self, tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
         limits = {"DECODE_STALL_S": "300", "REQUEST_DEADLINE_S": "300", "DECODE_WORKERS": "1"}
         with running_service(tiny_bundle, tmp_path / "data", **limits) as service:

@@ -116,6 +116,7 @@ def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
         assert not any(alive(importer) for importer in importers)
 
 
+@pytest.mark.slow
 def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
     with running_service(tiny_bundle, tmp_path / "data", STOP_NOTICE_S="5") as service:
         begin = monotonic()
@@ -127,6 +128,7 @@ def test_readiness_ends_before_the_service_stops(tiny_bundle: Path, tmp_path: Pa
         assert monotonic() - begin > 5.0
 
 
+@pytest.mark.slow
 def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
     with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         workers = children(service.process.pid)
@@ -155,6 +157,7 @@ def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path)
         wait_for(lambda: not any(alive(worker) for worker in workers))
 
 
+@pytest.mark.slow
 def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) -> None:
     with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
         plan_id = upload(service.client, tiled_plan(60, openings=True), wait=False)
