@@ -194,6 +194,7 @@ def _with_digest(service: httpx.Client, name: str, times: int) -> Any:
     return handle
 
 
+@pytest.mark.slow
 def test_another_model_is_noticed(browser: Browser, service: httpx.Client) -> None:
     for visited in visit(browser, service, viewport=DESKTOP):
         page = visited.open_example()
@@ -212,6 +213,7 @@ def test_another_model_is_noticed(browser: Browser, service: httpx.Client) -> No
         expect(error).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_page_says_which_photographs_it_cannot_encode(browser: Browser, service: httpx.Client) -> None:
     for visited in visit(browser, service, viewport=DESKTOP):
         page = visited.open_example()
