@@ -87,24 +87,35 @@ def grid_of(plan: FloorPlan) -> PoseGrid:
     return PoseGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, STEP_M, 1.5)
 
 
-def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
-    """Return a noisy prediction at a prototype; the first heading hypothesis is right."""
-    row = prototypes.rows[number]
-    log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
-    kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
+def query_of(log_m: np.ndarray, scale: float, kind: np.ndarray, hypotheses: int, **more: Any) -> Query:
+    """Return a prediction of walls and opening classes by column, whose first heading hypothesis is the frame's."""
     log_probability = np.log(np.where(kind[:, None] == np.arange(CLASSES), 0.85, 0.05))
     shifts = np.arange(hypotheses) * COLUMNS // hypotheses
-    types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
     return Query(
         np.zeros((hypotheses, 1)),
         shifts * 2.0 * np.pi / COLUMNS,
         0.0,
         hypotheses == 1,
         CameraHeight(1.5),
-        PredictedProfile(log_m[None], np.full((1, COLUMNS), np.log(0.05))).moved(shifts),
+        PredictedProfile(log_m[None], np.full((1, COLUMNS), np.log(scale))).moved(shifts),
         PredictedOpenings(rolled(log_probability, shifts), np.array([0.5, 0.2, 0.2, 0.1])),
-        PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
-        PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
+        **more,
+    )
+
+
+def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
+    """Return a noisy prediction at a prototype; the first heading hypothesis is right."""
+    row = prototypes.rows[number]
+    log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
+    kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
+    types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
+    return query_of(
+        log_m,
+        0.05,
+        kind,
+        hypotheses,
+        ceiling=PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
+        room_type=PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
     )
 
 
@@ -238,18 +249,7 @@ def seen_query(plan: FloorPlan, position_m: tuple[float, float], *, hypotheses: 
     pose = PoseSet(np.array([position_m]), np.zeros(1, int))
     layouts = layouts_at(plan, pose, np.array([turn]), COLUMNS)
     kind = np.zeros(COLUMNS, int) if layouts.kind is None else layouts.kind[0]
-    log_probability = np.log(np.where(kind[:, None] == np.arange(CLASSES), 0.85, 0.05))
-    shifts = np.arange(hypotheses) * COLUMNS // hypotheses
-    profile = PredictedProfile(layouts.log_profile.astype(float), np.full((1, COLUMNS), np.log(0.03)))
-    return Query(
-        np.zeros((hypotheses, 1)),
-        shifts * 2.0 * np.pi / COLUMNS,
-        0.0,
-        hypotheses == 1,
-        CameraHeight(1.5),
-        profile.moved(shifts),
-        PredictedOpenings(rolled(log_probability, shifts), np.array([0.5, 0.2, 0.2, 0.1])),
-    )
+    return query_of(layouts.log_profile[0].astype(float), 0.03, kind, hypotheses)
 
 
 @pytest.mark.parametrize("turn_deg", [-5.0, 0.0, 5.0])
