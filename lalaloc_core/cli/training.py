@@ -102,10 +102,11 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--version", required=True, dest="model_version", help="version of the model")
     export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="note for the manifest")
     export.add_argument(
+        "--into",
         "--views-of",
         type=Path,
         metavar="BUNDLE",
-        help="copy this bundle and add the run's encoder of views, instead of exporting the other stages",
+        help="copy this bundle with the run's encoder of spheres or of views in place of its own; calibrate the copy",
     )
     export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
     export.set_defaults(run=_export)
@@ -204,20 +205,18 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.learn.export.run import export_run, export_views
+    from lalaloc_core.learn.export.run import export_into, export_run
 
-    if arguments.views_of is not None:
-        bundle = export_views(
-            arguments.folder, arguments.views_of, arguments.out, version=arguments.model_version, last=arguments.last
-        )
-        print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
-        return
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
-    name = arguments.name or arguments.out.resolve().name
-    bundle = export_run(
-        arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes, last=arguments.last
-    )
+    given: dict[str, Any] = {"version": arguments.model_version, "notes": notes, "last": arguments.last}
+    if arguments.into is not None:
+        if arguments.name is not None:
+            raise InvalidInputError(f"--name is '{arguments.name}'; a copy of --into keeps its name")
+        bundle = export_into(arguments.into, arguments.folder, arguments.out, **given)
+    else:
+        name = arguments.name or arguments.out.resolve().name
+        bundle = export_run(arguments.folder, arguments.out, name=name, **given)
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
 
 

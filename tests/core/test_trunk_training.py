@@ -18,7 +18,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.export.run import export_run
+from lalaloc_core.learn.export.run import export_into, export_run
 from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -163,6 +163,18 @@ class TestLosses:
         assert frozen
         assert not {id(p) for p in frozen} & factors.keys()
 
+    def test_a_part_can_be_trained_alone(self, batch: dict[str, torch.Tensor]) -> None:
+        stage = stage_of()
+        settings = OptimiserConfig(learning_rate=1e-2, only=("image_encoder.to_profile",))
+        optimiser = build_optimiser(stage.modules, settings)
+        before = {name: value.clone() for name, value in stage.encoder.named_parameters()}
+        torch.stack(list(stage.losses(batch).values())).sum().backward()
+        optimiser.step()
+        changed = {name for name, value in stage.encoder.named_parameters() if not torch.equal(value, before[name])}
+        assert changed == {"to_profile.weight", "to_profile.bias"}
+        with pytest.raises(ConfigError, match=r"optimiser\.only has 'to_profile'; no parameter's name begins so, as"):
+            build_optimiser(stage.modules, OptimiserConfig(only=("to_profile",)))
+
 
 class TestHiddenParts:
     def test_labels_of_hidden_azimuths_do_not_count(self, batch: dict[str, torch.Tensor]) -> None:
@@ -238,6 +250,25 @@ class TestRuns:
         assert start.origin["name"] == "tiny-trunk"
         with pytest.raises(CheckpointError, match="was trained with trunk TrunkEncoderConfig"):
             load_warm_start(folder / "bundle", "image", TINY.with_settings({"trunk.mixer_blocks": 2}))
+
+    def test_an_encoder_takes_the_place_of_a_bundles_own(self, folder: Path, tiny_bundle: Path, tmp_path: Path) -> None:
+        origin = Bundle.open(tiny_bundle)
+        notes = {"hardware": "a laptop"}
+        bundle = export_into(tiny_bundle, folder, tmp_path / "out", version="2", notes=notes, last=True)
+        bundle.check()
+        manifest = Bundle.open(bundle.folder).manifest
+        assert (manifest.name, manifest.version, manifest.architecture) == (origin.manifest.name, "2", "trunk")
+        assert manifest.training["hardware"] == "a laptop"
+        assert manifest.training["image"]["steps"] == 3
+        assert manifest.training["layout"] == origin.manifest.training["layout"]
+        assert manifest.confidence == origin.manifest.confidence
+        for name in ("layout_encoder.onnx", "head.onnx", "layout_encoder.safetensors"):
+            assert bundle.read(name) == origin.read(name)
+        # It is the encoder that was trained, with its own classes and modes.
+        assert bundle.read("image_encoder.onnx") == Bundle.open(folder / "bundle").read("image_encoder.onnx")
+        assert Encoders(bundle, threads=1).predicts_structure
+        with pytest.raises(CheckpointError, match="no checkpoint of stage 'image' or 'view'"):
+            export_into(tiny_bundle, tmp_path, tmp_path / "other", version="2")
 
     def test_pretrained_weights_are_loaded_once(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         loaded: list[Trunk] = []

@@ -15,7 +15,7 @@ from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
-from lalaloc_core.learn.export.run import export_views
+from lalaloc_core.learn.export.run import export_into
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window, sample_shots
@@ -165,7 +165,7 @@ class TestTraining:
         origin = exported_bundle(tmp_path / "origin", TINY)
         with pytest.raises(BundleError, match="no encoder of views"):
             OnnxViewEncoder(origin)
-        bundle = export_views(run, origin.folder, tmp_path / "out", version="2")
+        bundle = export_into(origin.folder, run, tmp_path / "out", version="2")
         bundle.check()
         stored = Bundle.open(bundle.folder).manifest.view
         assert stored is not None

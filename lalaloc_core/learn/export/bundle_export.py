@@ -129,6 +129,29 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, 
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
 
 
+def replace_image_encoder(
+    bundle: Bundle, config: TrainConfig, encoder: ImageEncoder, training: dict[str, Any]
+) -> Bundle:
+    """Replace the image encoder of a bundle by one of the same ring; its weights are rounded in place.
+
+    Raises:
+        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
+    """
+    encoder.cpu().eval().requires_grad_(False)
+    _round_to_half(encoder)
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        work = Path(scratch)
+        parity = _export_image_network(work, config, encoder)
+        _save_weights(encoder, work / IMAGE_WEIGHTS, beside=work / IMAGE_ONNX)
+        for path in work.iterdir():
+            (bundle.folder / path.name).write_bytes(path.read_bytes())
+    described = {"config": config.to_dict(), "image": training, "parity_max_abs_difference": parity}
+    manifest = dataclasses.replace(
+        bundle.manifest, training={**bundle.manifest.training, **described}, **_image_entries(config, encoder)
+    )
+    return write_manifest(bundle.folder, manifest)
+
+
 def reexport_networks(
     bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> Bundle:
@@ -159,21 +182,26 @@ def _export_networks(
 
     profile = torch.empty(_PARITY_BATCH, config.profile_columns).uniform_(0.3, 6.0, generator=generator)
     layout = {"profile_m": profile, "camera_height_m": heights(1.0, 1.9), "ceiling_height_m": heights(2.2, 3.5)}
-    height, width = config.image_size
-    image = torch.randint(0, 256, (_PARITY_BATCH, height, width, 3), dtype=torch.uint8, generator=generator)
     differences = [_export(work / LAYOUT_ONNX, layout_encoder, layout, ["latent"])]
     if isinstance(layout_encoder, RingLayoutEncoder):
         features = layout_encoder.ring(*layout.values())
         differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
-    if isinstance(image_encoder, RingImageEncoder | TrunkImageEncoder):
-        inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
-        outputs = ["ring", "log_profile", "log_scale"]
-        if isinstance(image_encoder, TrunkImageEncoder):
-            outputs += [*(["log_share"] if image_encoder.config.modes > 1 else []), *_STRUCTURE_OUTPUTS]
-        differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
-    elif image_encoder is not None:
-        differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
+    if image_encoder is not None:
+        differences.append(_export_image_network(work, config, image_encoder))
     return max(differences)
+
+
+def _export_image_network(work: Path, config: TrainConfig, encoder: ImageEncoder) -> float:
+    """Export an image encoder and compare it with torch; return the largest difference."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (_PARITY_BATCH, *config.image_size, 3), dtype=torch.uint8, generator=generator)
+    if not isinstance(encoder, RingImageEncoder | TrunkImageEncoder):
+        return _export(work / IMAGE_ONNX, encoder, {"image": image}, ["latent"])
+    heights = torch.empty(_PARITY_BATCH).uniform_(1.0, 1.9, generator=generator)
+    outputs = ["ring", "log_profile", "log_scale"]
+    if isinstance(encoder, TrunkImageEncoder):
+        outputs += [*(["log_share"] if encoder.config.modes > 1 else []), *_STRUCTURE_OUTPUTS]
+    return _export(work / IMAGE_ONNX, _RingOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
 
 
 class _RingOutputs(nn.Module):
@@ -313,30 +341,36 @@ def _manifest(
     config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
 ) -> Manifest:
     sizes = config.layout_sizes
-    statistics = {"ring": ring_image_encoder, "trunk": trunk, "paper": paper_encoders}[config.architecture]
-    structure: dict[str, Any] = {}
-    if isinstance(image_encoder, TrunkImageEncoder):
-        prior = losses.opening_prior(image_encoder.opening_share, config.image.opening_balance)
-        structure = {
-            "image_config": dataclasses.asdict(config.trunk),
-            "opening_classes": list(OPENING_CLASSES),
-            "opening_prior": prior.tolist(),
-            "room_types": list(ROOM_TYPES),
-            "room_type_prior": image_encoder.room_type_share.tolist(),
-        }
-    height, width = config.image_size
     return Manifest(
         name=name,
         version=version,
-        architecture=config.architecture,
         layout_config=dataclasses.asdict(sizes),
         profile_columns=config.profile_columns,
-        image_height=height,
-        image_width=width,
-        image_mean=list(statistics.IMAGE_MEAN),
-        image_std=list(statistics.IMAGE_STD),
         latent_size=sizes.latent_size,
         ring_sectors=config.ring.sectors if config.has_ring else 0,
-        **structure,
+        **_image_entries(config, image_encoder),
         training={**training, "config": config.to_dict()},
     )
+
+
+def _image_entries(config: TrainConfig, encoder: ImageEncoder | None) -> dict[str, Any]:
+    """Return the manifest's entries that an image encoder decides."""
+    statistics = {"ring": ring_image_encoder, "trunk": trunk, "paper": paper_encoders}[config.architecture]
+    height, width = config.image_size
+    entries = {
+        "architecture": config.architecture,
+        "image_height": height,
+        "image_width": width,
+        "image_mean": list(statistics.IMAGE_MEAN),
+        "image_std": list(statistics.IMAGE_STD),
+    }
+    if not isinstance(encoder, TrunkImageEncoder):
+        return entries
+    prior = losses.opening_prior(encoder.opening_share, config.image.opening_balance)
+    return entries | {
+        "image_config": dataclasses.asdict(config.trunk),
+        "opening_classes": list(OPENING_CLASSES),
+        "opening_prior": prior.tolist(),
+        "room_types": list(ROOM_TYPES),
+        "room_type_prior": encoder.room_type_share.tolist(),
+    }

@@ -6,10 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.errors import CheckpointError
 from lalaloc_core.learn.export.bundle_export import (
     add_view_encoder,
     export_bundle,
     reexport_networks,
+    replace_image_encoder,
     slim_weights,
 )
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
@@ -25,7 +27,7 @@ from lalaloc_core.learn.training.warm_start import (
     training_totals,
 )
 from lalaloc_core.localise.bundle import IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.nets import ImageEncoder, load_layout_encoder
 from lalaloc_core.nets.view_encoder import ViewEncoder
 
 
@@ -60,8 +62,7 @@ def export_run(
     image_encoder = None
     if image is not None:
         check_same_networks("layout", image.config, layout.config, str(teacher))
-        image_encoder = build_image_encoder(image.config)
-        image_encoder.load_state_dict(image.inference_weights["image_encoder"])
+        image_encoder = _image_encoder(image)
         training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panorama_count(image)}
     return export_bundle(
         out,
@@ -75,32 +76,51 @@ def export_run(
     )
 
 
-def export_views(folder: Path, bundle: Path, out: Path, *, version: str, last: bool = False) -> Bundle:
-    """Copy a bundle with the encoder of views that was trained in `folder` added.
+def export_into(
+    bundle: Path, folder: Path, out: Path, *, version: str, notes: dict[str, Any] | None = None, last: bool = False
+) -> Bundle:
+    """Copy a bundle with the encoder of spheres, of views, or both, that were trained in `folder`, in place of its own.
+
+    The copy keeps the fitted evidence and confidence, which should be fitted again.
 
     Args:
-        folder: of the training run.
         bundle: folder of the bundle to copy.
+        folder: of the training run.
         out: folder of the copy.
         version: of the model.
+        notes: additional entries of the manifest's `training`.
         last: export the last weights instead of the best by validation.
 
     Raises:
-        CheckpointError: there is no checkpoint of stage "view", or it has another ring than the bundle.
-        ExportError: the exported network differs from torch.
+        CheckpointError: there is no checkpoint of such an encoder, or it has another ring than the bundle.
+        ExportError: an exported network differs from torch.
     """
-    checkpoint = find_checkpoint("view", folder, last=last)
+    stages = [stage for stage in ("image", "view") if (folder / f"{stage}.pt").exists()]
+    if not stages:
+        raise CheckpointError(f"'{folder}' has no checkpoint of stage 'image' or 'view'")
     origin = Bundle.open(bundle)
-    check_same_networks("layout", checkpoint.config, bundle_weights(origin, "layout").checkpoint.config, str(bundle))
-    encoder = ViewEncoder(checkpoint.config.view, checkpoint.config.ring)
-    encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
+    layout = bundle_weights(origin, "layout").checkpoint.config
+    checkpoints = [find_checkpoint(stage, folder, last=last) for stage in stages]
+    for checkpoint in checkpoints:
+        check_same_networks("layout", checkpoint.config, layout, str(bundle))
     out.mkdir(parents=True, exist_ok=True)
     for name in origin.manifest.files:
         content = origin.read(name)
         # Bundles of earlier versions repeat the network's weights.
         (out / name).write_bytes(slim_weights(content, origin.read(IMAGE_ONNX)) if name == IMAGE_WEIGHTS else content)
-    copied = dataclasses.replace(origin, folder=out, manifest=dataclasses.replace(origin.manifest, version=version))
-    return add_view_encoder(copied, checkpoint.config, encoder, _summary(checkpoint, folder, last=last))
+    training = {**origin.manifest.training, **(notes or {})}
+    manifest = dataclasses.replace(origin.manifest, version=version, training=training)
+    made = dataclasses.replace(origin, folder=out, manifest=manifest)
+    for checkpoint in checkpoints:
+        config, summary = checkpoint.config, _summary(checkpoint, folder, last=last)
+        if checkpoint.stage == "view":
+            view_encoder = ViewEncoder(config.view, config.ring)
+            view_encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
+            made = add_view_encoder(made, config, view_encoder, summary)
+        else:
+            summary["panoramas"] = panorama_count(checkpoint)
+            made = replace_image_encoder(made, config, _image_encoder(checkpoint), summary)
+    return made
 
 
 def reexport_bundle(folder: Path) -> Bundle:
@@ -120,6 +140,12 @@ def reexport_bundle(folder: Path) -> Bundle:
         start.load_into({"image_encoder": image_encoder})
     layout_encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
     return reexport_networks(bundle, start.checkpoint.config, layout_encoder, image_encoder)
+
+
+def _image_encoder(checkpoint: Checkpoint) -> ImageEncoder:
+    encoder = build_image_encoder(checkpoint.config)
+    encoder.load_state_dict(checkpoint.inference_weights["image_encoder"])
+    return encoder
 
 
 def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, Any]:

@@ -37,6 +37,8 @@ class OptimiserConfig:
         milestones: shares at which "steps" lowers the rate.
         clip_norm: maximum norm of the gradient; 0 turns clipping off.
         trunk_factor: factor on the learning rate of a pretrained trunk; lower values keep it closer to its weights.
+        only: names, or their beginnings, of the parameters that are trained, such as "image_encoder.to_profile"; the
+            others keep their weights. Empty trains all.
     """
 
     kind: Literal["adamw", "sgd"] = "adamw"
@@ -50,6 +52,7 @@ class OptimiserConfig:
     gamma: float = 0.1
     clip_norm: float = 1.0
     trunk_factor: float = 1.0
+    only: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

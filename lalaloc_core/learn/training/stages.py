@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
@@ -120,7 +121,20 @@ def sample_styles(
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:
-    """Build the optimiser of all parameters; AdamW decays matrices only."""
+    """Build the optimiser of the parameters in `config.only`, and freeze the others; AdamW decays matrices only.
+
+    Raises:
+        ConfigError: no parameter has such a name.
+    """
+    if config.only:
+        names = {f"{part}.{name}": p for part, module in modules.items() for name, p in module.named_parameters()}
+        for wanted in config.only:
+            if not any(name.startswith(wanted) for name in names):
+                raise ConfigError(
+                    f"optimiser.only has '{wanted}'; no parameter's name begins so, as {next(iter(names))}"
+                )
+        for name, parameter in names.items():
+            parameter.requires_grad_(parameter.requires_grad and name.startswith(config.only))
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
     slow = {id(p) for trunk in trunks for p in trunk.parameters()}
     parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]
