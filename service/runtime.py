@@ -43,7 +43,7 @@ from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
 from service.tenancy.cpu_accounts import PROBES
 from service.tenancy.fair_share import FairSemaphore, with_headroom
-from service.threads import BoundedReads, Threads
+from service.threads import BoundedReads, IdleCores, Threads
 
 # Queries read little: a plan, and a pose grid that is not in memory.
 _READ_THREADS = 4
@@ -270,6 +270,8 @@ class _QueryComponents:
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry, permits))
         decoder.start()
         encoder = backends.encoder(bundle, settings)
+        idle_cores = _closing(cleanup, IdleCores(usable_cores(), telemetry.cpu_accounts, permits))
+        encoder.networks.images.helper = idle_cores.if_any
         by_latents = not encoder.networks.predicts_profile
         optimiser = backends.optimiser(bundle, settings, telemetry, permits, by_latents)
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextvars import copy_context
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import ContextVar, copy_context
 from typing import Any, ParamSpec, TypeVar
 
 from service.errors import StoreUnavailableError
-from service.tenancy.cpu_accounts import CpuAccounts
+from service.tenancy.cpu_accounts import PROBES, CpuAccounts
 from service.tenancy.fair_share import FairSemaphore
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+# Client of the call that a thread computes.
+_CLIENT: ContextVar[str] = ContextVar("client", default=PROBES)
 
 
 class Threads:
@@ -63,6 +66,7 @@ class Threads:
         return await asyncio.wrap_future(future)
 
     def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        _CLIENT.set(client)
         with self._accounts.charged(client, rests=self._rests):
             return work(*args, **kwargs)
 
@@ -73,6 +77,36 @@ class Threads:
     def close(self, *, wait: bool = True) -> None:
         """Finish running calls and drop the rest."""
         self._executor.shutdown(wait=wait, cancel_futures=True)
+
+
+class IdleCores(Executor):
+    """Threads that take over parts of the calls of `Threads` while cores are idle; charged to the calls' clients.
+
+    Args:
+        cores: number of cores.
+        accounts: CPU time of the clients.
+        permits: permits to compute; as many cores are busy as are held.
+    """
+
+    def __init__(self, cores: int, accounts: CpuAccounts, permits: FairSemaphore) -> None:
+        self._executor = ThreadPoolExecutor(max(cores // 2, 1), thread_name_prefix="idle-core")
+        self._cores, self._accounts, self._permits = cores, accounts, permits
+
+    def if_any(self) -> IdleCores | None:
+        """Return these threads if a core is idle."""
+        return self if self._permits.in_use < self._cores else None
+
+    def submit(self, work: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Start a part of the call that the current thread computes."""
+        return self._executor.submit(self._charged, _CLIENT.get(), work, *args, **kwargs)
+
+    def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._accounts.charged(client):
+            return work(*args, **kwargs)
+
+    def close(self) -> None:
+        """Finish what is running."""
+        self._executor.shutdown()
 
 
 class BoundedReads:

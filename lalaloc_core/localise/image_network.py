@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Executor
+
 import numpy as np
 import onnxruntime
 from jaxtyping import UInt8
@@ -25,6 +28,8 @@ class SphereNetwork:
         session: the network; None for a bundle without an image encoder, which serves layout queries only.
         predicts_profile: whether it predicts a wall profile.
         predicts_structure: whether it predicts openings, ceiling and room type.
+        helper: returns threads that encode the mirror image of a panorama while the caller's encodes the panorama, or
+            None if no core is idle: one after the other, as a batch, they take less processor time.
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
@@ -33,6 +38,7 @@ class SphereNetwork:
         Raises:
             BundleError: the file is missing or altered, or the model has other opening classes or room types.
         """
+        self.helper: Callable[[], Executor | None] = lambda: None
         self._manifest = bundle.manifest
         image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self._manifest.files else None
         self.session = None if image is None else session(image, threads)
@@ -56,11 +62,22 @@ class SphereNetwork:
         """
         if not self.predicts_profile:
             return {"ring": self.run(image[None], camera_height_m, ["ring"])[0][0]}
-        ring, *outputs = self.run(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *self._predictions])
+        ring, *outputs = self._run_with_mirrored(image, camera_height_m, ["ring", *self._predictions])
         averaged = {}
         for name, (value, mirrored) in zip(self._predictions, outputs, strict=True):
             averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
         return {"ring": ring[0], **averaged}
+
+    def _run_with_mirrored(
+        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, outputs: list[str]
+    ) -> list[np.ndarray]:
+        """Run the image encoder on a batch of a panorama and its mirror image; return some outputs."""
+        both, helper = np.stack([image, image[:, ::-1]]), self.helper()
+        if helper is None:
+            return self.run(both, camera_height_m, outputs)
+        mirrored = helper.submit(self.run, both[1:], camera_height_m, outputs)
+        own = self.run(both[:1], camera_height_m, outputs)
+        return [np.concatenate(pair) for pair in zip(own, mirrored.result(), strict=True)]
 
     def run(self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]) -> list[np.ndarray]:
         """Run the image encoder on a batch; return some outputs.

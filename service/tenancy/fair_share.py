@@ -149,6 +149,11 @@ class FairSemaphore:
         self._shares = Shares(limit)
         self._waiting: FairQueue[Future[None]] = FairQueue(accounts)
 
+    @property
+    def in_use(self) -> int:
+        """Number of permits that are held."""
+        return self._shares.in_use
+
     async def acquire(self, client: str) -> None:
         """Wait for a permit; the caller must release it."""
         permit = self._queued(client)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +126,7 @@ class TestPredictedProfile:
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
 
-    def test_profile_averages_panorama_and_mirror_image(self, encoders: Encoders) -> None:
+    def test_profile_averages_panorama_and_mirror_image(self, encoders: Encoders, opened_bundle: Bundle) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
         predicted_profiles = []
@@ -137,6 +139,13 @@ class TestPredictedProfile:
             np.log(profile), 0.5 * (predicted_profiles[0] + predicted_profiles[1][::-1]), atol=1e-5
         )
         assert profile.shape == (COLUMNS,)
+        # Side by side on two threads, they give the same.
+        threads: list[str] = []
+        with ThreadPoolExecutor(1, "helper", lambda: threads.append(threading.current_thread().name)) as helper:
+            beside = Encoders(opened_bundle, threads=1)
+            beside.images.helper = lambda: helper
+            np.testing.assert_allclose(beside.profile(image, 0.0, CAMERA_M)[0], profile, rtol=1e-4)
+        assert threads == ["helper_0"]
 
     def test_network_without_profile_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
         encoders = Encoders(opened_bundle, threads=1)

@@ -22,7 +22,7 @@ from service.storage.records import Original
 from service.storage.store import Store
 from service.tenancy.cpu_accounts import PROBES, CpuAccounts
 from service.tenancy.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
-from service.threads import BoundedReads, Threads
+from service.threads import BoundedReads, IdleCores, Threads
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 WORST = "127.0.0.2"
@@ -146,6 +146,35 @@ def test_steps_of_a_coroutine_are_charged_without_other_tasks() -> None:
 
     assert asyncio.run(scenario()) == "done"
     assert 0.0 < accounts.total_s("a") < 0.2
+
+
+def test_idle_cores_take_parts_of_a_call_for_its_client() -> None:
+    accounts = CpuAccounts()
+    permits = FairSemaphore(4, accounts)
+    threads, idle_cores = Threads("calls", 4, accounts, permits), IdleCores(2, accounts, permits)
+
+    def busy() -> str:
+        begin = thread_time()
+        while thread_time() - begin < 0.1:
+            pass
+        return threading.current_thread().name
+
+    def call() -> str:
+        helper = idle_cores.if_any()
+        return helper.submit(busy).result() if helper else threading.current_thread().name
+
+    async def scenario() -> tuple[str, str]:
+        alone = await threads.run("a", call)
+        async with permits.held("b"):
+            return alone, await threads.run("a", call)
+
+    alone, beside = asyncio.run(scenario())
+    assert alone.startswith("idle-core")
+    assert beside.startswith("calls"), "both cores are busy: with the call itself, and with that of another client"
+    assert accounts.total_s("a") >= 0.1
+    assert accounts.totals().keys() == {"a"}
+    idle_cores.close()
+    threads.close()
 
 
 def test_client_rests_from_its_requests_beside_others() -> None:
