@@ -33,7 +33,7 @@ import psutil
 
 from benchmarks.harness import Service, argument_parser, query_of, resident_mb, upload_example_plan
 from benchmarks.venues import recall
-from examples.launch import running_service
+from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, VenuePlan
 from lalaloc_core.localise.bundle import Bundle
@@ -158,10 +158,15 @@ def _median(figures: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 @contextmanager
-def _running(data: str, plans: int) -> Iterator[tuple[Service, httpx.Client]]:
+def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[Service, httpx.Client]]:
     limits = {"LALALOC_MAX_FLOORPLANS": f"{plans + 10}", "LALALOC_MAX_VENUE_PLANS": f"{plans + 10}"}
-    environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", **limits}
-    with running_service(0, environment) as started, httpx.Client(base_url=started.url, timeout=300.0) as client:
+    # 7.5 kB per home, and some to spare.
+    limits["LALALOC_VENUE_CACHE_BYTES"] = f"{max(2**27, 10_000 * plans)}"
+    environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", "PYTHONPATH": str(checkout), **limits}
+    with (
+        running_service(0, environment, checkout) as started,
+        httpx.Client(base_url=started.url, timeout=300.0) as client,
+    ):
         yield Service(started.url, "", Path(data), psutil.Process(started.process.pid)), client
 
 
@@ -171,7 +176,9 @@ def _queries(venue: Venue, plan_id: str) -> dict[str, Any]:
         found = [venue.localise(pose, heading=heading) for _ in range(_ROUNDS) for pose in read_poses()]
         report["right"] &= all(each["answer"]["floorplan_id"] == plan_id for each in found)
         # The first ones read plans from the database.
-        report[name] = {"first": _times(found[0]), "p50": _median(found[len(read_poses()) :])}
+        later = found[len(read_poses()) :]
+        index_ms = np.median([each["answer"]["timings_ms"].get("shortlist", 0.0) for each in later])
+        report[name] = {"first": _times(found[0]), "p50": _median(later), "index_ms": round(float(index_ms), 1)}
     return report
 
 
@@ -189,11 +196,11 @@ def _changes(venue: Venue, plan_id: str) -> dict[str, Any]:
     }
 
 
-def measure(plans: int, *, one_by_one: bool = False) -> dict[str, Any]:
-    """Return the figures of a venue."""
+def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, changes: bool = True) -> dict[str, Any]:
+    """Return the figures of a venue in the service of a checkout, with or without changes and a crash."""
     report: dict[str, Any] = {"plans": plans, "resident_mb": {}}
     with tempfile.TemporaryDirectory() as data:
-        with _running(data, plans) as (service, client):
+        with _running(data, plans, checkout) as (service, client):
             resident = report["resident_mb"]
             resident["empty"] = round(resident_mb(service.process))
             shown, watch = upload_example_plan(service.url), Stopwatch(service)
@@ -211,6 +218,8 @@ def measure(plans: int, *, one_by_one: bool = False) -> dict[str, Any]:
             venue = Venue(service, client, venue_id)
             report["queries"] = _queries(venue, shown)
             resident["localised"] = round(resident_mb(service.process))
+            if not changes:
+                return report
             report["changes"] = _changes(venue, shown)
             again = upload_example_plan(service.url)
             added = {"plans": [{"floorplan_id": again, "level": 0}]}
@@ -219,7 +228,7 @@ def measure(plans: int, *, one_by_one: bool = False) -> dict[str, Any]:
             )
             service.process.kill()
         begin = time.perf_counter()
-        with _running(data, plans) as (service, client):
+        with _running(data, plans, checkout) as (service, client):
             started = time.perf_counter()
             first = Venue(service, client, venue_id).localise(read_poses()[0], heading=True)
             report["after_kill"] = {"started_ms": round(1e3 * (started - begin)), "first_query": _times(first)}

@@ -36,7 +36,7 @@ _TOLERANCE = 1e-6
 
 
 @dataclass(eq=False)
-class _Checkout:
+class Checkout:
     """Running service of a checkout, with the example plan."""
 
     name: str
@@ -57,14 +57,14 @@ class _Checkout:
         self.answers[known, number % len(poses)] = response.json()
         return duration_s
 
-    def burst(self, queries: int, clients: int, *, known: bool) -> _Burst:
+    def burst(self, queries: int, clients: int, *, known: bool) -> Burst:
         """Answer queries of several clients; return CPU time per query, duration and rate."""
         before_s, begin = self._cpu_s(), time.perf_counter()
         with ThreadPoolExecutor(clients) as threads:
             parts = threads.map(lambda first: self._series(range(first, queries, clients), known=known), range(clients))
             durations_s = [duration for part in parts for duration in part]
         wall_s = time.perf_counter() - begin
-        return _Burst(1e3 * (self._cpu_s() - before_s) / queries, [1e3 * s for s in durations_s], queries / wall_s)
+        return Burst(1e3 * (self._cpu_s() - before_s) / queries, [1e3 * s for s in durations_s], queries / wall_s)
 
     def _series(self, numbers: Sequence[int], *, known: bool) -> list[float]:
         with httpx.Client(base_url=self.url, timeout=_TIMEOUT_S) as client:
@@ -76,7 +76,9 @@ class _Checkout:
 
 
 @dataclass(frozen=True)
-class _Burst:
+class Burst:
+    """CPU time per query (ms), duration of each (ms) and queries per second."""
+
     cpu_ms: float
     durations_ms: list[float]
     per_second: float
@@ -91,35 +93,46 @@ def main() -> int:
     parser.add_argument("--clients", type=int, nargs="*", default=(1, 4))
     options = parser.parse_args()
     with ExitStack() as stack:
-        checkouts = [stack.enter_context(_running(folder.resolve())) for folder in options.checkouts]
+        checkouts = [stack.enter_context(running_checkout(folder.resolve())) for folder in options.checkouts]
         print("| heading | clients | checkout | CPU per query | p50 | p99 | queries/s |", flush=True)
         print("|---|---|---|---|---|---|---|", flush=True)
         for known in (True, False):
             for clients in options.clients:
                 for row in _rows(checkouts, options.rounds, options.queries, clients, known=known):
                     print(row, flush=True)
-    differences = _differences(*checkouts)
+    differences = differences_of(*checkouts)
     print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
     return int(max(differences.values()) > _TOLERANCE)
 
 
-def _rows(checkouts: list[_Checkout], rounds: int, queries: int, clients: int, *, known: bool) -> Iterator[str]:
+def bursts_of(
+    checkouts: Sequence[Checkout], rounds: int, queries: int, clients: int, *, known: bool
+) -> dict[str, Burst]:
+    """Let checkouts answer queries in turns; return the median of their CPU times and rates, and all durations."""
     for checkout in checkouts:
         checkout.burst(_WARM_UP, clients, known=known)
-    bursts: dict[str, list[_Burst]] = {checkout.name: [] for checkout in checkouts}
+    bursts: dict[str, list[Burst]] = {checkout.name: [] for checkout in checkouts}
     for index in range(rounds):
         for checkout in checkouts if index % 2 else reversed(checkouts):
             bursts[checkout.name].append(checkout.burst(queries, clients, known=known))
-    for name, found in bursts.items():
-        durations_ms = [duration for burst in found for duration in burst.durations_ms]
-        p50, p99 = np.quantile(durations_ms, [0.5, 0.99])
-        cpu_ms = statistics.median(burst.cpu_ms for burst in found)
-        rate = statistics.median(burst.per_second for burst in found)
-        heading = "known" if known else "unknown"
-        yield f"| {heading} | {clients} | {name} | {cpu_ms:.1f} ms | {p50:.0f} ms | {p99:.0f} ms | {rate:.1f} |"
+    return {
+        name: Burst(
+            statistics.median(burst.cpu_ms for burst in found),
+            [duration for burst in found for duration in burst.durations_ms],
+            statistics.median(burst.per_second for burst in found),
+        )
+        for name, found in bursts.items()
+    }
 
 
-def _differences(before: _Checkout, after: _Checkout) -> dict[str, float]:
+def _rows(checkouts: Sequence[Checkout], rounds: int, queries: int, clients: int, *, known: bool) -> Iterator[str]:
+    for name, burst in bursts_of(checkouts, rounds, queries, clients, known=known).items():
+        p50, p99 = np.quantile(burst.durations_ms, [0.5, 0.99])
+        heading, rate = "known" if known else "unknown", burst.per_second
+        yield f"| {heading} | {clients} | {name} | {burst.cpu_ms:.1f} ms | {p50:.0f} ms | {p99:.0f} ms | {rate:.1f} |"
+
+
+def differences_of(before: Checkout, after: Checkout) -> dict[str, float]:
     """Return the largest absolute differences of the answers to equal queries."""
     largest: dict[str, float] = {"position (m)": 0.0, "heading (°)": 0.0, "confidence": 0.0}
     for key, old in before.answers.items():
@@ -132,7 +145,8 @@ def _differences(before: _Checkout, after: _Checkout) -> dict[str, float]:
 
 
 @contextmanager
-def _running(folder: Path) -> Iterator[_Checkout]:
+def running_checkout(folder: Path) -> Iterator[Checkout]:
+    """Run the service of the checkout in a folder, with a temporary data folder and the example plan."""
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
@@ -143,7 +157,7 @@ def _running(folder: Path) -> Iterator[_Checkout]:
         process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
         try:
             _wait_until_ready(url, process)
-            yield _Checkout(str(folder.name), url, psutil.Process(process.pid), upload_example_plan(url))
+            yield Checkout(str(folder.name), url, psutil.Process(process.pid), upload_example_plan(url))
         finally:
             process.terminate()
             process.wait(_START_S)

@@ -41,7 +41,7 @@ from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
+from lalaloc_core.localise.venue.plan_index import ALIGNED, COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
@@ -136,7 +136,7 @@ def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, 
 
 
 def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[str, dict[str, float]]:
-    """Return how often the index ranks the right plan among the first ones, and its processor time.
+    """Return how often the index ranks the right plan among the first ones, with and without alignment, and its time.
 
     Args:
         bundle: the model.
@@ -153,10 +153,11 @@ def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[
     columns: dict[str, list[tuple[int, float]]] = defaultdict(list)
     photographed = np.linspace(0, homes - 1, photographs).astype(int).tolist()
     for number, name, query in queries(bundle, photographed, seed):
-        begin = time.process_time()
-        mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
-        seconds = time.process_time() - begin
-        columns[name].append((int((mass > mass[number]).sum()), seconds))
+        for aligned, shown in ((0, f"{name}, not aligned"), (ALIGNED, name)):
+            begin = time.process_time()
+            mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig(), aligned=aligned)
+            seconds = time.process_time() - begin
+            columns[shown].append((int((mass > mass[number]).sum()), seconds))
     return {
         name: {
             "plans": len(blocks),

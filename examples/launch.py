@@ -33,16 +33,17 @@ class RunningService:
 
 
 @contextmanager
-def running_service(port: int, environment: Mapping[str, str]) -> Iterator[RunningService]:
+def running_service(port: int, environment: Mapping[str, str], checkout: Path = ROOT) -> Iterator[RunningService]:
     """Run the service at 127.0.0.1 until the block ends, on `port`, 0 for a free one. It logs to standard error.
 
-    `environment` adds to the variables of this process.
+    `environment` adds to the variables of this process; the service runs in the folder `checkout`.
 
     Raises:
         ServiceFailedError: the service ended, or was not ready in time.
     """
     command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
-    process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True)
+    variables = {**os.environ, **environment}
+    process = subprocess.Popen(command, cwd=checkout, env=variables, stdout=subprocess.PIPE, text=True)
     try:
         url = _announced_url(process)
         _wait_until_ready(url, process)
