@@ -64,8 +64,8 @@ def example_service(settings: Mapping[str, str] | None = None) -> Iterator[Servi
 
 
 @contextmanager
-def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[str]:
-    """Run the service as `uvicorn --workers` on one SQLite database; yield its URL."""
+def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Run the service as `uvicorn --workers` on one database; yield its URL and the first process."""
     port = free_port()
     command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
     command += ["--workers", str(processes)]
@@ -81,7 +81,7 @@ def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[str
                 if time.monotonic() > deadline:
                     raise TimeoutError(f"the service is not ready after {_START_S:g} s")
                 time.sleep(0.05)
-            yield url
+            yield url, process
         finally:
             os.killpg(process.pid, signal.SIGTERM)
             process.wait(_STOP_S)

@@ -1,13 +1,14 @@
 """Queries per second and their duration by number of clients, for several ways of running the service.
 
     python -m benchmarks.throughput --seconds 20 --processes 1 2 --clients 1 2 4 8 16
-    python -m benchmarks.throughput --ray-nodes 1 2
+    python -m benchmarks.throughput --processes --ray-nodes 1 2 4 --kill
 
 Prints a Markdown table. With 2 processes, `uvicorn --workers 2` runs two replicas on one SQLite database and one port;
 each has half of the workers and compute threads where there are more cores than two. On Ray, each node runs one replica
 that searches, one encoder and one LPO optimiser, the first node also runs the ingress, and each client has its own
 plan. All nodes share the cores of this machine: the table shows the cost of distribution, not the gain of more
-machines. `--ray-nodes` needs the extra `ray`.
+machines. `--ray-nodes` needs the extra `ray`. `--kill` adds a row in the middle of which a process or node is killed.
+`LALALOC_DATABASE_URL` replaces the database of the processes, for instance by PostgreSQL.
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from benchmarks.harness import UNLIMITED, argument_parser, free_port, run_load, upload_example_plan, uvicorn_service
 from service.settings import Settings
@@ -35,6 +39,7 @@ def main() -> int:
     parser.add_argument("--clients", type=int, nargs="*", default=_CLIENTS)
     parser.add_argument("--processes", type=int, nargs="*", default=(1, 2), help="processes of uvicorn")
     parser.add_argument("--ray-nodes", type=int, nargs="*", default=(), help="nodes of a Ray cluster on this machine")
+    parser.add_argument("--kill", action="store_true", help="kill one of several processes or nodes in a further row")
     options = parser.parse_args()
     services = {f"{count} processes": _uvicorn(count) for count in options.processes}
     services |= {f"{count} Ray nodes": _ray_service(count) for count in options.ray_nodes}
@@ -42,7 +47,7 @@ def main() -> int:
     print("|---|---|---|---|---|---|---|---|", flush=True)
     failures = 0
     for name, service in services.items():
-        with service as url:
+        with service as (url, kill):
             plans = max(options.clients) if name.endswith("nodes") else 1
             plan_ids = [upload_example_plan(url) for _ in range(plans)]
             run_load(url, plan_ids, 4, 5.0)
@@ -50,21 +55,30 @@ def main() -> int:
                 result = run_load(url, plan_ids[:clients], clients, options.seconds)
                 failures += result.failures
                 print(result.row(name, clients), flush=True)
+            if options.kill and not name.startswith("1 "):
+                timer = threading.Timer(0.5 * options.seconds, kill)
+                timer.start()
+                result = run_load(url, plan_ids, max(options.clients), options.seconds)
+                timer.join()
+                print(result.row(f"{name}, one killed", max(options.clients)), flush=True)
     return int(failures > 0)
 
 
 @contextmanager
-def _uvicorn(processes: int) -> Iterator[str]:
+def _uvicorn(processes: int) -> Iterator[tuple[str, Callable[[], None]]]:
+    """Run the service in processes; yield its address, and how to kill one of them."""
     cores, settings = Settings.load().cores, dict(UNLIMITED)
     if processes > 1:
         settings["LALALOC_WORKERS"] = str(max(cores.workers // processes, 1))
         settings["LALALOC_COMPUTE_THREADS"] = str(max(cores.compute_threads // processes, 1))
-    with uvicorn_service(processes, settings) as url:
-        yield url
+    with uvicorn_service(processes, settings) as (url, server):
+        # The last child is a worker; the first one tracks resources of all.
+        yield url, lambda: psutil.Process(server.pid).children()[-1].kill()
 
 
 @contextmanager
-def _ray_service(nodes: int) -> Iterator[str]:
+def _ray_service(nodes: int) -> Iterator[tuple[str, Callable[[], None]]]:
+    """Run the service on nodes of Ray; yield its address, and how to kill the last of them."""
     import ray
     from ray import serve
     from ray.cluster_utils import Cluster
@@ -77,8 +91,7 @@ def _ray_service(nodes: int) -> Iterator[str]:
     node: dict[str, Any] = {"num_cpus": _CPUS_PER_NODE, "object_store_memory": _OBJECT_STORE_BYTES}
     cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
     try:
-        for _ in range(nodes - 1):
-            cluster.add_node(**node)
+        others = [cluster.add_node(**node) for _ in range(nodes - 1)]
         ray.init(address=cluster.address, log_to_driver=False)
         port = free_port()
         serve.start(http_options={"host": "127.0.0.1", "port": port})
@@ -86,7 +99,7 @@ def _ray_service(nodes: int) -> Iterator[str]:
             settings = Settings(data_dir=Path(data), log_level="error", max_queries=64, lpo_queue=64)
             replicas = {f"{name}_{end}": nodes for name in ("encoder", "search", "lpo") for end in ("min", "max")}
             serve.run(application(settings, RayOptions(ingress_max=1, **replicas)))
-            yield f"http://127.0.0.1:{port}"
+            yield f"http://127.0.0.1:{port}", lambda: cluster.remove_node(others[-1], allow_graceful=False)
             serve.shutdown()
     finally:
         ray.shutdown()

@@ -131,6 +131,7 @@ def test_demo_runs_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
         assert picture.width > 1000
 
 
+@pytest.mark.slow
 def test_serve_uses_another_port_and_logs_no_readiness_checks(tmp_path: Path) -> None:
     environment = os.environ | {"LALALOC_DATA_DIR": str(tmp_path / "data"), "LALALOC_WORKERS": "0"}
     command = [sys.executable, "-m", "examples.serve", "--port", "0"]

@@ -69,6 +69,7 @@ def test_concurrent_queries_with_asyncio_are_not_rejected(narrow: httpx.Client, 
     assert count_rejections(narrow) == before
 
 
+@pytest.mark.slow
 def test_rejected_queries_are_retried(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
     before = count_rejections(narrow)
     patient = RetryPolicy(attempts=40, total_s=60.0)

@@ -52,6 +52,7 @@ def test_json_answers_are_not_described_as_strings_too() -> None:
     assert strings == []
 
 
+@pytest.mark.slow
 def test_generated_python_client_localises(
     start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -45,6 +45,7 @@ def service(app: httpx.Client, make_client: MakeClient, cache: Path) -> Iterator
         yield client
 
 
+@pytest.mark.slow
 def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) -> None:
     with pytest.raises(UnauthorisedError, match="features-required"):
         service.localise(home, KITCHEN, refine="none")

@@ -86,6 +86,7 @@ def test_files_of_a_plan_are_downloaded(service: Any, tmp_path: Path) -> None:
     assert "<ellipse" in marked
 
 
+@pytest.mark.slow
 def test_localisability_is_read_and_drawn(service: Any) -> None:
     plan = service.upload_floorplan(FLAT)
     found = service.localisability(plan.id)

@@ -26,6 +26,7 @@ console.log(await findHeading("f".repeat(32), photo, AbortSignal.timeout(60000))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     shutil.which("node") is None or not (PACKAGE / "node_modules").is_dir(),
     reason="needs Node, and `npm ci` in clients/typescript",

@@ -439,6 +439,7 @@ class TestEvaluating:
         assert main([*command, "--workers", "0", "--out", str(out)]) == 0
         assert json.loads((out / FIGURES_FILE).read_text()) == figures
 
+    @pytest.mark.slow
     def test_foreign_plans_are_twenty_with_and_without_openings(self) -> None:
         plans = foreign_plans()
         assert [bool(plan.openings) for plan in plans] == [True, False] * 10

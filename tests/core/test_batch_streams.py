@@ -102,10 +102,12 @@ class TestStream:
         rolled = [profile.roll(k) for k in (shift // 2, -(-shift // 2))]
         assert (sum(rolled) / 2 - profiles[same[1]]).abs().median() < 0.05
 
+    @pytest.mark.slow
     def test_seed_determines_the_stream(self) -> None:
         first, again = (batches(uses_per_panorama=3, replay_panoramas=6) for _ in range(2))
         assert all(torch.equal(a[key], b[key]) for a, b in zip(first, again, strict=True) for key in a)
 
+    @pytest.mark.slow
     def test_resumed_stage_uses_new_homes(self) -> None:
         config = TINY.with_settings({"image.uses_per_panorama": 3, "image.replay_panoramas": 6})
         stage = ImageStage(config, GeneratedSource(config), build_layout_encoder(config))

@@ -122,6 +122,7 @@ class TestExport:
         stored = safetensors.torch.load(opened_bundle.read(DECODER_WEIGHTS))
         assert stored["expand.weight"].dtype == torch.float16
 
+    @pytest.mark.slow
     def test_bundle_without_decoder_is_valid(self, tmp_path: Path) -> None:
         bundle = exported_bundle(tmp_path, TINY)
         assert DECODER_WEIGHTS not in bundle.manifest.files
@@ -129,6 +130,7 @@ class TestExport:
         with pytest.raises(BundleError, match=DECODER_WEIGHTS):
             load_decoder(bundle)
 
+    @pytest.mark.slow
     def test_bundle_without_image_encoder_encodes_layouts(self, tmp_path: Path) -> None:
         bundle = export_bundle(tmp_path, TINY, build_layout_encoder(TINY), None, name="half", version="1")
         assert not {IMAGE_ONNX, IMAGE_WEIGHTS} & set(bundle.manifest.files)
@@ -266,12 +268,14 @@ class TestIdentity:
         (bundle_copy / HEAD_ONNX).write_bytes(b"other")
         assert write_manifest(bundle_copy, before.manifest).sha256 != before.sha256
 
+    @pytest.mark.slow
     def test_export_replaces_an_existing_bundle(self, bundle_copy: Path, opened_bundle: Bundle) -> None:
         replaced = exported_bundle(bundle_copy, TINY)
         assert replaced.sha256 != opened_bundle.sha256
         assert Bundle.open(bundle_copy).sha256 == replaced.sha256
         Encoders(replaced)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("architecture", ["ring", pytest.param("trunk", marks=pytest.mark.slow)])
     def test_reexport_rebuilds_networks_from_weights(self, tmp_path: Path, architecture: str) -> None:
         before = exported_bundle(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])

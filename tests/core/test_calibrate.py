@@ -375,6 +375,7 @@ class TestMatchingWeights:
 
 
 class TestCovariance:
+    @pytest.mark.slow
     @given(seed=seeds(), factor=st.floats(1e-3, 1e3))
     @settings(max_examples=10)
     def test_fit_recovers_generating_factors(self, seed: int, factor: float) -> None:

@@ -47,6 +47,7 @@ def test_real_photographs_are_found(capsys: pytest.CaptureFixture[str]) -> None:
         assert answer["confidence"] > 0.5
 
 
+@pytest.mark.slow
 def test_localise_works_from_any_folder(tmp_path: Path) -> None:
     done = run_in(tmp_path, "localise", PLAN, KITCHEN, "--heading", "250", "--out", "answer.png", "--json")
     assert done.returncode == 0, done.stderr
@@ -62,6 +63,7 @@ def test_localise_works_from_any_folder(tmp_path: Path) -> None:
         assert (picture.format, picture.width) == ("PNG", 1600)
 
 
+@pytest.mark.slow
 def test_features_replace_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     phone, features = str(EXAMPLES / "phone.jpg"), str(tmp_path / "phone.features")
     assert main(["encode", phone, "-o", features]) == 0
@@ -92,6 +94,7 @@ def test_features_reveal_the_shape_of_a_room(tmp_path: Path, capsys: pytest.Capt
         assert picture.format == "PNG"
 
 
+@pytest.mark.slow
 def test_track_follows_spheres_and_phone_photographs(tmp_path: Path) -> None:
     walk = tmp_path / "walk"
     walk.mkdir()
@@ -305,6 +308,7 @@ def test_default_bundle_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert Bundle.open(default_bundle()).manifest.name == "default"
 
 
+@pytest.mark.slow
 def test_wheel_contains_the_model(tmp_path: Path) -> None:
     source, wheels, installed, empty = (tmp_path / name for name in ("source", "wheels", "installed", "empty"))
     for folder in ("lalaloc_core", "service", "lalaloc_client", "models"):

@@ -77,6 +77,7 @@ class TestRunning:
         assert present(scores.layout_recall).value > 0.3
         assert [prediction.scene for prediction in predictions[::3]] == list(build_dataset(info).scenes("test"))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("heading_known", [True, False])
     def test_every_panorama_is_answered(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
         info = dataclasses.replace(layout_run, kind="panorama", furniture="full", heading_known=heading_known)

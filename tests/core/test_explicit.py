@@ -81,6 +81,7 @@ class TestAligner:
         assert np.linalg.norm(result.position_m - truths, axis=1).max() < 0.01
 
     # In narrow rooms the cost hardly depends on one direction, and the search can end far from the truth.
+    @pytest.mark.slow
     @given(polygon=convex_polygons(), seed=seeds())
     @settings(max_examples=5)
     def test_aligner_matches_a_depth_image(self, polygon: list, seed: int) -> None:

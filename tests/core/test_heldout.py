@@ -112,6 +112,7 @@ class TestTruth:
             profile = wall_profile(position[None], np.array([0.7]), room.walls_m[None], columns)[0]
             np.testing.assert_allclose(traced, profile, atol=0.01)
 
+    @pytest.mark.slow
     def test_empty_photograph_shows_the_layout_except_openings(self) -> None:
         scenes = HeldoutScenes(homes=3, shots_per_home=2, furniture="empty")
         for name in scenes.scenes("validation"):

@@ -234,6 +234,7 @@ class TestScans:
         with pytest.raises(InvalidPanoramaError, match=r"more than 8 scans"):
             read(of_scans(256, 128, 3), limits)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("unit", [b"\xff\x00", b"\xff\xff", b"\xff\xd0", b"\xff\x01", b"\xff\xe0\0\2", b"\0"])
     def test_scan_count_takes_linear_time(self, unit: bytes) -> None:
         def count(size: int) -> Callable[[], int]:

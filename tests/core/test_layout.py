@@ -46,6 +46,7 @@ def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:
     return layout_view(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(rows_of_rooms(), seeds())
 def test_view_matches_shapely_ray_by_ray(plan: FloorPlan, seed: int) -> None:

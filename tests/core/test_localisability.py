@@ -59,6 +59,7 @@ def test_drawn_predictions_have_the_measured_errors(manifest: Manifest) -> None:
     np.testing.assert_allclose(found.seen, stated.seen, atol=0.03)
 
 
+@pytest.mark.slow
 def test_equal_rooms_are_confused_and_a_room_hint_helps(manifest: Manifest) -> None:
     plan = _rooms((0.0, 4.0, 3.0), (10.0, 4.0, 3.0), (20.0, 9.0, 7.0))
     found = localisability(plan, manifest)

@@ -132,6 +132,7 @@ class TestConvergence:
         result = refined(job, config)
         assert np.mean(errors_m(result, scene) < 0.01) >= share
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("config", [LM, ADAM], ids=["lm", "adam"])
     @given(polygon=room_polygons(), seed=seeds())
     @settings(max_examples=6)
@@ -256,6 +257,7 @@ class TestContainment:
         assert np.isfinite(result.heading).all()
         assert shapely.contains(scene.plan.rooms[0].shape, shapely.points(result.position_m)).all()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("config", [LM, ADAM], ids=["lm", "adam"])
     def test_pose_does_not_cross_a_thin_wall(self, config: LpoConfig) -> None:
         left = [[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [0.0, 3.0]]
@@ -270,6 +272,7 @@ class TestContainment:
 
 
 class TestBatches:
+    @pytest.mark.slow
     @pytest.mark.parametrize("heading_known", [True, False])
     @given(polygon=room_polygons(), seed=seeds())
     @settings(max_examples=8)
@@ -291,6 +294,7 @@ class TestBatches:
         result = refined(job)
         assert errors_m(result, scene).max() < 1e-3
 
+    @pytest.mark.slow
     @given(seeds())
     @settings(max_examples=10)
     def test_pruning_keeps_the_best_result(self, seed: int) -> None:

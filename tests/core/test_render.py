@@ -91,6 +91,7 @@ class TestTorch:
         assert profile.dtype == dtype
         assert layout_depth(profile, heights, 2.0 * heights, 4).dtype == dtype
 
+    @pytest.mark.slow
     @given(scenes(count=1))
     def test_gradients_match_differences(self, scene: Scene) -> None:
         step = 1e-6

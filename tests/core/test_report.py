@@ -392,6 +392,7 @@ class TestGallery:
             worst = [math.inf if errors_m[index] is None else errors_m[index] for index in chosen["worst"]]
             assert worst == ranked[::-1][:PER_GROUP]
 
+    @pytest.mark.slow
     def test_query_is_drawn_with_the_run_s_data(self, tmp_path: Path, tiny_bundle: Path) -> None:
         run, pictures = generated_run(tmp_path / "run", str(tiny_bundle)), tmp_path / "pictures"
         write_report([run], tmp_path / "report.html", pictures=pictures)
@@ -414,17 +415,20 @@ class TestGallery:
             else:
                 Image.open(path).verify()
 
+    @pytest.mark.slow
     def test_missing_model_is_named(self, tmp_path: Path) -> None:
         page, _ = page_of(generated_run(tmp_path / "run", "no-model"), out=tmp_path / "report.html")
         assert "maps of latent distances are left out, because the model cannot be opened: no model bundle" in page.text
         _, drawing = [attributes["alt"] for tag, attributes in page.tags if tag == "img"]
         assert drawing == "Floor plan coloured by true layout distance"
 
+    @pytest.mark.slow
     def test_changed_model_is_named(self, tmp_path: Path, tiny_bundle: Path) -> None:
         run = generated_run(tmp_path / "run", str(tiny_bundle), model={"sha256": "0" * 64})
         page, _ = page_of(run, out=tmp_path / "report.html")
         assert "holds another model than the run used" in page.text
 
+    @pytest.mark.slow
     def test_method_without_latents_is_named(self, tmp_path: Path) -> None:
         run = generated_run(tmp_path / "run", None, method="icp")
         page, _ = page_of(run, out=tmp_path / "report.html")

@@ -345,6 +345,7 @@ def probabilities(pose: np.ndarray, cost: np.ndarray, poses: int) -> np.ndarray:
     return np.bincount(pose, weight, poses) / weight.sum()
 
 
+@pytest.mark.slow
 def test_best_pose_and_posterior_equal_the_exhaustive_search(
     building: Building, grid: PoseGrid, queries: list[Query]
 ) -> None:

@@ -373,6 +373,7 @@ class TestConfidence:
     # Joint refinement moves a pose from where its own walls fit best.
     TOLERANCE = 0.05
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("index", HOMES)
     @pytest.mark.parametrize("heights", ["each", "one"])
     def test_sequence_is_as_sure_as_its_photographs(self, shipped: Bundle, index: int, heights: str) -> None:

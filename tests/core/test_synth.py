@@ -49,6 +49,7 @@ def shut(home: Home) -> Home:
     return Home(home.plan, openings)
 
 
+@pytest.mark.slow
 @given(seed=seeds())
 @settings(max_examples=40)
 def test_homes_are_valid_plans_within_their_size_range(seed: int) -> None:
@@ -144,6 +145,7 @@ def test_night_has_dark_windows_and_lit_lamps(materials: MaterialLibrary) -> Non
         assert scene.lights.colour.any()
 
 
+@pytest.mark.slow
 def test_homes_are_varied() -> None:
     homes = [home_of(seed) for seed in range(150)]
     rooms = [room for home in homes for room in home.plan.rooms]
@@ -162,6 +164,7 @@ def test_homes_are_varied() -> None:
     assert 0.1 < turned / len(homes) < 0.7
 
 
+@pytest.mark.slow
 @given(seed=seeds())
 @settings(max_examples=25)
 def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
@@ -226,6 +229,7 @@ def test_turned_camera_rolls_the_picture(renderer: PanoramaRenderer) -> None:
     assert ((rolled - hits.distance_m[1]).abs() < 1e-2).float().mean() > 0.99
 
 
+@pytest.mark.slow
 def test_furniture_hides_the_layout(renderer: PanoramaRenderer) -> None:
     shares = []
     for level in FURNITURE_LEVELS:
@@ -267,6 +271,7 @@ def test_furniture_stays_in_its_room_clear_of_the_camera(seed: int) -> None:
             assert shapely.distance(footprint, shapely.Point(shot.position_m)) > CAMERA_CLEARANCE_M - 0.1
 
 
+@pytest.mark.slow
 @given(seed=seeds())
 @settings(max_examples=25)
 def test_camera_is_outside_all_objects(materials: MaterialLibrary, seed: int) -> None:

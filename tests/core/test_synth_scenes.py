@@ -78,6 +78,7 @@ def test_each_fact_occurs_sometimes(known: list[tuple[Shot, frozenset[str]]]) ->
     assert set().union(*(facts for _, facts in known)) <= set(FACTS)
 
 
+@pytest.mark.slow
 def test_facts_match_the_scene(known: list[tuple[Shot, frozenset[str]]], materials: MaterialLibrary) -> None:
     for shot, facts in known:
         scene, room = build_scene(shot, materials), shot.home.plan.rooms[shot.room_index]
@@ -129,6 +130,7 @@ def test_shapes_do_not_depend_on_materials(materials: MaterialLibrary) -> None:
         assert first.facts == second.facts
 
 
+@pytest.mark.slow
 def test_empty_staged_rooms_have_no_mirrors_or_fittings(materials: MaterialLibrary) -> None:
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -180,6 +182,7 @@ def test_ceiling_boxes_stay_in_their_room_above_camera_and_openings(seed: int) -
                 assert not parallel or prism.z0 > opening.head_m or not footprint.contains(shapely.Point(before))
 
 
+@pytest.mark.slow
 def test_only_fitted_rooms_have_uneven_ceilings() -> None:
     shots = [dataclasses.replace(shot, is_fitted=fitted) for shot in shots_of(12) for fitted in (False, True)]
     materials = MaterialLibrary.create(np.random.default_rng(0))

@@ -404,6 +404,7 @@ def test_depth_out_of_range_is_zero(tmp_path: Path) -> None:
 # Runs
 
 
+@pytest.mark.slow
 def test_interrupted_run_leaves_whole_scenes_and_resumes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,6 +432,7 @@ def test_interrupted_run_leaves_whole_scenes_and_resumes(
     assert synthesise(Synthesis(root=out, seed=SEED, height=HEIGHT), NUMBERS) == 0
 
 
+@pytest.mark.slow
 def test_files_do_not_depend_on_the_number_of_workers(root: Path, tmp_path: Path) -> None:
     assert synthesise(Synthesis(root=tmp_path / "data", seed=SEED, height=HEIGHT), NUMBERS, workers=2) == 2
     assert content(tmp_path / "data") == content(root)
@@ -507,6 +509,7 @@ def test_too_many_scenes_for_a_split_are_refused(scenes: int, split: Any) -> Non
         share_out(scenes, split)
 
 
+@pytest.mark.slow
 def test_command_writes_and_extends_scenes(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "data"
     common = ["synth", "--out", str(out), "--height", str(HEIGHT), "--seed", str(SEED)]

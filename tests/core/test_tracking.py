@@ -324,6 +324,7 @@ class TestState:
             heading = np.exp(1j * math.tau / sectors * other.belief.sector[of_seven]) @ other.belief.weight[of_seven]
             assert np.angle(heading) == pytest.approx(math.pi / 2)
 
+    @pytest.mark.slow
     def test_long_session_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(260)]

@@ -174,6 +174,7 @@ class TestBadFiles:
         with pytest.raises(DatasetError, match="no training scenes"):
             SceneSource(CONFIG, OwnData(tmp_path))
 
+    @pytest.mark.slow
     def test_worker_errors_keep_their_attributes(self, data: OwnData) -> None:
         (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
         with pytest.raises(DatasetError) as raised:
@@ -184,6 +185,7 @@ class TestBadFiles:
 
 
 class TestRuns:
+    @pytest.mark.slow
     def test_resuming_on_other_data_is_refused(self, data: OwnData) -> None:
         folder = data.root.parent / "run"
         trained = train_layout(CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)

@@ -282,6 +282,7 @@ class TestRuns:
             )
             assert len(loaded) == expected
 
+    @pytest.mark.slow
     def test_old_checkpoint_without_rate_factors_resumes(self, tmp_path: Path) -> None:
         """Parameter groups of older checkpoints have no factor."""
         stage = stage_of(SHORT)
@@ -354,6 +355,7 @@ class TestWarmStart:
         loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith("to_profile.")}
         assert all(torch.equal(value, trained[key]) for key, value in loaded.items())
 
+    @pytest.mark.slow
     def test_run_starts_from_the_best_checkpoint_of_another(self, tiny_bundle: Path, tmp_path: Path) -> None:
         trained(tmp_path / "first", tiny_bundle)
         best = Checkpoint.load(tmp_path / "first" / "image.best.pt")

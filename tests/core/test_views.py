@@ -86,6 +86,7 @@ class TestRendering:
 
 
 class TestViewScenes:
+    @pytest.mark.slow
     def test_views_state_what_is_known(self) -> None:
         spheres = GeneratedScenes(homes=1, seed=0, shots_per_home=1)
         name = spheres.scenes("validation")[0]
@@ -101,6 +102,7 @@ class TestViewScenes:
         assert [view.pitch.source == "given" for view in (nothing, field, tilt)] == [False, False, True]
         assert nothing.hfov.sd > field.hfov.sd
 
+    @pytest.mark.slow
     def test_views_show_the_parts_of_the_sphere_that_they_look_at(self) -> None:
         spheres = GeneratedScenes(homes=1, seed=0, shots_per_home=1)
         name = spheres.scenes("validation")[0]

@@ -73,6 +73,7 @@ def test_failure_of_the_converter_is_reported(programs: Path):
         import_plan(DWG)
 
 
+@pytest.mark.slow
 def test_converter_is_stopped_with_its_children(programs: Path, tmp_path: Path):
     alive = tmp_path / "alive"
     _install(programs, f"(while true; do echo x >> {alive}; sleep 0.05; done) & sleep 600")

@@ -155,6 +155,7 @@ def test_printed_names_and_dimensions_of_a_picture_are_read(px_per_m: float, tex
     check_flat(import_plan(PrintedPlan(px_per_m, text_px).file(), limits=LIMITS), px_per_m)
 
 
+@pytest.mark.slow
 def test_printed_names_and_dimensions_of_a_scan_are_read():
     page = PrintedPlan()
     page.picture = page.picture.rotate(1.5, expand=True, fillcolor=255, resample=Image.Resampling.BICUBIC)

@@ -31,6 +31,7 @@ def drawn() -> dict[Style, DrawnPlan]:
     return {style: draw_plan(style, SEED[style]) for style in STYLES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("style", STYLES)
 def test_rooms_and_openings_are_found_in_every_style(drawn: dict[Style, DrawnPlan], style: Style):
     plan = drawn[style]
@@ -42,6 +43,7 @@ def test_rooms_and_openings_are_found_in_every_style(drawn: dict[Style, DrawnPla
     assert f"| {style} | {score.rooms} | 100.0% |" in table({style: score})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coloured", [True, False])
 def test_drawings_of_plan_svg_are_read_back(coloured: bool):
     flat = FloorPlan.from_json(FLAT.read_bytes())
@@ -144,6 +146,7 @@ def test_picture_without_scale_is_rejected(drawn: dict[Style, DrawnPlan]):
         import_plan(drawn["thick"].png(), ImportOptions(units="m"))
 
 
+@pytest.mark.slow
 def test_known_distance_sets_the_scale(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     known = KnownDistance((10.0, 10.0), (10.0, 110.0), 100.0 * plan.metres_per_pixel)
@@ -152,6 +155,7 @@ def test_known_distance_sets_the_scale(drawn: dict[Style, DrawnPlan]):
     assert by_distance.document == by_pixel.document
 
 
+@pytest.mark.slow
 def test_scan_resolution_and_paper_scale_set_the_scale(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     # 80 pixels to a metre are 1:125 at 254 dots per inch.
@@ -234,6 +238,7 @@ def test_pdf_with_lines_is_read_as_a_drawing():
     assert door.length == pytest.approx(0.9, abs=0.02)
 
 
+@pytest.mark.slow
 def test_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     stream = io.BytesIO()

@@ -150,6 +150,7 @@ def cut_out(picture: np.ndarray) -> np.ndarray:
     return np.array(part.resize((WIDTH, HEIGHT), Image.Resampling.BILINEAR))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [upside_down, cut_out])
 def test_changed_panorama_is_not_trusted(
     shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool, change: Callable[[np.ndarray], np.ndarray]

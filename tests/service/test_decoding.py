@@ -80,6 +80,7 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
     return buffer.getvalue()
 
 
+@pytest.mark.slow
 def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
@@ -91,6 +92,7 @@ def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, pa
     assert decoders() == [], "the pool left a process behind"
 
 
+@pytest.mark.slow
 def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     slow = black_png(10_000, 5_000)
     with start_app(tmp_path, decode_stall_s=0.2) as client:

@@ -60,6 +60,7 @@ def test_deletion_writes_a_fraction_of_the_deleted_bytes(tmp_path: Path) -> None
     store.close()
 
 
+@pytest.mark.slow
 def test_file_shrinks_after_deletions(tmp_path: Path) -> None:
     store = _open(tmp_path)
     for number in range(3):
@@ -77,6 +78,7 @@ def test_file_shrinks_after_deletions(tmp_path: Path) -> None:
     store.close()
 
 
+@pytest.mark.slow
 def test_old_file_shrinks_after_it_was_compacted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
     _make_old(tmp_path)
@@ -95,6 +97,7 @@ def test_old_file_shrinks_after_it_was_compacted(tmp_path: Path, monkeypatch: py
     store.close()
 
 
+@pytest.mark.slow
 def test_service_returns_space_by_itself(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     # Stored without an upload, whose time and speed are limited.
     store, plan_id = Store(database_of(tmp_path)), "0" * 32

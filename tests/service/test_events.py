@@ -118,6 +118,7 @@ def test_unknown_plan_has_no_stream(client: httpx.Client) -> None:
         assert_problem(client.get(f"/floorplans/{plan_id}/events"), 404, "unknown-floorplan")
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_streams_are_limited_and_freed_on_disconnect(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_streams=3, **SLOW) as client:
@@ -136,6 +137,7 @@ def test_streams_are_limited_and_freed_on_disconnect(start_app: StartApp, tmp_pa
             assert next(_events(again))[0] == "progress"
 
 
+@pytest.mark.slow
 def test_stream_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "STREAM_DEADLINE_S", 1.0)
     with start_app(tmp_path, **SLOW) as client:
@@ -174,6 +176,7 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
         assert chunks.count(b": heartbeat\n\n") >= 3
 
 
+@pytest.mark.slow
 def test_stream_ends_when_its_key_is_revoked(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,6 +201,7 @@ def test_stream_ends_when_its_key_is_revoked(
         store.close()
 
 
+@pytest.mark.slow
 def test_progress_of_another_replica_is_streamed(postgres: PostgresServer, start_app: StartApp, tmp_path: Path) -> None:
     shared = {"database_url": postgres.new_database(), "sweep_s": 0.2, "grid_lease_s": 0.8, **SLOW}
     with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:

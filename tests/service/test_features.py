@@ -120,6 +120,7 @@ def test_known_heading_finds_the_place_of_the_photograph(client: httpx.Client, h
     assert by_features["heading_deg"] == by_photograph["heading_deg"] == 252.0
 
 
+@pytest.mark.slow
 def test_sequences_venues_and_sessions_take_features(client: httpx.Client, home: str, device: Device) -> None:
     features = [device.features(photograph) for photograph in (KITCHEN, PHONE)]
     answers = [

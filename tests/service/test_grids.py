@@ -498,6 +498,7 @@ def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, e
     assert slow.result(60.0) is not None
 
 
+@pytest.mark.slow
 def test_overtaken_grid_keeps_its_lease(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_lease_s=2.0)
     large, small = _add(store, LARGE_HALL, "large"), _add(store, HALL, "small")
@@ -555,6 +556,7 @@ def _looked_up(lookup: PlanLookup, tenant: str, plan_id: str) -> PlanRecord | No
     return asyncio.run(find())
 
 
+@pytest.mark.slow
 def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make_grids: MakeGrids) -> None:
     url = postgres.new_database()
     store, elsewhere, without_memory = Store(url), Store(url), Store(url, plan_cache_bytes=0)

@@ -67,6 +67,7 @@ _PARSED: dict[str, Callable[[str], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["a", "-", "_", " ", ":", "[", "1.", "%0a", "@", "-a"])
 @pytest.mark.parametrize("kind", _PARSED)
 def test_head_parsing_is_linear(kind: str, unit: str) -> None:
@@ -101,6 +102,7 @@ _BODIES: dict[str, Callable[[int], bytes]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [_UPLOAD_CHUNK, 512])
 @pytest.mark.parametrize("kind", _BODIES)
 def test_form_parsing_is_linear(kind: str, chunk: int) -> None:

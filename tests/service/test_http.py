@@ -175,6 +175,7 @@ def test_service_without_workers_is_ready_at_once(client: httpx.Client) -> None:
     assert response.json()["decode_pool"]["workers"] == 1
 
 
+@pytest.mark.slow
 def test_waiting_reads_do_not_block_health(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     url = postgres.new_database()
     with (

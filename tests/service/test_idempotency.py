@@ -346,6 +346,7 @@ def _files(contents: dict[str, bytes]) -> dict[str, UploadedFile]:
     return {name: UploadedFile.of(content) for name, content in contents.items()}
 
 
+@pytest.mark.slow
 @given(PARTS, FILES, PARTS, FILES)
 def test_digests_differ_for_different_parts(
     fields: dict[str, str], files: dict[str, bytes], other_fields: dict[str, str], other_files: dict[str, bytes]

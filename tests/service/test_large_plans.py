@@ -42,6 +42,7 @@ def no_parsing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json_text, "_check_size", refuse)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_parsing")
 def test_service_does_not_parse_large_plans(client: httpx.Client) -> None:
     document = large_plan()
@@ -91,6 +92,7 @@ def test_values_of_venue_documents_are_counted_before_parsing(
     assert "the limit is 51000" in answer.text
 
 
+@pytest.mark.slow
 def test_packed_plan_is_the_same() -> None:
     document = large_plan()
     document["rooms"][0] |= {"holes": [[[1, 1], [1.2, 1], [1.2, 1.2]]], "walls": [[[0.5, 0.5], [0.7, 0.5]]]}

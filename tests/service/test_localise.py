@@ -393,6 +393,7 @@ def test_hanging_database_does_not_block_known_plans(
         wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 404)
 
 
+@pytest.mark.slow
 def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     plan = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, inline_grid_poses=10**6) as client:

@@ -85,6 +85,7 @@ def _workers() -> list[int]:
     return [child.pid for child in multiprocessing.active_children() if child.pid and "lpo" in child.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_profile", [False, True])
 def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
     from lalaloc_core.localise.optimise import PoseRefiner
@@ -101,6 +102,7 @@ def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_prof
     np.testing.assert_allclose(result.information, expected.information, rtol=1e-2, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_torch_is_loaded_with_the_first_job_by_latents(bundle: Bundle, job: RefinementJob) -> None:
     def loaded() -> bool:
         (worker,) = set(_workers()) - others
@@ -137,6 +139,7 @@ def test_no_time_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None
     assert _refine(pool, job, -1.0) is None
 
 
+@pytest.mark.slow
 def test_idle_killed_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     killed, other = _workers()
     os.kill(killed, signal.SIGKILL)
@@ -209,6 +212,7 @@ def test_pool_without_workers_returns_none(bundle: Bundle, job: RefinementJob) -
         assert none.state.warmed_up
 
 
+@pytest.mark.slow
 def test_changed_bundle_is_not_used(tiny_bundle: Path, tmp_path: Path, job: RefinementJob) -> None:
     copy = tmp_path / "bundle"
     shutil.copytree(tiny_bundle, copy)

@@ -33,6 +33,7 @@ def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield started
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading", [None, 90.0])
 @pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "lpo")])
 def test_query_reaches_each_stage(

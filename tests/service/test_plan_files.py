@@ -94,6 +94,7 @@ def test_pdf_is_a_draft(client: httpx.Client) -> None:
     assert plan["import_report"]["scale_source"] == "1:100, written in the drawing"
 
 
+@pytest.mark.slow
 def test_picture_needs_a_scale_and_is_a_draft(client: httpx.Client) -> None:
     drawn = draw_plan("thick", 1)
     problem = assert_problem(send_plan(client, drawn.png()), 422, "invalid-floorplan")

@@ -211,6 +211,7 @@ def test_random_kills_lose_and_mix_up_no_result(log: Path) -> None:
         assert ask(pool, 20_000_000, _LONG_S) == "right"
 
 
+@pytest.mark.slow
 def test_stalled_worker_is_replaced_mid_message(log: Path) -> None:
     with _warm_pool(log, stall_s=3.0) as pool:
         (stalled,) = _pids()

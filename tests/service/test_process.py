@@ -174,6 +174,7 @@ def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) ->
     assert not {"torch", "safetensors", "matplotlib", "onnx"} & set(report["modules"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variable", "value", "message"),
     [
@@ -209,6 +210,7 @@ def test_damaged_model_stops_the_start(tiny_bundle: Path, tmp_path: Path) -> Non
     assert "the manifest states" in done.stderr
 
 
+@pytest.mark.slow
 def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
     command = [sys.executable, "-m", "service", "--port", "0"]
@@ -224,6 +226,7 @@ def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
         process.wait(10.0)
 
 
+@pytest.mark.slow
 def test_log_is_json_and_holds_no_query(tiny_bundle: Path, tmp_path: Path) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="0")
     with _uvicorn(environment, tmp_path / "log") as (process, client):

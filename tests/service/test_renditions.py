@@ -200,6 +200,7 @@ def test_repeated_reads_convert_a_plan_once(start_app: StartApp, tmp_path: Path,
             assert converted == ["PlanStateAnswer"] * (path == "")
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_large_plans_are_converted_by_workers(start_app: StartApp, tmp_path: Path, converted: list[str]) -> None:
     document = tiled_plan(12, openings=True)
@@ -218,6 +219,7 @@ def test_large_plans_are_converted_by_workers(start_app: StartApp, tmp_path: Pat
     assert [room["area_m2"] for room in bodies[""].json()["rooms"]] == [16.0] * 144
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_localisability_is_predicted_once_per_revision_and_model(
     start_app: StartApp, tiny_view_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

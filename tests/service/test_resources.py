@@ -317,6 +317,7 @@ def test_replacing_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path:
         wait_for(lambda: "lalaloc_grids_pending 0.0" in client.get("/metrics").text, 5.0)
 
 
+@pytest.mark.slow
 def test_deleting_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
         plan_id = upload(client, HALL, wait=False)

@@ -525,6 +525,7 @@ def test_address_counters_are_bounded(
 # --- Without the database ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_known_keys_work_without_the_database(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes

@@ -108,6 +108,7 @@ def test_busy_connection_is_not_closed() -> None:
         assert answer.result(30.0).json() == "done"
 
 
+@pytest.mark.slow
 def test_refused_bodies_are_read_slowly_to_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "_DROPPING_S", 5e-8)
     body, clients = b"x" * (20 * 2**20), 3

@@ -275,6 +275,7 @@ class TestProcess:
                 put(connection, panorama)
                 assert received(connection)["session"]["photographs"] == 3
 
+    @pytest.mark.slow
     def test_messages_and_fragments_are_bounded(self, tiny_bundle: Path, tmp_path: Path) -> None:
         with running_service(tiny_bundle, tmp_path / "data") as service:
             session_id = begin(service.client, upload(service.client))
@@ -288,6 +289,7 @@ class TestProcess:
                     connection.send(b"" for _ in range(100_000))
                 assert_too_large(caught.value)
 
+    @pytest.mark.slow
     def test_stop_answers_the_photograph_in_work(self, tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
         limits = {"DECODE_STALL_S": "100", "REQUEST_DEADLINE_S": "100", "STOP_DEADLINE_S": "100", "DECODE_WORKERS": "1"}
         with running_service(tiny_bundle, tmp_path / "data", **limits) as service:
@@ -321,6 +323,7 @@ class TestProcess:
                 put(connection, panorama)
                 assert received(connection)["status"] == 200
 
+    @pytest.mark.slow
     def test_other_paths_have_no_websocket(self, tiny_bundle: Path, tmp_path: Path) -> None:
         with running_service(tiny_bundle, tmp_path / "data") as service:
             for path in ("/localise", "/floorplans", "/"):

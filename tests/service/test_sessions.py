@@ -179,6 +179,7 @@ def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, panoram
         assert after.json()["photographs"] == 2, after.text
 
 
+@pytest.mark.slow
 def test_sessions_expire_and_are_limited(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
 ) -> None:

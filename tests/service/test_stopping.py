@@ -92,6 +92,7 @@ def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> No
         assert not any(alive(worker) for worker in workers)
 
 
+@pytest.mark.slow
 def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
     document = new_dxf()
     document.header["$INSUNITS"] = 6
@@ -142,6 +143,7 @@ def test_stop_respects_its_deadline(tiny_bundle: Path, tmp_path: Path) -> None:
         wait_for(lambda: not any(alive(worker) for worker in workers))
 
 
+@pytest.mark.slow
 def test_stop_succeeds_despite_a_stuck_thread(tiny_bundle: Path, tmp_path: Path) -> None:
     with running_service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="1") as service:
         workers = children(service.process.pid)
@@ -171,6 +173,7 @@ def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) ->
         assert service.process.wait(30.0) == 0
 
 
+@pytest.mark.slow
 def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"GRID_STEP_M": "0.1", "MAX_GRID_POSES": "1000000"}
@@ -185,6 +188,7 @@ def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) 
         assert service.process.wait(60.0) == 0
 
 
+@pytest.mark.slow
 def test_second_signal_ends_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
     with running_service(tiny_bundle, tmp_path / "data") as service:
         workers = children(service.process.pid)

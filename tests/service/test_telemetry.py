@@ -313,6 +313,7 @@ def test_unsampled_trace_is_not_exported() -> None:
     assert exporter.get_finished_spans() == ()
 
 
+@pytest.mark.slow
 def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with (
         collector() as (endpoint, received),
@@ -363,6 +364,7 @@ def test_endpoint_without_the_extra_is_an_error(monkeypatch: pytest.MonkeyPatch)
         otlp_exporter("http://c/v1/traces")
 
 
+@pytest.mark.slow
 def test_sdk_is_not_loaded_without_an_endpoint() -> None:
     program = "import sys, service.app; sys.exit(any(n.startswith('opentelemetry.sdk') for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0

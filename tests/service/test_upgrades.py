@@ -91,6 +91,7 @@ def _rows(url: str) -> dict[str, int]:
     return counts
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 @pytest.mark.parametrize(("kind", "version"), CASES)
 def test_data_of_a_released_version_is_kept(

@@ -198,6 +198,7 @@ def test_repeated_request_makes_one_venue(client: httpx.Client) -> None:
     assert_problem(send(client, geojson(), headers=key, name="x"), 422, "idempotency-key-reused")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "status", "kind", "words"),
     [

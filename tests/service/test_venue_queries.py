@@ -124,6 +124,7 @@ def walk(client: httpx.Client, place: dict[str, str], names: list[str], **fields
     return response.json()
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 @pytest.mark.parametrize("most", [128, 2], ids=["all plans", "probable plans"])
 def test_sequence_is_found_in_a_venue(
@@ -222,6 +223,7 @@ def test_missing_prototypes_are_made(
         store.close()
 
 
+@pytest.mark.slow
 def test_replaced_plan_is_chosen_by_its_new_revision(
     start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,6 +316,7 @@ def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, plan: str
     assert_problem(ask(client, venue_of(client, low), panorama, camera_height_m=2.1), 422, "invalid-pose")
 
 
+@pytest.mark.slow
 def test_plans_that_are_not_ready_are_warned_about(
     start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:

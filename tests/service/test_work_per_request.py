@@ -139,6 +139,7 @@ def test_every_route_has_a_load() -> None:
 
 
 # The work of refused inputs is limited; `tests/core/test_plan_work.py` counts it.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "load", [load for load in LOADS if not load.refusals], ids=lambda load: f"{load.routes[0]} {load.title}"
 )

@@ -175,6 +175,7 @@ def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
     expect(page.locator("#plan-name")).to_have_text("Chosen second")
 
 
+@pytest.mark.slow
 def test_error_marks_its_field_and_hides_the_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     desktop.find()
@@ -263,6 +264,7 @@ def test_near_candidates_are_one_place_and_all_places_add_up(desktop: Visit) -> 
     assert rest == pytest.approx(1.0 - 0.05 - 0.7 - 0.203)
 
 
+@pytest.mark.slow
 def test_answers_to_all_photographs_are_a_table(desktop: Visit) -> None:
     page = desktop.open_example()
     page.get_by_role("button", name="Find all").click()

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from playwright.sync_api import Page, Route
 
 from tests.service.conftest import FLAT, upload
@@ -58,6 +59,7 @@ def test_upload_reports_its_progress(desktop: Visit) -> None:
     assert answer["floorplan_id"] == plan_id
 
 
+@pytest.mark.slow
 def test_overload_is_retried_a_bounded_number_of_times(desktop: Visit) -> None:
     page, waits = desktop.open(), ["1", "1", "1", "1"]
     problem = {"type": "urn:lalaloc:problem:overloaded", "title": "Overloaded", "status": 503, "detail": "full"}

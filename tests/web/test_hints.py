@@ -13,6 +13,7 @@ from tests.web.conftest import Visit, visit
 from tests.web.test_answer import _assert_accessible, _copied
 
 
+@pytest.mark.slow
 def test_hints_are_set_and_sent(desktop: Visit) -> None:
     page = desktop.open_example()
     page.locator("#hints summary").click()
@@ -53,6 +54,7 @@ def test_hints_are_set_and_sent(desktop: Visit) -> None:
     desktop.find()
 
 
+@pytest.mark.slow
 def test_picture_of_an_answer_is_saved(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     # Drawing takes a second of CPU time; the timeouts allow for busy machines.
     with start_app(tmp_path / "data", request_deadline_s=100.0, decode_stall_s=90.0) as client:

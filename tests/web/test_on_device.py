@@ -132,6 +132,7 @@ PHOTOGRAPHS: dict[str, tuple[bytes, dict[str, str], dict[str, Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PHOTOGRAPHS)
 def test_features_replace_the_photograph(browser: Browser, service: httpx.Client, kind: str) -> None:
     content, settings, stated = PHOTOGRAPHS[kind]
@@ -254,6 +255,7 @@ def test_page_says_which_photographs_it_cannot_encode(browser: Browser, service:
         expect(page.locator("#session-pose")).to_contain_text("kitchen", timeout=SLOW_MS)
 
 
+@pytest.mark.slow
 def test_runtime_is_loaded_only_if_it_is_needed(desktop: Visit) -> None:
     urls: list[str] = []
     desktop.page.on("request", lambda request: urls.append(request.url))
@@ -280,6 +282,7 @@ def test_only_the_worker_may_compile(service: httpx.Client) -> None:
     assert again.status_code == 304
 
 
+@pytest.mark.slow
 def test_box_is_locked_where_features_are_required(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, bundle=default_bundle(), require_features=True, request_deadline_s=90.0) as client:
         for visited in visit(browser, client, viewport=DESKTOP):

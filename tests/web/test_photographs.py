@@ -71,6 +71,7 @@ def _colours(page: Page, place: str) -> list[list[int]]:
     )
 
 
+@pytest.mark.slow
 def test_layer_shows_where_photographs_will_be_found(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     opener = page.get_by_role("button", name="Will it work here?")

@@ -108,6 +108,7 @@ def _drag_end(page: Page, index: int, x: float, y: float) -> None:
     page.mouse.up()
 
 
+@pytest.mark.slow
 def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     _scan().save(tmp_path / "scan.png")
@@ -285,6 +286,7 @@ def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of:
             expect(page.locator(".auth-wrapper .authorize.locked")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_docs_page_shows_and_sends_operations(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Documented"})
     page = desktop.open("/docs")
@@ -302,6 +304,7 @@ def test_docs_page_shows_and_sends_operations(desktop: Visit) -> None:
     expect(operation.locator(".live-responses-table")).to_contain_text("Documented")
 
 
+@pytest.mark.slow
 def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as client:
         for visited in visit(browser, client):

@@ -48,6 +48,7 @@ def test_photographs_one_after_the_other_are_followed(phone: Visit) -> None:
     assert phone.client.get(f"/sessions/{session_id}").status_code == 404
 
 
+@pytest.mark.slow
 def test_session_of_another_client_is_shown_live(desktop: Visit, plan_id: str) -> None:
     panorama = (EXAMPLES / "kitchen.jpg").read_bytes()
     session_id = begin(desktop.client, plan_id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.importers.test_pictures import vector_pdf
@@ -13,6 +14,7 @@ from tests.web.conftest import EXAMPLES, PHONE, visit
 from tests.web.test_answer import _assert_accessible
 
 
+@pytest.mark.slow
 def test_answer_of_a_venue_names_the_plan(browser: Browser, start_app: StartApp, tmp_path) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as client:
         ids = [upload(client, FLAT | {"name": name}) for name in ("Flat below", "Flat above")]
@@ -90,6 +92,7 @@ def test_venue_is_created_and_searched(browser: Browser, start_app: StartApp, tm
             expect(page.locator("#answer .plan-of")).to_contain_text("level")
 
 
+@pytest.mark.slow
 def test_pdf_levels_of_a_file_and_a_photograph_lead_to_an_answer(
     browser: Browser, start_app: StartApp, tmp_path: Path
 ) -> None:
