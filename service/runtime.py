@@ -252,6 +252,7 @@ class _QueryComponents:
     admission: Admission
     reads: BoundedReads
     permits: FairSemaphore
+    idle_cores: IdleCores
 
     @classmethod
     def start(
@@ -287,6 +288,7 @@ class _QueryComponents:
             admission=_admission(settings, telemetry, store),
             reads=_closing(cleanup, _reads(settings, threads=_READ_THREADS, max_pending=settings.pending_limit)),
             permits=permits,
+            idle_cores=idle_cores,
         )
 
     def localiser(self) -> Localiser:
@@ -326,6 +328,7 @@ class _QueryComponents:
             file_bytes=self.settings.storage.venue_file_bytes,
             limit_bytes=self.settings.storage.venue_cache_bytes,
             max_poses=min(self.settings.grids.max_grid_poses, _VENUE_POSES),
+            idle_cores=self.idle_cores,
         )
 
     def venue_localiser(self, localiser: Localiser, plans: VenuePlans, search: VenueSearch) -> VenueLocaliser:

@@ -37,7 +37,7 @@ from service.storage.grid_format import SortedPrototypes
 from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord, VenueState
 from service.telemetry import LOGGER_NAME
-from service.threads import BoundedReads
+from service.threads import BoundedReads, IdleCores
 
 # Limits of the plans searched in full: their number, and poses × heading hypotheses × camera heights. `VenuePlans` also
 # limits the poses of their grids.
@@ -117,6 +117,7 @@ class VenuePlans:
         file_bytes: int,
         limit_bytes: int,
         max_poses: int,
+        idle_cores: IdleCores | None = None,
     ) -> None:
         """Create the reader; files are opened on first use.
 
@@ -128,12 +129,14 @@ class VenuePlans:
             file_bytes: maximum size of that file.
             limit_bytes: memory limit for each of the two caches, of rows and of indices.
             max_poses: maximum number of poses in all grids of the chosen plans.
+            idle_cores: threads that take over a part of a search; None: the caller's does all.
         """
         self._store = store
         self._grids = grids
         self._reads = reads
         self._path, self._file_bytes = path, file_bytes
         self._max_poses = max_poses
+        self._idle_cores = idle_cores
         self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: _ROW_BYTES * len(venue.rows))
         # Keys are digests of the plans' grids in order.
         self._indices: BoundedCache[bytes, _Indexed] = BoundedCache(
@@ -210,7 +213,10 @@ class VenuePlans:
             log_prior: (p,) log prior of the plans.
             favour: (p,) log factors by which plans are preferred in the choice alone.
         """
-        masses = [index.log_masses(query, weights, MatchingConfig()) + log_prior for query, weights in choosing]
+        helper = None if self._idle_cores is None else self._idle_cores.if_any()
+        masses = [
+            index.log_masses(query, weights, MatchingConfig(), helper=helper) + log_prior for query, weights in choosing
+        ]
         log_mass = masses[0]
         if len(masses) > 1:
             shares = [mass - np.logaddexp.reduce(mass) for mass in masses]

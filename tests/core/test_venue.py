@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -346,6 +347,9 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) ->
         query = query_at(prototype_sets[number], 5, rng, hypotheses=16)
         whole = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs)
         few = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 40, scanned=pairs // 10)
+        with ThreadPoolExecutor(1) as helper:
+            halved = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 40, scanned=pairs // 10, helper=helper)
+        np.testing.assert_array_equal(halved, few)
         assert few[whole.argmax()] > few.max() - 0.1
         # Skipped comparisons contribute no mass.
         assert (few <= whole + 1e-6).all()

@@ -26,6 +26,7 @@ merged so that each has at least twice as many plans as the next (the logarithmi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -232,16 +233,18 @@ class PlanIndex:
         compared: int = COMPARED,
         scanned: int = SCANNED,
         aligned: int = ALIGNED,
+        helper: Executor | None = None,
     ) -> Float[np.ndarray, "p"]:
         """Return the log of each plan's mass (see `prototypes`); -inf if none of its prototypes was compared exactly.
 
         About `compared` pairs are compared exactly and about `aligned` pairs are aligned, as pairs of equal cost are
-        kept together. About `scanned` pairs are in the code scan, as the last probed cell is scanned whole.
+        kept together. About `scanned` pairs are in the code scan, as the last probed cell is scanned whole; threads of
+        `helper` take over half of the scan.
         """
         costs = PrototypeCosts(query, self.step_m, weights, config)
         k, j = costs.shape
         compares_all = len(self) * k * j <= compared
-        pairs = self._all_pairs(k, j) if compares_all else self._best_pairs(costs, compared, scanned)
+        pairs = self._all_pairs(k, j) if compares_all else self._best_pairs(costs, compared, scanned, helper)
         compared_masses, aligned_masses = (_Masses(self.plan_count, weights.temperature) for _ in range(2))
         alignment = PrototypeAlignment(costs)
         for batch in _cheapest_pairs(costs, pairs, aligned, compared_masses):
@@ -263,7 +266,9 @@ class PlanIndex:
                 place, hypothesis, offset = np.unravel_index(pair, (len(number), k, j))
                 yield _Pairs(part, number[place], hypothesis, offset)
 
-    def _best_pairs(self, costs: PrototypeCosts, compared: int, scanned: int) -> Iterator[_Pairs]:
+    def _best_pairs(
+        self, costs: PrototypeCosts, compared: int, scanned: int, helper: Executor | None
+    ) -> Iterator[_Pairs]:
         """Yield about the `compared` pairs that are cheapest by their codes, in batches."""
         k, j = costs.shape
         probed = self._probed_cells(costs, scanned)
@@ -272,7 +277,7 @@ class PlanIndex:
         per_hypothesis = min(compared, -(-_OVERFETCH * compared // (k * j)))
         found = []
         for part in self.parts:
-            prototype, joint, cost = part.segment.search(tables, probed, per_hypothesis)
+            prototype, joint, cost = part.segment.search(tables, probed, per_hypothesis, helper)
             alive = part.alive(prototype)
             found.append((prototype[alive], joint[alive], cost[alive]))
         cost = np.concatenate([cost for *_, cost in found])

@@ -15,6 +15,7 @@ unit vectors, so the query vector is the (negated) tables themselves.
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from typing import Any, cast
 
 import faiss
@@ -89,14 +90,30 @@ class CodeScan:
         self._index.referenced_objects.clear()
 
     def search(
-        self, tables: Float[np.ndarray, "q d"], lists: Bool[np.ndarray, "q l"], count: int
+        self,
+        tables: Float[np.ndarray, "q d"],
+        lists: Bool[np.ndarray, "q l"],
+        count: int,
+        helper: Executor | None = None,
     ) -> tuple[Int[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
         """Return the numbers of the cheapest codes of each of q queries, and their costs.
 
         Fewer codes than `count` are filled up with the number -1 and infinite costs. `tables` holds a lookup table per
         query, the 16 values of the 50 parts (see `lookup_tables`); `lists` tells whether each list is probed for each
-        query.
+        query. Every second query is searched on a thread of `helper`, if there is one.
         """
+        if helper is None or len(tables) < 2:
+            return self._search(tables, lists, count)
+        # Neighbours are similar, so that both halves probe about as many codes.
+        second = helper.submit(self._search, tables[1::2], lists[1::2], count)
+        code, cost = (np.empty((len(tables), count), kind) for kind in (np.int64, np.float32))
+        code[::2], cost[::2] = self._search(tables[::2], lists[::2], count)
+        code[1::2], cost[1::2] = second.result()
+        return code, cost
+
+    def _search(
+        self, tables: Float[np.ndarray, "q d"], lists: Bool[np.ndarray, "q l"], count: int
+    ) -> tuple[Int[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
         # Queries of several callers run on threads of their own; by default faiss takes all cores for each.
         faiss.omp_set_num_threads(1)
         number = np.where(lists, np.arange(lists.shape[1]), -1)

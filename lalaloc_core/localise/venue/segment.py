@@ -7,6 +7,7 @@ index (`plan_index`) has several: plans that are added later are in segments of 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -117,6 +118,7 @@ class Segment:
         tables: Mapping[int, Float[np.ndarray, "q d"]],
         probed: Mapping[int, Bool[np.ndarray, "l q"]] | None,
         count: int,
+        helper: Executor | None = None,
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
         """Return the cheapest distinct prototypes of each of q queries by their codes: numbers, queries and costs.
 
@@ -124,12 +126,13 @@ class Segment:
             tables: lookup tables by family, see `prototype_codes`.
             probed: tells for every family which of its cells are probed for each query; None probes all.
             count: maximum number of prototypes per query and family.
+            helper: threads that take over a part; None: the caller's does all.
         """
         parts = []
         for family, (first, scan) in self._scans.items():
             cell, queries = self.nonempty_cells[family] % self.cells_per_family, len(tables[family])
             lists = np.ones((queries, len(cell)), bool) if probed is None else probed[family][cell].T
-            number, cost = scan.search(tables[family], lists, count)
+            number, cost = scan.search(tables[family], lists, count, helper)
             query = np.broadcast_to(np.arange(queries)[:, None], number.shape)
             is_found = number >= 0
             parts.append((number[is_found] + first, query[is_found], cost[is_found]))
