@@ -22,7 +22,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
-from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
+from lalaloc_core.localise.posterior import Posterior, WeightedPlaces, area_shares, weighted_places
 from lalaloc_core.localise.ranking import distinct, ranked
 from lalaloc_core.localise.refinement import refined_candidates, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve
@@ -301,6 +301,8 @@ class _Search:
         self._modes_before_lpo = self.modes
         # The modes that LPO refined and their candidates after it, in the same order; empty until then.
         self._lpo_modes, self._lpo_candidates = list[Candidate](), list[Candidate]()
+        # Probable places after the stages so far; None until they are needed.
+        self._places: WeightedPlaces | None = None
         self._best = dict[SearchStage, Candidate]()
         self._signals = dict[SearchStage, Signals]()
         self._stage: SearchStage = "retrieval"
@@ -350,7 +352,7 @@ class _Search:
         self._lpo_candidates = refined_candidates(
             self._plan, self._encoders, self.query, starts, result, self._config.matching, self._hints
         )
-        self._stage = "lpo"
+        self._places, self._stage = None, "lpo"
         return [self._lpo_candidates[index] for index in ranked(self._lpo_candidates, self.query)] + others
 
     def localisation(self, candidates: list[Candidate]) -> Localisation:
@@ -382,16 +384,17 @@ class _Search:
 
     def _posterior(self, candidates: list[Candidate]) -> Posterior:
         """Return the posterior after the stages so far, with the probabilities of some candidates."""
-        return posterior_of(
-            self._costs,
-            self._prior,
-            self.query,
-            starts=self._lpo_modes,
-            ends=self._lpo_candidates,
-            candidates=candidates,
-            temperature=self._weights.temperature,
-            separation_m=self._config.separation_m,
-        )
+        if self._places is None:
+            self._places = weighted_places(
+                self._costs,
+                self._prior,
+                self.query,
+                starts=self._lpo_modes,
+                ends=self._lpo_candidates,
+                temperature=self._weights.temperature,
+                separation_m=self._config.separation_m,
+            )
+        return self._places.posterior(candidates)
 
     def _record(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
         self._stage, self._best[stage] = stage, candidate

@@ -125,22 +125,38 @@ def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.nd
     return np.log(areas_m2[poses.room_index] / count[poses.room_index])
 
 
-def posterior_of(
+@dataclass(frozen=True, eq=False)
+class WeightedPlaces:
+    """Probable places of a query after some modes of the grid were refined; see `posterior_from_weights`."""
+
+    query: Query
+    pose: Int[np.ndarray, "m"]
+    position: Float[np.ndarray, "m 2"]
+    heading: Float[np.ndarray, "m"]
+    weight: Float[np.ndarray, "m"]
+    poses: int
+    counted: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]
+
+    def posterior(self, candidates: Sequence[Candidate]) -> Posterior:
+        """Return the posterior with the probabilities of candidates, the answer first."""
+        return posterior_from_weights(candidates=candidates, **vars(self))
+
+
+def weighted_places(
     grid: GridCosts,
     prior: Float[np.ndarray, "n"],
     query: Query,
     *,
     starts: Sequence[Candidate],
     ends: Sequence[Candidate],
-    candidates: Sequence[Candidate],
     temperature: float,
     separation_m: float,
-) -> Posterior:
-    """Return the posterior after some modes of the grid were refined.
+) -> WeightedPlaces:
+    """Return the probable places after some modes of the grid were refined.
 
     `prior` is the log prior of every pose of the grid, up to a constant. `starts` are the modes that were refined, as
-    the grid has them, and `ends` the same after refinement, in the same order. `candidates` are those whose probability
-    is wanted, the answer first. `temperature` is T, and `separation_m` the radius of a mode.
+    the grid has them, and `ends` the same after refinement, in the same order. `temperature` is T, and `separation_m`
+    the radius of a mode.
     """
     lowest = float(grid.total.min())
     gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
@@ -166,9 +182,8 @@ def posterior_of(
         counted = _ties_at_their_ends(position, heading, mode, ends, query)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return posterior_from_weights(
+    return WeightedPlaces(
         query,
-        candidates,
         pose=pose,
         position=position,
         heading=heading,

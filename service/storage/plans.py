@@ -191,10 +191,11 @@ class Plans:
         documents = dict[str, PlanDocument]()
         columns = REVISIONS.c
         with self._database.reading() as connection:
-            for first in range(0, len(revision_ids), _BATCH_SIZE):
-                part = revision_ids[first : first + _BATCH_SIZE]
-                for current in (False, True):
-                    own = FLOORPLANS.c.tenant == tenant, columns.id.in_(part)
+            # Almost all are current, so that nothing is left for the second statement.
+            for current in (True, False):
+                wanted = [revision_id for revision_id in revision_ids if revision_id not in rows]
+                for first in range(0, len(wanted), _BATCH_SIZE):
+                    own = FLOORPLANS.c.tenant == tenant, columns.id.in_(wanted[first : first + _BATCH_SIZE])
                     found = connection.execute(_select_heads(current=current).where(*own))
                     rows |= {row.revision_id: (row, current) for row in found}
             plans = {key: self._cache.plan(tenant, row.id, key) for key, (row, _) in rows.items()}

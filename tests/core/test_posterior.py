@@ -24,7 +24,7 @@ from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import Localisation, Refine, localise
 from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
-from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of, probability_map
+from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, probability_map, weighted_places
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.questions import perfect_query
@@ -49,16 +49,9 @@ def posterior_at(
 ) -> Posterior:
     ends = starts if ends is None else ends
     candidates = sorted(ends, key=lambda end: end.cost)
-    return posterior_of(
-        grid,
-        np.zeros(len(grid.poses)),
-        query,
-        starts=starts,
-        ends=ends,
-        candidates=candidates,
-        temperature=16.0,
-        separation_m=1.0,
-    )
+    prior = np.zeros(len(grid.poses))
+    places = weighted_places(grid, prior, query, starts=starts, ends=ends, temperature=16.0, separation_m=1.0)
+    return places.posterior(candidates)
 
 
 def test_map_is_of_the_refined_positions() -> None:
@@ -153,16 +146,8 @@ def test_candidates_that_meet_are_one_mode() -> None:
     grid = costs_at([0.0, 1.2, 10.0], np.array([0.05, 0.05, 0.05]))
     starts = [candidate(0.0, 0.05), candidate(1.2, 0.05), candidate(10.0, 0.05)]
     ends = [candidate(0.6, 0.01), candidate(0.6, 0.01), candidate(10.6, 0.01)]
-    found = posterior_of(
-        grid,
-        np.zeros(3),
-        PLAIN,
-        starts=starts,
-        ends=ends,
-        candidates=[ends[0], ends[2]],
-        temperature=16.0,
-        separation_m=1.0,
-    )
+    places = weighted_places(grid, np.zeros(3), PLAIN, starts=starts, ends=ends, temperature=16.0, separation_m=1.0)
+    found = places.posterior([ends[0], ends[2]])
     assert found.candidate == pytest.approx((0.5, 0.5))
 
 
