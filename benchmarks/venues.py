@@ -20,6 +20,7 @@ service does, and among all plans.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -80,7 +81,7 @@ def prototypes(plans: int, seed: int) -> list[np.ndarray]:
         rows["cell"] = shipped_cells().assign(rows)
         blocks.append(rows)
         if number % 1000 == 999:
-            print(f"  {number + 1} homes", flush=True)
+            print(f"  {number + 1} homes", file=sys.stderr, flush=True)
     return blocks
 
 
@@ -96,7 +97,7 @@ def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> 
             block["cell"] = own
         found += variants
         if number % 5 == 4:
-            print(f"  {len(found)} plans", flush=True)
+            print(f"  {len(found)} plans", file=sys.stderr, flush=True)
     return found
 
 

@@ -319,6 +319,11 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
     assert ranks.count(0) >= 7
     assert max(ranks) <= 2
     assert grown_ranks == ranks
+    unaligned = index.log_masses(query, WEIGHTS, CONFIG, compared=4000, aligned=0)
+    one = index.log_masses(query, WEIGHTS, CONFIG, compared=4000, aligned=1)
+    # All plans but that of the only aligned pair change alike.
+    assert len(set(np.round(one - unaligned, 6).tolist())) <= 2
+    assert len(set(np.round(mass - unaligned, 6).tolist())) > 2
     # By walls alone, all plans are equal.
     walls = index.log_masses(query, WEIGHTS, replace(CONFIG, use_openings=False), compared=10**9, aligned=10**9)
     np.testing.assert_allclose(walls, walls[0], atol=1e-3)

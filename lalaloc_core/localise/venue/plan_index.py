@@ -340,6 +340,8 @@ def _cheapest_pairs(costs: PrototypeCosts, pairs: Iterable[_Pairs], count: int, 
 
 def _highest(pairs: Sequence[tuple[_Pairs, np.ndarray]], count: int, highest: float) -> float:
     """Return the highest cost of the `count` cheapest pairs."""
+    if not count:
+        return -np.inf
     cost = np.concatenate([cost for _, cost in pairs])
     return highest if len(cost) <= count else min(highest, float(np.partition(cost, count - 1)[count - 1]))
 
