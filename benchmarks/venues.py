@@ -201,7 +201,7 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
         for number, name, query in queries(bundle, homes, options.seed):
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
             reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
-            limits = {"compared": compared, "scanned": 10**15, "aligned": _MAX_ALIGNED}
+            limits: dict[str, Any] = {"compared": compared, "scanned": 10**15, "aligned": _MAX_ALIGNED}
             exact = _ranked(index.log_masses(query, weights, config, **limits))
             for scanned in options.scanned:
                 begin, began = time.process_time(), time.perf_counter()

@@ -302,7 +302,7 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
     parts = [prototypes_of(grid_of(plan), plan) for plan in plans]
     rows, count = joined(parts).rows.copy(), np.array([len(part) for part in parts])
     rows["cell"] = cells.assign(rows)
-    begin, limits = np.cumsum(count) - count, {"compared": 4000, "aligned": 1000}
+    begin, limits = np.cumsum(count) - count, dict[str, Any](compared=4000, aligned=1000)
     index = PlanIndex.build(rows, begin, count, step_m=STEP_M, cells=cells)
     # The same plans, a third of them added later.
     grown = PlanIndex.build(rows, begin[:6], count[:6], step_m=STEP_M, cells=cells).updated(
@@ -419,7 +419,7 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
         assert all(before >= 2 * after for before, after in pairwise(sizes))
         for query in queries:
             for compared, scanned in ((10**9, 1), (400, 10**9)):
-                limits = {"compared": compared, "scanned": scanned}
+                limits: dict[str, Any] = {"compared": compared, "scanned": scanned}
                 masses = index.log_masses(query, WEIGHTS, CONFIG, **limits)
                 expected = fresh.log_masses(query, WEIGHTS, CONFIG, **limits)
                 compares_copies_twice = compared < 10**9 and max(wanted) > 40
