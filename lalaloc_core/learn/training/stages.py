@@ -130,9 +130,8 @@ def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> t
         names = {f"{part}.{name}": p for part, module in modules.items() for name, p in module.named_parameters()}
         for wanted in config.only:
             if not any(name.startswith(wanted) for name in names):
-                raise ConfigError(
-                    f"optimiser.only has '{wanted}'; no parameter's name begins so, as {next(iter(names))}"
-                )
+                first = next(iter(names))
+                raise ConfigError(f"optimiser.only has '{wanted}', but no parameter begins with it; one is '{first}'")
         for name, parameter in names.items():
             parameter.requires_grad_(parameter.requires_grad and name.startswith(config.only))
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
