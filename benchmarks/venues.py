@@ -41,8 +41,9 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.venue.index_search import ALIGNED, COMPARED, SCANNED, SearchLimits
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from lalaloc_core.localise.venue.plan_index import ALIGNED, COMPARED, SCANNED, PlanIndex
+from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
@@ -156,7 +157,7 @@ def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[
     for number, name, query in queries(bundle, photographed, seed):
         for aligned, shown in ((0, f"{name}, not aligned"), (ALIGNED, name)):
             begin = time.process_time()
-            mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig(), aligned=aligned)
+            mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig(), SearchLimits(aligned=aligned))
             seconds = time.process_time() - begin
             columns[shown].append((int((mass > mass[number]).sum()), seconds))
     return {
@@ -201,11 +202,12 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
         for number, name, query in queries(bundle, homes, options.seed):
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
             reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
-            limits: dict[str, Any] = {"compared": compared, "scanned": 10**15, "aligned": _MAX_ALIGNED}
-            exact = _ranked(index.log_masses(query, weights, config, **limits))
+            limits = SearchLimits(compared=compared, scanned=10**15, aligned=_MAX_ALIGNED)
+            exact = _ranked(index.log_masses(query, weights, config, limits))
             for scanned in options.scanned:
                 begin, began = time.process_time(), time.perf_counter()
-                mass = index.log_masses(query, weights, config, compared=options.compared, scanned=int(scanned))
+                fewer = SearchLimits(compared=options.compared, scanned=int(scanned))
+                mass = index.log_masses(query, weights, config, fewer)
                 columns = figures[f"{name}, {scanned:,.0f} pairs by codes"]
                 columns["ms"].append(1e3 * (time.process_time() - begin))
                 columns["ms of wall clock"].append(1e3 * (time.perf_counter() - began))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
@@ -25,6 +26,7 @@ from lalaloc_core.localise.poses import (
     Query,
     rolled,
 )
+from lalaloc_core.localise.venue.index_search import DividedIndex, PlanSearch, SearchLimits
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
@@ -302,7 +304,7 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
     parts = [prototypes_of(grid_of(plan), plan) for plan in plans]
     rows, count = joined(parts).rows.copy(), np.array([len(part) for part in parts])
     rows["cell"] = cells.assign(rows)
-    begin, limits = np.cumsum(count) - count, dict[str, Any](compared=4000, aligned=1000)
+    begin, limits = np.cumsum(count) - count, SearchLimits(compared=4000, aligned=1000)
     index = PlanIndex.build(rows, begin, count, step_m=STEP_M, cells=cells)
     # The same plans, a third of them added later.
     grown = PlanIndex.build(rows, begin[:6], count[:6], step_m=STEP_M, cells=cells).updated(
@@ -313,19 +315,21 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
         # Cameras between prototypes, and between hypotheses of the heading.
         x_m, y_m = rng.uniform((1.2, 1.2), (3.2, 2.2)).tolist()
         query = seen_query(plan, (x_m, y_m), hypotheses=hypotheses, turn=0.08 if hypotheses > 1 else 0.0)
-        mass, grown_mass = (each.log_masses(query, WEIGHTS, CONFIG, **limits) for each in (index, grown))
+        mass, grown_mass = (each.log_masses(query, WEIGHTS, CONFIG, limits) for each in (index, grown))
         ranks.append(int((mass > mass[number]).sum()))
         grown_ranks.append(int((grown_mass > grown_mass[number]).sum()))
     assert ranks.count(0) >= 7
     assert max(ranks) <= 2
     assert grown_ranks == ranks
-    unaligned = index.log_masses(query, WEIGHTS, CONFIG, compared=4000, aligned=0)
-    one = index.log_masses(query, WEIGHTS, CONFIG, compared=4000, aligned=1)
+    unaligned = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=0))
+    one = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=1))
     # All plans but that of the only aligned pair change alike.
     assert len(set(np.round(one - unaligned, 6).tolist())) <= 2
     assert len(set(np.round(mass - unaligned, 6).tolist())) > 2
     # By walls alone, all plans are equal.
-    walls = index.log_masses(query, WEIGHTS, replace(CONFIG, use_openings=False), compared=10**9, aligned=10**9)
+    walls = index.log_masses(
+        query, WEIGHTS, replace(CONFIG, use_openings=False), SearchLimits(compared=10**9, aligned=10**9)
+    )
     np.testing.assert_allclose(walls, walls[0], atol=1e-3)
 
 
@@ -350,10 +354,12 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) ->
     pairs = sum(map(len, prototype_sets)) * 16
     for number in range(len(prototype_sets)):
         query = query_at(prototype_sets[number], 5, rng, hypotheses=16)
-        whole = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs)
-        few = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 40, scanned=pairs // 10)
+        whole = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs))
+        few = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs // 40, scanned=pairs // 10))
         with ThreadPoolExecutor(1) as helper:
-            halved = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 40, scanned=pairs // 10, helper=helper)
+            halved = index.log_masses(
+                query, WEIGHTS, CONFIG, SearchLimits(compared=pairs // 40, scanned=pairs // 10), helper=helper
+            )
         np.testing.assert_array_equal(halved, few)
         assert few[whole.argmax()] > few.max() - 0.1
         # Skipped comparisons contribute no mass.
@@ -369,7 +375,7 @@ def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> 
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
     index = PlanIndex.from_prototypes(prototype_sets, shipped_cells())
     assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
-    assert index.log_masses(unknown, WEIGHTS, CONFIG, compared=2000).argmax() == 7
+    assert index.log_masses(unknown, WEIGHTS, CONFIG, SearchLimits(compared=2000)).argmax() == 7
 
 
 def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]) -> None:
@@ -377,7 +383,7 @@ def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]
     index, rng = PlanIndex.from_prototypes(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
         query = query_at(prototype_sets[3], 1, rng, hypotheses=8)
-        masses = index.log_masses(query, WEIGHTS, CONFIG, compared=compared, scanned=scanned)
+        masses = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=compared, scanned=scanned))
         assert np.isfinite(masses[3])
         np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
 
@@ -419,9 +425,9 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
         assert all(before >= 2 * after for before, after in pairwise(sizes))
         for query in queries:
             for compared, scanned in ((10**9, 1), (400, 10**9)):
-                limits: dict[str, Any] = {"compared": compared, "scanned": scanned}
-                masses = index.log_masses(query, WEIGHTS, CONFIG, **limits)
-                expected = fresh.log_masses(query, WEIGHTS, CONFIG, **limits)
+                limits = SearchLimits(compared=compared, scanned=scanned)
+                masses = index.log_masses(query, WEIGHTS, CONFIG, limits)
+                expected = fresh.log_masses(query, WEIGHTS, CONFIG, limits)
                 compares_copies_twice = compared < 10**9 and max(wanted) > 40
                 if not compares_copies_twice:
                     np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
@@ -429,6 +435,32 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
                 for copy in (number for number, plan in enumerate(wanted) if plan >= 40 and plan - 40 in wanted):
                     assert masses[copy] == pytest.approx(masses[wanted.index(wanted[copy] - 40)], abs=1e-9)
         plans = wanted
+
+
+def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes]) -> None:
+    rng, cells = np.random.default_rng(15), shipped_cells()
+    index, order = PlanIndex.from_prototypes(prototype_sets, cells), rng.permutation(len(prototype_sets))
+    shards = [
+        (PlanIndex.from_prototypes([prototype_sets[number] for number in numbers], cells), numbers)
+        for numbers in np.split(order, [3, 4, 13])
+    ]
+    divided = DividedIndex(shards=shards, step_m=STEP_M, cells=cells)
+    pairs = 16 * len(index)
+    for number in range(0, len(prototype_sets), 3):
+        query = query_at(prototype_sets[number], 2, rng, hypotheses=16)
+        for compared, scanned in ((pairs, 1), (pairs // 40, pairs), (pairs // 40, pairs // 10)):
+            limits = SearchLimits(compared=compared, scanned=scanned, aligned=300)
+            masses, expected = (each.log_masses(query, WEIGHTS, CONFIG, limits) for each in (divided, index))
+            np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
+
+
+def test_search_sent_to_another_machine_has_the_same_costs(prototype_sets: list[Prototypes]) -> None:
+    search = PlanSearch(query_at(prototype_sets[0], 2, np.random.default_rng(16)), STEP_M, WEIGHTS, CONFIG)
+    alone = len(pickle.dumps(search))
+    assert search.costs.opening_loss is not None
+    sent = pickle.dumps(search)
+    assert len(sent) < 2 * alone
+    np.testing.assert_array_equal(pickle.loads(sent).costs.opening_loss, search.costs.opening_loss)
 
 
 def test_plans_with_and_without_openings_are_found() -> None:
@@ -446,7 +478,7 @@ def test_plans_with_and_without_openings_are_found() -> None:
     index = PlanIndex.from_prototypes(prototype_sets, cells)
     for number in range(12):
         query = query_at(whole[number], 2, rng, hypotheses=8)
-        masses = index.log_masses(query, WEIGHTS, CONFIG, compared=3000)
+        masses = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=3000))
         assert (masses > masses[number]).sum() <= (2 if number % 2 else 0)
 
 

@@ -25,10 +25,9 @@ merged so that each has at least twice as many plans as the next (the logarithmi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,17 +35,23 @@ from jaxtyping import Bool, Float, Int
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.venue.index_search import (
+    DividedIndex,
+    Pairs,
+    Pending,
+    PlanMasses,
+    PlanSearch,
+    Probed,
+    SearchLimits,
+    ShardSizes,
+    cheapest,
+)
 from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
-from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of
+from lalaloc_core.localise.venue.prototype_cells import Cells, claims_of
 from lalaloc_core.localise.venue.prototype_codes import lookup_tables
-from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import Prototypes, joined
-from lalaloc_core.localise.venue.segment import Segment, by_family
+from lalaloc_core.localise.venue.segment import Segment
 
-# Default numbers of pairs per query in the code scan, in the exact comparison, and in the alignment.
-SCANNED, COMPARED, ALIGNED = 40_000_000, 20_000, 4_000
-# The scan returns this multiple of each hypothesis's share, as the best pairs are spread unevenly over hypotheses.
-_OVERFETCH = 6
 # Pairs compared at a time, to bound memory.
 _BATCH_SIZE = 65_536
 
@@ -95,26 +100,11 @@ class _Part:
         return self.dead[place] != prototype
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Pairs of a distinct prototype of a segment, a heading hypothesis and a height hypothesis, by number."""
+class _Batch:
+    """Pairs of one segment, with the records of their prototypes."""
 
-    part: _Part
-    prototype: Int[np.ndarray, "n"]
-    hypothesis: Int[np.ndarray, "n"]
-    offset: Int[np.ndarray, "n"]
-
-    def __len__(self) -> int:
-        return len(self.prototype)
-
-    def chosen(self, place: Int[np.ndarray, "m"]) -> _Pairs:
-        """Return some of the pairs."""
-        return _Pairs(self.part, self.prototype[place], self.hypothesis[place], self.offset[place])
-
-    @cached_property
-    def rows(self) -> np.ndarray:
-        """Records of the prototypes."""
-        return self.part.segment.records(self.prototype)
+    def __init__(self, part: _Part, pairs: Pairs) -> None:
+        self.part, self.pairs, self.rows = part, pairs, part.segment.records(pairs.prototype)
 
 
 class _Masses:
@@ -123,15 +113,15 @@ class _Masses:
     def __init__(self, plans: int, temperature: float) -> None:
         self._mass, self._temperature, self._lowest = np.zeros(plans), temperature, np.inf
 
-    def add(self, pairs: _Pairs, cost: Float[np.ndarray, "n"]) -> None:
+    def add(self, batch: _Batch, cost: Float[np.ndarray, "n"]) -> None:
         """Add pairs with their costs."""
-        part, temperature = pairs.part, self._temperature
+        part, temperature = batch.part, self._temperature
         # Masses are relative to the lowest cost so far, so that relevant ones do not underflow.
         lowest = min(self._lowest, float(cost.min()))
         self._mass *= np.exp(-temperature * (self._lowest - lowest)) if np.isfinite(self._lowest) else 1.0
         self._lowest = lowest
-        weight = np.exp(pairs.rows["log_area"] - temperature * (cost.astype(np.float64) - lowest))
-        count, owner = part.segment.owners(pairs.prototype)
+        weight = np.exp(batch.rows["log_area"] - temperature * (cost.astype(np.float64) - lowest))
+        count, owner = part.segment.owners(batch.pairs.prototype)
         plan, each = part.plan[owner], np.repeat(weight, count)
         # Removed plans can share prototypes with those that are left.
         left = plan >= 0
@@ -139,10 +129,10 @@ class _Masses:
             plan, each = plan[left], each[left]
         self._mass += np.bincount(plan, each, minlength=len(self._mass))
 
-    def log(self) -> Float[np.ndarray, "p"]:
-        """Return the log masses; -inf for plans without pairs."""
-        with np.errstate(divide="ignore"):
-            return np.log(self._mass) - self._temperature * self._lowest
+    def log(self) -> PlanMasses:
+        """Return the log masses of plans with pairs."""
+        plan = np.flatnonzero(self._mass)
+        return PlanMasses(plan, np.log(self._mass[plan]) - self._temperature * self._lowest)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -224,126 +214,93 @@ class PlanIndex:
         for part in self.parts:
             part.segment.prepare()
 
+    @property
+    def sizes(self) -> ShardSizes:
+        """The sizes of the index."""
+        return ShardSizes(len(self), np.sum([part.cell_sizes for part in self.parts], axis=0))
+
     def log_masses(
         self,
         query: Query,
         weights: MatchingWeights,
         config: MatchingConfig,
+        limits: SearchLimits | None = None,
         *,
-        compared: int = COMPARED,
-        scanned: int = SCANNED,
-        aligned: int = ALIGNED,
         helper: Executor | None = None,
     ) -> Float[np.ndarray, "p"]:
-        """Return the log of each plan's mass (see `prototypes`); -inf if none of its prototypes was compared exactly.
+        """Return the log of each plan's mass; see `DividedIndex.log_masses`."""
+        whole = DividedIndex(shards=[(self, np.arange(self.plan_count))], step_m=self.step_m, cells=self.cells)
+        return whole.log_masses(query, weights, config, limits, helper=helper)
 
-        About `compared` pairs are compared exactly and about `aligned` pairs are aligned, as pairs of equal cost are
-        kept together. About `scanned` pairs are in the code scan, as the last probed cell is scanned whole; threads of
-        `helper` take over half of the scan.
-        """
-        costs = PrototypeCosts(query, self.step_m, weights, config)
-        k, j = costs.shape
-        compares_all = len(self) * k * j <= compared
-        pairs = self._all_pairs(k, j) if compares_all else self._best_pairs(costs, compared, scanned, helper)
-        compared_masses, aligned_masses = (_Masses(self.plan_count, weights.temperature) for _ in range(2))
-        alignment = PrototypeAlignment(costs)
-        for batch in _cheapest_pairs(costs, pairs, aligned, compared_masses):
-            aligned_masses.add(batch, alignment.pairs(batch.rows, batch.hypothesis, batch.offset).cost)
-        compared_mass, aligned_mass = compared_masses.log(), aligned_masses.log()
-        is_aligned = np.isfinite(aligned_mass)
-        if not is_aligned.any():
-            return compared_mass
-        change = np.median(aligned_mass[is_aligned] - compared_mass[is_aligned])
-        return np.where(is_aligned, aligned_mass, compared_mass + change)
+    def scan(
+        self, search: PlanSearch, probed: Probed | None, per_hypothesis: int, count: int, helper: Executor | None = None
+    ) -> Pending[Pairs]:
+        """See `Shard.scan`; threads of `helper` take over half of it."""
 
-    def _all_pairs(self, k: int, j: int) -> Iterator[_Pairs]:
-        """Yield all pairs in batches."""
-        for part in self.parts:
-            number = np.arange(len(part.segment))
-            number = number[part.alive(number)]
-            for begin in range(0, len(number) * k * j, _BATCH_SIZE):
-                pair = np.arange(begin, min(begin + _BATCH_SIZE, len(number) * k * j))
-                place, hypothesis, offset = np.unravel_index(pair, (len(number), k, j))
-                yield _Pairs(part, number[place], hypothesis, offset)
+        def scanned() -> Pairs:
+            k, j = search.costs.shape
+            families = {family for part in self.parts for family in part.segment.nonempty_cells}
+            tables = {family: lookup_tables(search.costs, claims_of(family)).reshape(k * j, -1) for family in families}
+            found = []
+            for number, part in enumerate(self.parts):
+                prototype, hypothesis, cost = part.segment.search(tables, probed, per_hypothesis, helper)
+                pairs = Pairs(np.full(len(cost), number), prototype, hypothesis, cost)
+                found.append(pairs.chosen(part.alive(prototype)))
+            return Pairs.joined(cheapest(found, count))
 
-    def _best_pairs(
-        self, costs: PrototypeCosts, compared: int, scanned: int, helper: Executor | None
-    ) -> Iterator[_Pairs]:
-        """Yield about the `compared` pairs that are cheapest by their codes, in batches."""
-        k, j = costs.shape
-        probed = self._probed_cells(costs, scanned)
-        families = {family for part in self.parts for family in part.segment.nonempty_cells}
-        tables = {family: lookup_tables(costs, claims_of(family)).reshape(k * j, -1) for family in families}
-        per_hypothesis = min(compared, -(-_OVERFETCH * compared // (k * j)))
-        found = []
-        for part in self.parts:
-            prototype, joint, cost = part.segment.search(tables, probed, per_hypothesis, helper)
-            alive = part.alive(prototype)
-            found.append((prototype[alive], joint[alive], cost[alive]))
-        cost = np.concatenate([cost for *_, cost in found])
-        highest = np.partition(cost, compared - 1)[compared - 1] if len(cost) > compared else np.inf
-        for part, (prototype, joint, cost) in zip(self.parts, found, strict=True):
-            prototype, joint = prototype[cost <= highest], joint[cost <= highest]
+        return scanned
+
+    def compare(self, search: PlanSearch, pairs: Pairs | None, count: int) -> Pending[tuple[Pairs, PlanMasses]]:
+        """See `Shard.compare`."""
+
+        def compared() -> tuple[Pairs, PlanMasses]:
+            k, j = search.costs.shape
+            masses, kept, total = _Masses(self.plan_count, search.costs.temperature), list[Pairs](), 0
+            for batch in self._all_pairs(k * j) if pairs is None else self._batches(pairs):
+                cost = search.costs.pairs(batch.rows, *np.divmod(batch.pairs.hypothesis, j))
+                masses.add(batch, cost)
+                kept.append(replace(batch.pairs, cost=cost))
+                total += len(cost)
+                if total > count + _BATCH_SIZE:
+                    kept = cheapest(kept, count)
+                    total = sum(map(len, kept))
+            return Pairs.joined(cheapest(kept, count) if kept else kept), masses.log()
+
+        return compared
+
+    def align(self, search: PlanSearch, pairs: Pairs) -> Pending[PlanMasses]:
+        """See `Shard.align`."""
+
+        def aligned() -> PlanMasses:
+            masses, alignment = _Masses(self.plan_count, search.costs.temperature), PrototypeAlignment(search.costs)
+            _, j = search.costs.shape
+            for batch in self._batches(pairs):
+                masses.add(batch, alignment.pairs(batch.rows, *np.divmod(batch.pairs.hypothesis, j)).cost)
+            return masses.log()
+
+        return aligned
+
+    def _batches(self, pairs: Pairs) -> Iterator[_Batch]:
+        """Yield pairs in batches of one segment each."""
+        for number, part in enumerate(self.parts):
+            own = pairs.chosen(pairs.part == number)
             # Rows are read fastest in the order of memory.
-            order = np.argsort(prototype, kind="stable")
-            found_pairs = _Pairs(part, prototype[order], *np.divmod(joint[order], j))
-            for begin in range(0, len(found_pairs), _BATCH_SIZE):
-                yield found_pairs.chosen(np.arange(begin, min(begin + _BATCH_SIZE, len(found_pairs))))
+            own = own.chosen(np.argsort(own.prototype, kind="stable"))
+            for begin in range(0, len(own), _BATCH_SIZE):
+                yield _Batch(part, own.chosen(np.arange(begin, min(begin + _BATCH_SIZE, len(own)))))
 
-    def _probed_cells(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l q"]] | None:
-        """Return for each family which of its cells are probed under which hypotheses; None for all."""
-        (k, j), per_family = costs.shape, len(self.cells) // FAMILIES
-        if len(self) * k * j <= scanned:
-            return None
-        sizes = np.sum([part.cell_sizes for part in self.parts], axis=0)
-        nonempty = by_family(np.flatnonzero(sizes), per_family)
-        costs_of = self.cells.costs(costs, nonempty)
-        cost = np.concatenate([costs_of[family][cell % per_family].ravel() for family, cell in nonempty.items()])
-        size = np.concatenate([np.repeat(sizes[cell], k * j) for cell in nonempty.values()])
-        # Costs are rounded to 16 bits, which numpy sorts twenty times as fast.
-        lowest = float(cost.min())
-        rounded = ((cost - lowest) * (65535.0 / max(float(cost.max()) - lowest, 1e-9))).astype(np.uint16)
-        order = np.argsort(rounded, kind="stable")
-        fits = np.cumsum(size[order]) <= scanned
-        chosen = np.zeros(len(cost), bool)
-        chosen[order[: int(fits.sum()) + 1]] = True
-        ends = np.cumsum([len(cell) * k * j for cell in nonempty.values()])
-        # Cells without a living prototype are in no list of `nonempty`, and are not probed.
-        families = {family for part in self.parts for family in part.segment.nonempty_cells}
-        probed = {family: np.zeros((per_family, k * j), bool) for family in families}
-        for (family, cell), part in zip(nonempty.items(), np.split(chosen, ends[:-1]), strict=True):
-            probed[family][cell % per_family] = part.reshape(-1, k * j)
-        return probed
-
-
-def _cheapest_pairs(costs: PrototypeCosts, pairs: Iterable[_Pairs], count: int, masses: _Masses) -> list[_Pairs]:
-    """Add all pairs to the masses, and return about the `count` cheapest ones, by their exact costs.
-
-    Pairs of equal cost are kept together.
-    """
-    kept, total, highest = list[tuple[_Pairs, np.ndarray]](), 0, np.inf
-    for batch in pairs:
-        if not len(batch):
-            continue
-        cost = costs.pairs(batch.rows, batch.hypothesis, batch.offset)
-        masses.add(batch, cost)
-        kept.append((batch, cost))
-        total += len(batch)
-        if total > count + _BATCH_SIZE:
-            highest = _highest(kept, count, highest)
-            kept = [(batch.chosen(low), cost[low]) for batch, cost in kept for low in [np.flatnonzero(cost <= highest)]]
-            total = sum(len(batch) for batch, _ in kept)
-    highest = _highest(kept, count, highest) if kept else highest
-    chosen = [batch.chosen(np.flatnonzero(cost <= highest)) for batch, cost in kept]
-    return [batch for batch in chosen if len(batch)]
-
-
-def _highest(pairs: Sequence[tuple[_Pairs, np.ndarray]], count: int, highest: float) -> float:
-    """Return the highest cost of the `count` cheapest pairs."""
-    if not count:
-        return -np.inf
-    cost = np.concatenate([cost for _, cost in pairs])
-    return highest if len(cost) <= count else min(highest, float(np.partition(cost, count - 1)[count - 1]))
+    def _all_pairs(self, hypotheses: int) -> Iterator[_Batch]:
+        """Yield all pairs with some number of hypotheses in batches."""
+        for number, part in enumerate(self.parts):
+            prototype = np.arange(len(part.segment))
+            prototype = prototype[part.alive(prototype)]
+            for begin in range(0, len(prototype) * hypotheses, _BATCH_SIZE):
+                place, hypothesis = np.divmod(
+                    np.arange(begin, min(begin + _BATCH_SIZE, len(prototype) * hypotheses)), hypotheses
+                )
+                yield _Batch(
+                    part, Pairs(np.full(len(place), number), prototype[place], hypothesis, np.zeros(len(place)))
+                )
 
 
 def _part(rows: np.ndarray, begin: np.ndarray, count: np.ndarray, numbers: Int[np.ndarray, "p"], cells: Cells) -> _Part:

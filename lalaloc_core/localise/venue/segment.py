@@ -124,12 +124,15 @@ class Segment:
 
         Args:
             tables: lookup tables by family, see `prototype_codes`.
-            probed: tells for every family which of its cells are probed for each query; None probes all.
+            probed: tells which cells of each family are probed for each query; families left out are not. None probes
+                all.
             count: maximum number of prototypes per query and family.
             helper: threads that take over a part; None: the caller's does all.
         """
-        parts = []
+        parts = [(np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.float32))]
         for family, (first, scan) in self._scans.items():
+            if probed is not None and family not in probed:
+                continue
             cell, queries = self.nonempty_cells[family] % self.cells_per_family, len(tables[family])
             lists = np.ones((queries, len(cell)), bool) if probed is None else probed[family][cell].T
             number, cost = scan.search(tables[family], lists, count, helper)
