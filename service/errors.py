@@ -46,6 +46,7 @@ LaLaLocError
     ├── TooManyRefusedKeysError     too many invalid API keys from one client
     ├── OverloadedError             all slots are in use
     │   └── ShareExceededError      one tenant's share of the slots is in use
+    ├── IndexTooLargeError          the index of a venue exceeds its memory
     ├── DrawingFailedError          a drawing could not be rasterised
     ├── DecoderNotReadyError        no decoder process is running
     ├── ConverterNotReadyError      no converter process is running
@@ -482,6 +483,16 @@ class ConverterNotReadyError(ServiceError):
 
     def __init__(self) -> None:
         super().__init__("no process for reading and writing plan files is running yet; the native format needs none")
+
+
+class IndexTooLargeError(ServiceError):
+    """The index of some plans exceeds the memory for indices."""
+
+    def __init__(self, plans: int, size: int, limit: int) -> None:
+        super().__init__(
+            f"the index of {plans} floor plans takes {size} bytes and the limit is {limit}: raise "
+            "LALALOC_VENUE_CACHE_BYTES, or divide the index into more shards"
+        )
 
 
 class DeadlineExceededError(ServiceError):

@@ -23,10 +23,12 @@ from service.http.events import HEARTBEAT_S, PlanEvents
 from service.query import (
     Decoder,
     Grounds,
+    IndexSource,
     Localiser,
     LocaliserBackend,
     LpoPool,
     OptimiserBackend,
+    PlanIndices,
     SessionTracker,
     TrackerBackend,
     VenueLocaliser,
@@ -82,6 +84,8 @@ class Runtime:
         uploads: threads that check, prepare and store plans.
         file_uploads: threads for uploads that wait for the converter.
         reads: store reads of queries.
+        venue_plans: rows of the plans of venues in memory.
+        plan_indices: indices of venues in this process.
         renditions: files made from stored plans.
         permits: permits to compute, of which each piece of work holds one.
     """
@@ -105,6 +109,8 @@ class Runtime:
     uploads: Threads
     file_uploads: Threads
     reads: BoundedReads
+    venue_plans: VenuePlans
+    plan_indices: PlanIndices
     renditions: RenditionCache
     permits: FairSemaphore
 
@@ -126,11 +132,13 @@ class Backends:
         optimiser: builds the pool of LPO workers; the last argument tells whether poses are refined by latents.
         encoder: loads the networks and warms them up.
         localisers: builds the localisers; None: this process computes answers.
+        indices: builds the source of the indices of venues; None: they are in this process.
     """
 
     optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore, bool], OptimiserBackend]
     encoder: Callable[[Bundle, Settings], PhotographEncoder]
     localisers: Callable[[ModelAnswer, Settings, Telemetry], Localisers] | None = None
+    indices: Callable[[Settings], IndexSource] | None = None
 
 
 def warm_encoder(bundle: Bundle, settings: Settings) -> PhotographEncoder:
@@ -189,8 +197,9 @@ def start_runtime(
     _closing(cleanup, sweeper).start()
     # A thread of its own: a database that does not answer blocks no reads of queries.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
-    plans = _closing(cleanup, components.venue_plans())
-    search = VenueSearch(plans=plans, encoder=components.encoder, queries=components.admission.queries)
+    plans, plan_indices = components.venue_plans(), _closing(cleanup, components.plan_indices())
+    indices: IndexSource = plan_indices if backends.indices is None else backends.indices(settings)
+    search = VenueSearch(plans=plans, indices=indices, encoder=components.encoder, queries=components.admission.queries)
     venue_localiser = components.venue_localiser(localiser, plans, search)
     if backends.localisers is None:
         tracker = components.tracker(localiser, Grounds(localiser, plans, search))
@@ -232,6 +241,8 @@ def start_runtime(
         uploads=uploads,
         file_uploads=file_uploads,
         reads=components.reads,
+        venue_plans=plans,
+        plan_indices=plan_indices,
         renditions=_closing(cleanup, renditions),
         permits=components.permits,
     )
@@ -324,11 +335,20 @@ class _QueryComponents:
             self.store,
             self.grids,
             self.reads,
-            path=self.settings.data_dir / "prototypes.bin",
-            file_bytes=self.settings.storage.venue_file_bytes,
             limit_bytes=self.settings.storage.venue_cache_bytes,
             max_poses=min(self.settings.grids.max_grid_poses, _VENUE_POSES),
             idle_cores=self.idle_cores,
+        )
+
+    def plan_indices(self) -> PlanIndices:
+        """Build the indices of plans."""
+        return PlanIndices(
+            self.store,
+            self.grids,
+            self.reads,
+            path=self.settings.data_dir / "prototypes.bin",
+            file_bytes=self.settings.storage.venue_file_bytes,
+            limit_bytes=self.settings.storage.venue_cache_bytes,
         )
 
     def venue_localiser(self, localiser: Localiser, plans: VenuePlans, search: VenueSearch) -> VenueLocaliser:

@@ -11,7 +11,7 @@ from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.bundle import Bundle
-from service.on_ray.replicas import EncoderReplica, IngressReplica, LpoReplica, SearchReplica
+from service.on_ray.replicas import EncoderReplica, IndexReplica, IngressReplica, LpoReplica, SearchReplica
 from service.settings import Settings
 from service.tenancy.fair_share import with_headroom
 
@@ -21,10 +21,17 @@ Replicas = Annotated[int, Field(ge=1, le=1000)]
 _SEARCH_THREADS = 2
 # Requests queued at a replica besides the running request, so that it never idles.
 _QUEUED_REQUESTS = 1
+# Searches of a shard at a time.
+_INDEX_REQUESTS = 4
 
 
 class RayOptions(BaseModel):
-    """Minimum and maximum number of replicas per deployment."""
+    """Minimum and maximum number of replicas per deployment.
+
+    Attributes:
+        index_shards: deployments between which the index of each venue is divided; 0: each search replica has the
+            whole index.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -36,6 +43,7 @@ class RayOptions(BaseModel):
     search_max: Replicas = 8
     lpo_min: Replicas = 1
     lpo_max: Replicas = 16
+    index_shards: Annotated[int, Field(ge=0, le=1000)] = 0
 
 
 def app(arguments: dict[str, str]) -> serve.Application:
@@ -87,6 +95,13 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
     optimiser = None if settings.compute.workers == 0 else lpo
     # The annotation of the router class is wrong.
     routed: dict[str, Any] = {"request_router_class": ConsistentHashRouter}
+    index_settings = settings.with_values(workers=0, compute_threads=1, decode_workers=1, onnx_threads=threads)
+    shards = [
+        serve.deployment(IndexReplica, name=f"index-{number}", max_ongoing_requests=_INDEX_REQUESTS).bind(
+            index_settings, sha256, encoder
+        )
+        for number in range(options.index_shards)
+    ]
     search = serve.deployment(
         SearchReplica,
         name="search",
@@ -94,7 +109,7 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
         request_router_config=RequestRouterConfig(**routed),
         graceful_shutdown_timeout_s=settings.requests.stop_deadline_s,
         **_scaled("search", options, target=float(search_settings.query_limit)),
-    ).bind(search_settings, sha256, encoder, optimiser)
+    ).bind(search_settings, sha256, encoder, optimiser, shards)
     ingress = serve.deployment(
         IngressReplica,
         name="ingress",

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from jaxtyping import UInt64
 from ray import serve
 from ray.serve.handle import DeploymentHandle
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -15,10 +19,12 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from lalaloc_core.localise.venue.index_search import ShardSizes
 from lalaloc_core.photograph import View
 from service.app import create_app
-from service.errors import UnknownFloorPlanError, UnknownVenueError
-from service.on_ray.outcome import returning_failures
+from service.errors import IndexTooLargeError, UnknownFloorPlanError, UnknownVenueError
+from service.on_ray.index_shards import RemoteIndices, Stage
+from service.on_ray.outcome import Success, returning_failures
 from service.on_ray.remote import (
     RemoteLocaliser,
     RemoteOptimiser,
@@ -27,6 +33,7 @@ from service.on_ray.remote import (
     RemoteVenueLocaliser,
 )
 from service.query import PanoramaQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery
+from service.query.plan_list import PlanList
 from service.runtime import Backends, Localisers, start_runtime, warm_encoder
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
@@ -71,19 +78,71 @@ class LpoReplica:
         return self._refine(deepcopy(job))
 
 
-class SearchReplica:
-    """Search: the service without HTTP, with remote encoder and LPO."""
+class _ServiceReplica:
+    """The service without HTTP, with remote encoder, LPO and indices."""
 
-    def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle, lpo: DeploymentHandle) -> None:
-        """Build the localisers; check the bundle as `EncoderReplica` does."""
+    def __init__(
+        self,
+        settings: Settings,
+        model_sha256: str,
+        encoder: DeploymentHandle,
+        lpo: DeploymentHandle | None = None,
+        shards: Sequence[DeploymentHandle] = (),
+    ) -> None:
+        """Start the service; check the bundle as `EncoderReplica` does.
+
+        Without `shards`, this process has the indices of venues.
+        """
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
         backends = Backends(
             optimiser=lambda _bundle, _settings, telemetry, *_: RemoteOptimiser(lpo, telemetry),
             encoder=lambda bundle, settings: RemotePhotographEncoder(bundle, settings, encoder),
+            indices=(lambda settings: RemoteIndices(shards, settings)) if shards else None,
         )
         self._cleanup = ExitStack()
         self._runtime = start_runtime(settings, Telemetry(), self._cleanup, backends)
+
+    def __del__(self) -> None:
+        # Ray calls this when it stops a replica; `_cleanup` is missing if the start failed early.
+        if (cleanup := self.__dict__.get("_cleanup")) is not None:
+            cleanup.close()
+
+
+class IndexReplica(_ServiceReplica):
+    """Shard of the indices of venues; stages of a search are called by `index_shards.RemoteShard`."""
+
+    async def held(self, digest: bytes) -> Success[tuple[ShardSizes, UInt64[np.ndarray, "p"]] | None]:
+        """Return the sizes of an index and the keys of its plans; None if it is not in memory.
+
+        `digest` is that of the plans it was asked for, see `PlanList.digest`.
+        """
+        indexed = self._runtime.plan_indices.held(digest)
+        return Success(None if indexed is None else (indexed.index.sizes, indexed.keys))
+
+    @returning_failures
+    async def hold(
+        self, tenant: str, venue_id: str | None, plans: PlanList
+    ) -> tuple[ShardSizes, UInt64[np.ndarray, "p"]]:
+        """Index plans; return as `held` does.
+
+        Raises:
+            LaLaLocError: see `PlanIndices.index`.
+            IndexTooLargeError: the index exceeds the memory for indices.
+        """
+        known, index = await self._runtime.plan_indices.index(tenant, plans, asyncio.to_thread, venue_id=venue_id)
+        if self._runtime.plan_indices.held(plans.digest) is None:
+            raise IndexTooLargeError(len(known), index.nbytes, self._runtime.settings.storage.venue_cache_bytes)
+        return index.sizes, known.keys
+
+    async def search(self, digest: bytes, stage: Stage, arguments: tuple[Any, ...]) -> Success[Any]:
+        """Return the result of a stage of `Shard`; None if the index is not in memory."""
+        indexed = self._runtime.plan_indices.held(digest)
+        return Success(None if indexed is None else await asyncio.to_thread(getattr(indexed.index, stage)(*arguments)))
+
+
+class SearchReplica(_ServiceReplica):
+    """Search of plans and venues."""
 
     @returning_failures
     async def localise(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
@@ -157,11 +216,6 @@ class SearchReplica:
         if record is None:
             raise UnknownVenueError(venue_id)
         return record
-
-    def __del__(self) -> None:
-        # Ray calls this when it stops a replica; `_cleanup` is missing if the start failed early.
-        if (cleanup := self.__dict__.get("_cleanup")) is not None:
-            cleanup.close()
 
 
 @serve.ingress()

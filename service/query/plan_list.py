@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from bisect import insort
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
@@ -57,10 +58,19 @@ class PlanList(list[Row[Any]]):
         digests = np.frombuffer(bytes.fromhex("".join(self._column("grid_sha256"))), np.uint64)
         return digests[::4] + np.array(self._column("grid_id"), np.uint64) * _FACTOR
 
+    @cached_property
+    def digest(self) -> bytes:
+        """Digest of the plans' pose grids in order."""
+        return hashlib.sha256(self.keys.tobytes()).digest()
+
     @property
     def members(self) -> Iterator[tuple[float, str, str | None]]:
         """Level, id and name in the venue of each plan, as `Venues.members` returns them."""
         return zip(self._column("level"), self._column("plan_id"), self._column("name_in_venue"), strict=True)
+
+    def plan_ids_among(self, plan_ids: Iterable[str]) -> set[str]:
+        """Return those ids that are ids of plans in the list."""
+        return set(plan_ids).intersection(self._column("plan_id"))
 
     def updated(self, removed: Collection[str], added: Iterable[Row[Any]]) -> PlanList:
         """Return the list, ordered by level and id, without some plans and with other rows in their places."""

@@ -26,6 +26,7 @@ from service.grids import check_height_m
 from service.http.admission_control import Slots
 from service.query.answers import Place
 from service.query.geopose import plan_anchor
+from service.query.plan_indices import IndexSource
 from service.query.plan_list import PlanList
 from service.query.queries import QueryContext
 from service.query.venue_hints import VenueHints
@@ -87,8 +88,9 @@ class SearchedPlans:
 class VenueSearch:
     """Chooser of the plans of venues that a photograph is compared with."""
 
-    def __init__(self, *, plans: VenuePlans, encoder: PhotographEncoder, queries: Slots) -> None:
+    def __init__(self, *, plans: VenuePlans, indices: IndexSource, encoder: PhotographEncoder, queries: Slots) -> None:
         self._plans = plans
+        self._indices = indices
         self._encoder = encoder
         self._queries = queries
 
@@ -161,7 +163,7 @@ class VenueSearch:
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
             whole_venue = venue.id if possible is ready else None
-            known, plan_index = await self._plans.index(venue.tenant, possible, compute, venue_id=whole_venue)
+            known, plan_index = await self._indices.index(venue.tenant, possible, compute, venue_id=whole_venue)
             manifest = self._encoder.networks.manifest
             choosing = [(one, manifest.evidence_for(view=one.is_view)) for one in queries]
             log_prior = hints.log_prior(known, shares)

@@ -25,7 +25,7 @@ def venue_summary(record: VenueRecord) -> VenueSummary:
 
 def venue_representation(record: VenueRecord, runtime: Runtime) -> tuple[bytes, str]:
     """Return a venue as JSON, and its entity tag."""
-    counts = runtime.store.venues.counts(record.id, *runtime.grids.model)
+    counts = runtime.venue_plans.counts(record.tenant, record.id)
     answer = VenueAnswer(
         **venue_summary(record).model_dump(),
         revision_number=record.revision,

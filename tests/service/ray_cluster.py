@@ -11,8 +11,8 @@ import pytest
 
 from service.settings import Settings
 
-# One replica each, but several that search, so that requests are routed.
-REPLICAS = {"ingress_max": 1, "encoder_max": 1, "search_min": 2, "search_max": 2, "lpo_max": 1}
+# One replica each, but several that search, so that requests are routed, and two shards of the index of venues.
+REPLICAS = {"ingress_max": 1, "encoder_max": 1, "search_min": 2, "search_max": 2, "lpo_max": 1, "index_shards": 2}
 NAME = "lalaloc"
 # More CPUs than the machine has, because several replicas share one here.
 _PROCESSORS = 8

@@ -30,6 +30,10 @@ from ray import serve  # noqa: E402
 from service.on_ray import app  # noqa: E402
 from service.on_ray.outcome import Failure, Success, returning_failures  # noqa: E402
 from tests.service.ray_cluster import NAME  # noqa: E402
+from tests.service.test_venue_queries import ask, venue_of  # noqa: E402
+
+# Two plans of a venue are too many to search in full, so that their index chooses.
+FEW_POSES: dict[str, Any] = {"max_grid_poses": 300}
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +48,7 @@ def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[http
     # Deadlines as they would be on a machine that has nothing else to do are not what is tested.
     patient: dict[str, Any] = {"request_deadline_s": 50.0, "decode_stall_s": 50.0, "lpo_deadline_s": 30.0}
     processes: dict[str, Any] = {"decode_workers": 1, "import_workers": 1}
-    settings = Settings(data_dir=data_dir, bundle=tiny_bundle, log_level="error", **patient, **processes)
+    settings = Settings(data_dir=data_dir, bundle=tiny_bundle, log_level="error", **patient, **processes, **FEW_POSES)
     with serving(settings), httpx.Client(base_url=ray_address, timeout=60.0) as client:
         yield client
 
@@ -53,6 +57,20 @@ def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[http
 def plan_id(on_ray: httpx.Client) -> str:
     """Return the id of a plan that was stored through Ray."""
     return upload(on_ray, FLAT)
+
+
+def kill_replica(deployment: str) -> None:
+    """Kill the only replica of a deployment."""
+    actors = ray.util.list_named_actors(all_namespaces=True)
+    [replica] = [actor for actor in actors if actor["name"].startswith(f"SERVE_REPLICA::{NAME}#{deployment}#")]
+    ray.kill(ray.get_actor(**replica), no_restart=True)
+
+
+def wider(plan: dict[str, Any], factor: float) -> dict[str, Any]:
+    """Return a plan stretched along x."""
+    return plan | {
+        "rooms": [room | {"polygon": [[factor * x, y] for x, y in room["polygon"]]} for room in plan["rooms"]]
+    }
 
 
 @pytest.mark.slow
@@ -106,9 +124,7 @@ def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -
 
 @pytest.mark.slow
 def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    actors = ray.util.list_named_actors(all_namespaces=True)
-    [lpo] = [actor for actor in actors if actor["name"].startswith(f"SERVE_REPLICA::{NAME}#lpo#")]
-    ray.kill(ray.get_actor(**lpo), no_restart=True)
+    kill_replica("lpo")
     # Single photographs are refined by the search replicas.
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
 
@@ -119,9 +135,37 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panora
     wait_for(lambda: ask().json()["stage"] == "lpo", timeout_s=120.0)
 
 
+@pytest.mark.slow
+def test_index_in_shards_chooses_the_same_plans(
+    on_ray: httpx.Client, start_app: StartApp, data_dir: Path, panorama: bytes
+) -> None:
+    plans = [upload(on_ray, wider(FLAT, 1.0 + 0.04 * number)) for number in range(7)]
+    venue = venue_of(on_ray, *plans)
+
+    def answers(client: httpx.Client) -> list[dict[str, Any]]:
+        stated: list[dict[str, Any]] = [{}, {"heading_deg": 30}]
+        found = [ask(client, venue, panorama, refine="none", top_k=10, **fields) for fields in stated]
+        return [{name: one.json()[name] for name in ("position", "plans")} for one in found]
+
+    found = answers(on_ray)
+    with start_app(data_dir, **FEW_POSES) as alone:
+        expected = answers(alone)
+    # Not all plans were searched.
+    assert len(found[0]["plans"]) < len(plans)
+    assert [answer["plans"] for answer in found] == [answer["plans"] for answer in expected]
+    assert [answer["position"] for answer in found] == [pytest.approx(answer["position"]) for answer in expected]
+    # A shard that dies is indexed anew, and a change reaches the shards.
+    kill_replica("index-0")
+    assert answers(on_ray) == found
+    best = found[0]["plans"][0]["floorplan_id"]
+    on_ray.patch(f"/venues/{venue}", json={"remove": [best]}).raise_for_status()
+    assert best not in {plan["floorplan_id"] for answer in answers(on_ray) for plan in answer["plans"]}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"index_shards": "-1"}, "index_shards is '-1': .*greater than or equal to 0"),
         ({"search_max": "0"}, "search_max is '0': .*greater than or equal to 1"),
         ({"searchers": "2"}, "searchers is '2': .*known: ingress_min, ingress_max"),
         ({"lpo_min": "3", "lpo_max": "2"}, "lpo_max is 2, less than lpo_min, which is 3"),

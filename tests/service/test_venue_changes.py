@@ -37,7 +37,7 @@ class Replica:
 
     def __init__(self, url: str) -> None:
         self.store = Store(url)
-        limits: dict[str, Any] = {"path": None, "file_bytes": 1, "limit_bytes": 2**20, "max_poses": 1}
+        limits: dict[str, Any] = {"limit_bytes": 2**20, "max_poses": 1}
         self._plans = VenuePlans(self.store, cast(Any, _Grids()), cast(Any, None), **limits)
 
     def rows(self) -> list[tuple[Any, ...]]:
