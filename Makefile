@@ -65,13 +65,13 @@ web: ## build the web pages from web/ into service/web, and clients/typescript (
 	cd web && npm ci --no-audit --no-fund && npm run types && npm run check && npm run build
 	cd clients/typescript && npm run build
 
-# Programs beside the environment, so that it stays as small as its users need it.
-build/tools/bin/%:
+# Beside the environment, so that it stays as small as its users need it.
+build/tools/bin/pip-audit:
 	$(BIN)/python -m venv build/tools
-	build/tools/bin/python -m pip install --quiet uv==0.13.9 pip-audit==2.10.1
+	build/tools/bin/python -m pip install --quiet pip-audit==2.10.1
 
-lock: $(STAMP) build/tools/bin/uv ## write requirements.lock and docker/requirements.lock from constraints.txt
-	$(BIN)/python -m scripts.write_locks build/tools/bin/uv
+lock: $(STAMP) ## write requirements.lock and docker/requirements.lock from constraints.txt
+	$(BIN)/python -m scripts.write_locks $(BIN)/uv
 
 notice: $(STAMP) ## write the licences of all that ships into NOTICE
 	$(BIN)/python -m scripts.write_notice
