@@ -488,10 +488,10 @@ class ConverterNotReadyError(ServiceError):
 class IndexTooLargeError(ServiceError):
     """The index of some plans exceeds the memory for indices."""
 
-    def __init__(self, plans: int, size: int, limit: int) -> None:
+    def __init__(self, plans: int, limit: int) -> None:
         super().__init__(
-            f"the index of {plans} floor plans takes {size} bytes and the limit is {limit}: raise "
-            "LALALOC_VENUE_CACHE_BYTES, or divide the index into more shards"
+            f"the index of {plans} floor plans exceeds the limit of {limit} bytes: raise LALALOC_VENUE_CACHE_BYTES, or "
+            "divide the index into more shards"
         )
 
 

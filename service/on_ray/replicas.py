@@ -112,6 +112,11 @@ class _ServiceReplica:
 class IndexReplica(_ServiceReplica):
     """Shard of the indices of venues; stages of a search are called by `index_shards.RemoteShard`."""
 
+    def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle) -> None:
+        """Start the service; check the bundle as `EncoderReplica` does."""
+        super().__init__(settings, model_sha256, encoder)
+        self._making: dict[bytes, asyncio.Task[None]] = {}
+
     async def held(self, digest: bytes) -> Success[tuple[ShardSizes, UInt64[np.ndarray, "p"]] | None]:
         """Return the sizes of an index and the keys of its plans; None if it is not in memory.
 
@@ -130,10 +135,19 @@ class IndexReplica(_ServiceReplica):
             LaLaLocError: see `PlanIndices.index`.
             IndexTooLargeError: the index exceeds the memory for indices.
         """
-        known, index = await self._runtime.plan_indices.index(tenant, plans, asyncio.to_thread, venue_id=venue_id)
-        if self._runtime.plan_indices.held(plans.digest) is None:
-            raise IndexTooLargeError(len(known), index.nbytes, self._runtime.settings.storage.venue_cache_bytes)
-        return index.sizes, known.keys
+        making = self._making.get(plans.digest)
+        if making is None:
+            making = self._making[plans.digest] = asyncio.create_task(self._make(tenant, venue_id, plans))
+            making.add_done_callback(lambda _: self._making.pop(plans.digest))
+        # A query that misses its deadline does not stop it, so that the next one finds the index.
+        await asyncio.shield(making)
+        indexed = self._runtime.plan_indices.held(plans.digest)
+        if indexed is None:
+            raise IndexTooLargeError(len(plans), self._runtime.settings.storage.venue_cache_bytes)
+        return indexed.index.sizes, indexed.keys
+
+    async def _make(self, tenant: str, venue_id: str | None, plans: PlanList) -> None:
+        await self._runtime.plan_indices.index(tenant, plans, asyncio.to_thread, venue_id=venue_id)
 
     async def search(self, digest: bytes, stage: Stage, arguments: tuple[Any, ...]) -> Success[Any]:
         """Return the result of a stage of `Shard`; None if the index is not in memory."""
