@@ -157,7 +157,9 @@ def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[
     for number, name, query in queries(bundle, photographed, seed):
         for aligned, shown in ((0, f"{name}, not aligned"), (ALIGNED, name)):
             begin = time.process_time()
-            mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig(), SearchLimits(aligned=aligned))
+            mass = index.whole.log_masses(
+                query, bundle.manifest.evidence, MatchingConfig(), SearchLimits(aligned=aligned)
+            )
             seconds = time.process_time() - begin
             columns[shown].append((int((mass > mass[number]).sum()), seconds))
     return {
@@ -203,11 +205,11 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
             reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
             limits = SearchLimits(compared=compared, scanned=10**15, aligned=_MAX_ALIGNED)
-            exact = _ranked(index.log_masses(query, weights, config, limits))
+            exact = _ranked(index.whole.log_masses(query, weights, config, limits))
             for scanned in options.scanned:
                 begin, began = time.process_time(), time.perf_counter()
                 fewer = SearchLimits(compared=options.compared, scanned=int(scanned))
-                mass = index.log_masses(query, weights, config, fewer)
+                mass = index.whole.log_masses(query, weights, config, fewer)
                 columns = figures[f"{name}, {scanned:,.0f} pairs by codes"]
                 columns["ms"].append(1e3 * (time.process_time() - begin))
                 columns["ms of wall clock"].append(1e3 * (time.perf_counter() - began))
@@ -245,7 +247,7 @@ def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
     photographed = np.linspace(0, options.plans - 1, options.queries).astype(int).tolist()
     for number, name, query in queries(bundle, photographed, options.seed):
         begin = time.process_time()
-        mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
+        mass = index.whole.log_masses(query, bundle.manifest.evidence, MatchingConfig())
         chosen = most_probable(mass, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, limit)).tolist()
         indexed = time.process_time()
         by_index = best_plan(query, chosen)

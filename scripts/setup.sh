@@ -36,12 +36,13 @@ create_venv
 export PIP_NO_COMPILE=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 # Torch comes while the others do.
 "$venv/bin/python" scripts/install_torch.py &
+torch=$!
 # Every package by its digest, of the lock that `make lock` writes for these extras, so that there is nothing to resolve:
 # by uv, which takes a tenth of pip's time, or by pip, where only pip is configured for a mirror.
 pip_install=("$venv/bin/python" -m pip install --no-deps)
 "${pip_install[@]}" --require-hashes -r <(sed -n '/^uv==/,/[^\\]$/p' requirements.lock)
 "$venv/bin/uv" pip install --python "$venv/bin/python" --no-deps --require-hashes -r requirements.lock ||
     "${pip_install[@]}" --require-hashes -r requirements.lock
-wait $!
+wait "$torch"
 "${pip_install[@]}" --no-build-isolation -e ".[$extras]"
 printf 'setup: done, the environment is in %s\n' "$venv"

@@ -29,13 +29,11 @@ from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from service.bounded_cache import BoundedCache
 from service.errors import DeadlineExceededError
 from service.on_ray.outcome import Failure, Success
-from service.query.plan_list import PlanList
+from service.query.plan_list import ROW_BYTES, PlanList
 from service.settings import Settings
 
 # A shard stores nothing, so calls are repeated if its replica dies.
 _ATTEMPTS = 2
-# Approximate memory of a plan in an index that is divided: its number and a reference to its row.
-_PLAN_BYTES = 16
 
 Stage = Literal["scan", "compare", "align"]
 
@@ -172,4 +170,4 @@ class RemoteShard:
 
 
 def _bytes(plans: PlanList, index: DividedIndex) -> int:
-    return _PLAN_BYTES * len(plans) + sum(shard.sizes.cells.nbytes for shard, _ in index.shards)
+    return ROW_BYTES * len(plans) + sum(shard.sizes.cells.nbytes for shard, _ in index.shards)

@@ -22,7 +22,7 @@ from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.localise.venue.index_search import ShardSizes
 from lalaloc_core.photograph import View
 from service.app import create_app
-from service.errors import IndexTooLargeError, UnknownFloorPlanError, UnknownVenueError
+from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlanError, UnknownVenueError
 from service.on_ray.index_shards import RemoteIndices, Stage
 from service.on_ray.outcome import Success, returning_failures
 from service.on_ray.remote import (
@@ -40,6 +40,9 @@ from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
 from service.workers.lpo import load_refiner
+
+# Indices that a shard makes at a time; they outlive the queries that wait for them.
+_MAX_MAKING = 2
 
 
 class EncoderReplica:
@@ -134,9 +137,12 @@ class IndexReplica(_ServiceReplica):
         Raises:
             LaLaLocError: see `PlanIndices.index`.
             IndexTooLargeError: the index exceeds the memory for indices.
+            OverloadedError: other indices are made already.
         """
         making = self._making.get(plans.digest)
         if making is None:
+            if len(self._making) >= _MAX_MAKING:
+                raise OverloadedError(_MAX_MAKING)
             making = self._making[plans.digest] = asyncio.create_task(self._make(tenant, venue_id, plans))
             making.add_done_callback(lambda _: self._making.pop(plans.digest))
         # A query that misses its deadline does not stop it, so that the next one finds the index.

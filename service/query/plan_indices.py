@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,12 +12,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from cachetools import LRUCache
-from jaxtyping import Float, Int, UInt64
+from jaxtyping import Int, UInt64
 from sqlalchemy import Row
 
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.venue.index_search import DividedIndex
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from service.bounded_cache import BoundedCache
@@ -40,22 +37,12 @@ _MAX_LATEST = 1000
 Compute = Callable[[Callable[[], Any]], Awaitable[Any]]
 
 
-class SearchableIndex(Protocol):
-    """Index of plans in this process or elsewhere: `PlanIndex` or `DividedIndex`."""
-
-    def log_masses(
-        self, query: Query, weights: MatchingWeights, config: MatchingConfig, *, helper: Executor | None = None
-    ) -> Float[np.ndarray, "p"]:
-        """Return the log of each plan's mass."""
-        ...
-
-
 class IndexSource(Protocol):
     """Source of the indices of plans."""
 
     async def index(
         self, tenant: str, ready: PlanList, compute: Compute, *, venue_id: str | None = None
-    ) -> tuple[PlanList, SearchableIndex]:
+    ) -> tuple[PlanList, DividedIndex]:
         """See `PlanIndices.index`."""
         ...
 
@@ -120,7 +107,7 @@ class PlanIndices:
 
     async def index(
         self, tenant: str, ready: PlanList, compute: Compute, *, venue_id: str | None = None
-    ) -> tuple[PlanList, PlanIndex]:
+    ) -> tuple[PlanList, DividedIndex]:
         """Return the index of plans that are ready, and their rows in its order, without plans whose grid was deleted.
 
         Prototypes that are missing, or of an earlier format, are made and stored.
@@ -146,8 +133,8 @@ class PlanIndices:
         if venue_id is not None:
             self._latest[venue_id] = digest
         if len(indexed.keys) == len(ready):
-            return ready, indexed.index
-        return ready.chosen(np.isin(ready.keys, indexed.keys)), indexed.index
+            return ready, indexed.index.whole
+        return ready.chosen(np.isin(ready.keys, indexed.keys)), indexed.index.whole
 
     def held(self, digest: bytes) -> Indexed | None:
         """Return the index that was asked for plans with a digest, if it is still in memory."""

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 from sqlalchemy import Row
 
+# Approximate memory of a row.
+ROW_BYTES = 600
 # Odd factor of the ids of grids in their keys.
 _FACTOR = np.uint64(0x9E3779B97F4A7C15)
 

@@ -16,11 +16,11 @@ from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import PoseGrid, Query
+from lalaloc_core.localise.venue.index_search import DividedIndex
 from lalaloc_core.localise.venue.prototypes import most_probable
 from service.bounded_cache import BoundedCache
 from service.grids import GridProvider
-from service.query.plan_indices import SearchableIndex
-from service.query.plan_list import PlanList
+from service.query.plan_list import ROW_BYTES, PlanList
 from service.schemas import EarthPoint
 from service.schemas.query_fields import CameraFields
 from service.storage import Store
@@ -35,8 +35,6 @@ _MAX_COMPARISONS = 8_000_000
 # Maximum radius of the circle around a plan, and maximum number of plans near a place.
 _MAX_REACH_M = 1000.0
 _MAX_NEAR = 2000
-# Approximate memory of a plan's row.
-_ROW_BYTES = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +91,7 @@ class VenuePlans:
         self._reads = reads
         self._max_poses = max_poses
         self._idle_cores = idle_cores
-        self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: _ROW_BYTES * len(venue.rows))
+        self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: ROW_BYTES * len(venue.rows))
 
     async def members(self, tenant: str, venue_id: str) -> PlanList:
         """Return the current row of every plan of a venue."""
@@ -123,7 +121,7 @@ class VenuePlans:
     def choose(
         self,
         known: PlanList,
-        index: SearchableIndex,
+        index: DividedIndex,
         choosing: Sequence[tuple[Query, MatchingWeights]],
         log_prior: Float[np.ndarray, "p"],
         favour: Float[np.ndarray, "p"] | None = None,

@@ -315,19 +315,19 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
         # Cameras between prototypes, and between hypotheses of the heading.
         x_m, y_m = rng.uniform((1.2, 1.2), (3.2, 2.2)).tolist()
         query = seen_query(plan, (x_m, y_m), hypotheses=hypotheses, turn=0.08 if hypotheses > 1 else 0.0)
-        mass, grown_mass = (each.log_masses(query, WEIGHTS, CONFIG, limits) for each in (index, grown))
+        mass, grown_mass = (each.whole.log_masses(query, WEIGHTS, CONFIG, limits) for each in (index, grown))
         ranks.append(int((mass > mass[number]).sum()))
         grown_ranks.append(int((grown_mass > grown_mass[number]).sum()))
     assert ranks.count(0) >= 7
     assert max(ranks) <= 2
     assert grown_ranks == ranks
-    unaligned = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=0))
-    one = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=1))
+    unaligned = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=0))
+    one = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=4000, aligned=1))
     # All plans but that of the only aligned pair change alike.
     assert len(set(np.round(one - unaligned, 6).tolist())) <= 2
     assert len(set(np.round(mass - unaligned, 6).tolist())) > 2
     # By walls alone, all plans are equal.
-    walls = index.log_masses(
+    walls = index.whole.log_masses(
         query, WEIGHTS, replace(CONFIG, use_openings=False), SearchLimits(compared=10**9, aligned=10**9)
     )
     np.testing.assert_allclose(walls, walls[0], atol=1e-3)
@@ -344,7 +344,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
         cost = np.stack([alignment.pairs(part.rows, np.full(len(part), k), offset).cost for k in range(4)])
         weighed = part.rows["log_area"] - WEIGHTS.temperature * cost.astype(float)
         expected.append(np.logaddexp.reduce(weighed, axis=None))
-    found = index.log_masses(query, WEIGHTS, CONFIG)
+    found = index.whole.log_masses(query, WEIGHTS, CONFIG)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert found.argmax() == 1
 
@@ -354,10 +354,10 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) ->
     pairs = sum(map(len, prototype_sets)) * 16
     for number in range(len(prototype_sets)):
         query = query_at(prototype_sets[number], 5, rng, hypotheses=16)
-        whole = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs))
-        few = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs // 40, scanned=pairs // 10))
+        whole = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs))
+        few = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=pairs // 40, scanned=pairs // 10))
         with ThreadPoolExecutor(1) as helper:
-            halved = index.log_masses(
+            halved = index.whole.log_masses(
                 query, WEIGHTS, CONFIG, SearchLimits(compared=pairs // 40, scanned=pairs // 10), helper=helper
             )
         np.testing.assert_array_equal(halved, few)
@@ -374,8 +374,8 @@ def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> 
     smaller = replace(present(query.profile), log_m=present(query.profile).log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
     index = PlanIndex.from_prototypes(prototype_sets, shipped_cells())
-    assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
-    assert index.log_masses(unknown, WEIGHTS, CONFIG, SearchLimits(compared=2000)).argmax() == 7
+    assert index.whole.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
+    assert index.whole.log_masses(unknown, WEIGHTS, CONFIG, SearchLimits(compared=2000)).argmax() == 7
 
 
 def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]) -> None:
@@ -383,7 +383,7 @@ def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]
     index, rng = PlanIndex.from_prototypes(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
         query = query_at(prototype_sets[3], 1, rng, hypotheses=8)
-        masses = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=compared, scanned=scanned))
+        masses = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=compared, scanned=scanned))
         assert np.isfinite(masses[3])
         np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
 
@@ -426,8 +426,8 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
         for query in queries:
             for compared, scanned in ((10**9, 1), (400, 10**9)):
                 limits = SearchLimits(compared=compared, scanned=scanned)
-                masses = index.log_masses(query, WEIGHTS, CONFIG, limits)
-                expected = fresh.log_masses(query, WEIGHTS, CONFIG, limits)
+                masses = index.whole.log_masses(query, WEIGHTS, CONFIG, limits)
+                expected = fresh.whole.log_masses(query, WEIGHTS, CONFIG, limits)
                 compares_copies_twice = compared < 10**9 and max(wanted) > 40
                 if not compares_copies_twice:
                     np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
@@ -450,7 +450,7 @@ def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes])
         query = query_at(prototype_sets[number], 2, rng, hypotheses=16)
         for compared, scanned in ((pairs, 1), (pairs // 40, pairs), (pairs // 40, pairs // 10)):
             limits = SearchLimits(compared=compared, scanned=scanned, aligned=300)
-            masses, expected = (each.log_masses(query, WEIGHTS, CONFIG, limits) for each in (divided, index))
+            masses, expected = (each.log_masses(query, WEIGHTS, CONFIG, limits) for each in (divided, index.whole))
             np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
 
 
@@ -478,7 +478,7 @@ def test_plans_with_and_without_openings_are_found() -> None:
     index = PlanIndex.from_prototypes(prototype_sets, cells)
     for number in range(12):
         query = query_at(whole[number], 2, rng, hypotheses=8)
-        masses = index.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=3000))
+        masses = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=3000))
         assert (masses > masses[number]).sum() <= (2 if number % 2 else 0)
 
 

@@ -37,7 +37,7 @@ Probed = Mapping[int, Bool[np.ndarray, "l q"]]
 
 @dataclass(frozen=True, eq=False)
 class PlanSearch:
-    """What the stages need to know of a query.
+    """Query, with the settings that all stages of its search share.
 
     Attributes:
         query: the query.
@@ -80,7 +80,7 @@ class Pairs:
     Attributes:
         part: (n,) segments of the shard.
         prototype: (n,) distinct prototypes of the segments.
-        hypothesis: (n,) hypotheses: those of the heading, each with all of the camera height.
+        hypothesis: (n,) hypotheses: k j + i for heading k, height i and j heights.
         cost: (n,) costs, by codes or exact ones.
     """
 
@@ -153,7 +153,7 @@ class SearchLimits:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DividedIndex:
-    """Index of p plans in shards.
+    """Index of p plans in one or more shards.
 
     Attributes:
         shards: the shards, each with the numbers of its plans among all p plans.

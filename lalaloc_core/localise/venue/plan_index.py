@@ -32,9 +32,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.index_search import (
     DividedIndex,
     Pairs,
@@ -42,7 +39,6 @@ from lalaloc_core.localise.venue.index_search import (
     PlanMasses,
     PlanSearch,
     Probed,
-    SearchLimits,
     ShardSizes,
     cheapest,
 )
@@ -219,18 +215,10 @@ class PlanIndex:
         """The sizes of the index."""
         return ShardSizes(len(self), np.sum([part.cell_sizes for part in self.parts], axis=0))
 
-    def log_masses(
-        self,
-        query: Query,
-        weights: MatchingWeights,
-        config: MatchingConfig,
-        limits: SearchLimits | None = None,
-        *,
-        helper: Executor | None = None,
-    ) -> Float[np.ndarray, "p"]:
-        """Return the log of each plan's mass; see `DividedIndex.log_masses`."""
-        whole = DividedIndex(shards=[(self, np.arange(self.plan_count))], step_m=self.step_m, cells=self.cells)
-        return whole.log_masses(query, weights, config, limits, helper=helper)
+    @property
+    def whole(self) -> DividedIndex:
+        """The index to search, with this one as its only shard."""
+        return DividedIndex(shards=[(self, np.arange(self.plan_count))], step_m=self.step_m, cells=self.cells)
 
     def scan(
         self, search: PlanSearch, probed: Probed | None, per_hypothesis: int, count: int, helper: Executor | None = None
