@@ -20,9 +20,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
@@ -37,6 +38,8 @@ HEADING_WITHIN = np.radians(5.0)
 NEGLIGIBLE = 12.0
 # Lattice step (m) on which the places of a probability map are merged.
 _MAP_STEP_M = 0.01
+# More than the rounding of coordinates.
+_ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,6 +128,28 @@ def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.nd
     return np.log(areas_m2[poses.room_index] / count[poses.room_index])
 
 
+class SortedPlaces:
+    """Places sorted by x, as a venue has tens of thousands, few of which are near a candidate."""
+
+    def __init__(self, position: Float[np.ndarray, "m 2"], heading: Float[np.ndarray, "m"], query: Query) -> None:
+        self._order = np.argsort(position[:, 0])
+        self._x_m, self._y_m = np.ascontiguousarray(position[self._order].T)
+        self._heading, self._query = heading, query
+
+    def within(self, centre: Float[np.ndarray, "2"], distance_m: float) -> Int[np.ndarray, "n"]:
+        """Return the numbers, rising, of the places near a point."""
+        reach_m = distance_m + _ROUNDING_M
+        begin, end = np.searchsorted(self._x_m, (centre[0] - reach_m, centre[0] + reach_m))
+        x_m, y_m = self._x_m[begin:end] - centre[0], self._y_m[begin:end] - centre[1]
+        return np.sort(self._order[begin:end][x_m * x_m + y_m * y_m < distance_m * distance_m])
+
+    def near(self, candidate: Candidate, distance_m: float) -> Int[np.ndarray, "n"]:
+        """Return the numbers, rising, of the places near a candidate and at about its heading."""
+        near = self.within(candidate.position_m, distance_m)
+        turned = wrap_angle(self._heading[near] - self._query.roll[candidate.hypothesis] - candidate.frame_heading)
+        return near[np.abs(turned) <= HEADING_SEPARATION]
+
+
 @dataclass(frozen=True, eq=False)
 class WeightedPlaces:
     """Probable places of a query after some modes of the grid were refined; see `posterior_from_weights`."""
@@ -135,7 +160,7 @@ class WeightedPlaces:
     heading: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
     poses: int
-    counted: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]
+    counted: SortedPlaces
 
     def posterior(self, candidates: Sequence[Candidate]) -> Posterior:
         """Return the posterior with the probabilities of candidates, the answer first."""
@@ -159,7 +184,8 @@ def weighted_places(
     the radius of a mode.
     """
     lowest = float(grid.total.min())
-    gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
+    moves = list(zip(starts, ends, strict=True))
+    gains = [start.total_cost - end.total_cost for start, end in moves]
     usual = float(np.median(gains)) if gains else 0.0
     best = min([lowest - usual, *(end.total_cost for end in ends)])
     pair = np.flatnonzero(temperature * (grid.total - max(gains, default=0.0) - best) < NEGLIGIBLE)
@@ -167,12 +193,11 @@ def weighted_places(
     position = grid.poses.position_m[pose]
     heading = query.roll[hypothesis] + query.frame_heading
     mode = _modes(position, heading, starts, query, separation_m)
-    gain = np.full(len(cost), usual)
-    for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        member = mode == index
-        gain[member] = gains[index]
-        position[member] += end.position_m - start.position_m
-        heading[member] += end.frame_heading - start.frame_heading
+    # The last row is for pairs of no mode.
+    gain = np.array([*gains, usual])[mode]
+    shifts = [(*(end.position_m - start.position_m), end.frame_heading - start.frame_heading) for start, end in moves]
+    shift = np.array([*shifts, (0.0, 0.0, 0.0)])[mode]
+    position, heading = position + shift[:, :2], heading + shift[:, 2]
     log_weight = -temperature * (cost - gain) + prior[pose]
     counted = position, heading
     if ends:
@@ -189,7 +214,7 @@ def weighted_places(
         heading=heading,
         weight=weight,
         poses=len(grid.poses),
-        counted=counted,
+        counted=SortedPlaces(*counted, query),
     )
 
 
@@ -201,9 +226,9 @@ def _modes(
     separation_m: float,
 ) -> Int[np.ndarray, "m"]:
     """Return the first candidate near each pair and at about its heading; -1 for none."""
-    mode = np.full(len(position), -1)
+    mode, places = np.full(len(position), -1), SortedPlaces(position, heading, query)
     for index, start in reversed(list(enumerate(starts))):
-        mode[_near(position, heading, query, start, separation_m)] = index
+        mode[places.near(start, separation_m)] = index
     return mode
 
 
@@ -212,10 +237,10 @@ def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int
     head = np.arange(len(ends))
     position = np.stack([end.position_m for end in ends])
     heading = np.array([query.roll[end.hypothesis] + end.frame_heading for end in ends])
-    left = np.ones(len(ends), bool)
+    left, places = np.ones(len(ends), bool), SortedPlaces(position, heading, query)
     for index in ranking(np.array([end.total_cost for end in ends]), position, heading):
         if left[index]:
-            same = _near(position, heading, query, ends[index], separation_m)
+            same = places.near(ends[index], separation_m)
             same = same[left[same]]
             head[same] = index
             left[same] = False
@@ -233,11 +258,13 @@ def _width_corrections(
     The number of grid poses that fit a mode depends on where the lattice lies, and differs between copies of one room.
     `mode` is the refined candidate of each pair, -1 for none, and `depth` the cost of each refined candidate.
     """
-    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(depth))]
+    correction, order = np.zeros(len(log_weight)), np.argsort(mode, kind="stable")
+    bounds = np.searchsorted(mode[order], np.arange(len(depth) + 1))
+    members = [order[begin:end] for begin, end in pairwise(bounds)]
     width = {
         index: np.logaddexp.reduce(log_weight[member]) + temperature * depth[index]
         for index, member in enumerate(members)
-        if member.any()
+        if len(member)
     }
     if width:
         deepest = min(depth[index] for index in width)
@@ -271,26 +298,6 @@ def _ties_at_their_ends(
     return position, heading
 
 
-def _near(
-    position: Float[np.ndarray, "m 2"],
-    heading: Float[np.ndarray, "m"],
-    query: Query,
-    candidate: Candidate,
-    distance_m: float,
-) -> Int[np.ndarray, "n"]:
-    """Return the numbers of the places near a candidate and at about its heading."""
-    near = np.flatnonzero(_within(position, candidate.position_m, distance_m))
-    turned = wrap_angle(heading[near] - query.roll[candidate.hypothesis] - candidate.frame_heading)
-    return near[np.abs(turned) <= HEADING_SEPARATION]
-
-
-def _within(
-    position: Float[np.ndarray, "m 2"], centre: Float[np.ndarray, "2"], distance_m: float
-) -> Bool[np.ndarray, "m"]:
-    x_m, y_m = position[:, 0] - centre[0], position[:, 1] - centre[1]
-    return x_m * x_m + y_m * y_m < distance_m * distance_m
-
-
 def posterior_from_weights(
     query: Query,
     candidates: Sequence[Candidate],
@@ -300,7 +307,7 @@ def posterior_from_weights(
     heading: Float[np.ndarray, "m"],
     weight: Float[np.ndarray, "m"],
     poses: int,
-    counted: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]] | None = None,
+    counted: SortedPlaces | None = None,
 ) -> Posterior:
     """Return the posterior of weighted places.
 
@@ -308,27 +315,21 @@ def posterior_from_weights(
     `weight` is one. `candidates` are those whose probability is wanted, the answer first; they count the places by
     `counted` (default: `position` and `heading`).
     """
-    counted_position, counted_heading = (position, heading) if counted is None else counted
-    near = _within(counted_position, candidates[0].position_m, RIGHT_WITHIN_M)
+    places = counted or SortedPlaces(position, heading, query)
+    near = places.within(candidates[0].position_m, RIGHT_WITHIN_M)
     return Posterior(
         pose=np.bincount(pose, weight, minlength=poses),
         position=min(float(weight[near].sum()), 1.0),
-        candidate=_shares(counted_position, counted_heading, weight, query, candidates),
+        candidate=_shares(places, weight, candidates),
         heading=_heading_share(heading, weight, query, candidates),
         support=Support(pose, position, weight),
     )
 
 
-def _shares(
-    position: Float[np.ndarray, "m 2"],
-    heading: Float[np.ndarray, "m"],
-    weight: Float[np.ndarray, "m"],
-    query: Query,
-    candidates: Sequence[Candidate],
-) -> tuple[float, ...]:
+def _shares(places: SortedPlaces, weight: Float[np.ndarray, "m"], candidates: Sequence[Candidate]) -> tuple[float, ...]:
     left, shares = weight.copy(), []
     for candidate in candidates:
-        near = _near(position, heading, query, candidate, RIGHT_WITHIN_M)
+        near = places.near(candidate, RIGHT_WITHIN_M)
         shares.append(float(left[near].sum()))
         left[near] = 0.0
     return tuple(shares)

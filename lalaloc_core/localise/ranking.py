@@ -71,10 +71,13 @@ def suppress(
         if len(kept) >= limit and not cost[index] < ceiling:
             break
         kept.append(index)
-        apart = np.linalg.norm(position_m[remaining] - position_m[index], axis=1) >= separation_m
+        x_m, y_m = (position_m[remaining] - position_m[index]).T
+        near = np.flatnonzero(np.sqrt(x_m * x_m + y_m * y_m) < separation_m)
         if heading is not None:
-            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > HEADING_SEPARATION
-            apart[0] = False
+            turned = wrap_angle(heading[remaining[near]] - heading[index])
+            near = near[np.abs(turned) <= HEADING_SEPARATION]
+        apart = np.ones(len(remaining), bool)
+        apart[near] = apart[0] = False
         remaining = remaining[apart]
     return kept
 

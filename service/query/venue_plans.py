@@ -151,14 +151,14 @@ class VenuePlans:
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
         """Return chosen plans with their pose grids, without those that were deleted or replaced meanwhile."""
         keys = {row.revision_id: self._grids.key(row.revision_id, row.camera_height_m) for row in members}
-        plans = self._store.plans
-        found = await self._reads.run(tenant, plans.find_revisions, tenant, list(keys))
-
-        def parsed() -> dict[str, PlanRecord]:
-            return {revision_id: plans.record(plan) for revision_id, plan in found.items()}
-
-        in_memory = all(plan.is_parsed for plan in found.values())
-        records = parsed() if in_memory else await self._reads.process(tenant, parsed)
+        in_memory = [self._store.plan_cache.get(tenant, row.plan_id, row.revision_id) for row in members]
+        records = {record.revision_id: record for record in in_memory if record is not None}
+        if len(records) < len(keys):
+            plans = self._store.plans
+            missing = [revision_id for revision_id in keys if revision_id not in records]
+            found = await self._reads.run(tenant, plans.find_revisions, tenant, missing)
+            parsed = await self._reads.process(tenant, list, map(plans.record, found.values()))
+            records |= {record.revision_id: record for record in parsed}
         grids = {key: grid for key in keys.values() if (grid := self._grids.cached(key)) is not None}
         if len(grids) < len(keys):
             missing = [key for key in keys.values() if key not in grids]

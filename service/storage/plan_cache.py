@@ -26,10 +26,10 @@ class PlanCache:
         """Keep a plan at its current revision, as of now."""
         self._records.put((record.tenant, record.id), (record, monotonic()))
 
-    def plan(self, tenant: str, plan_id: str, revision_id: str) -> FloorPlan | None:
+    def get(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
         """Return a plan if it is in memory at this revision."""
         entry = self._records.get((tenant, plan_id))
-        return None if entry is None or entry[0].revision_id != revision_id else entry[0].plan
+        return None if entry is None or entry[0].revision_id != revision_id else entry[0]
 
     def recent(self, tenant: str, plan_id: str, max_age_s: float) -> PlanRecord | None:
         """Return a plan that was read or stored within `max_age_s` (s)."""

@@ -198,17 +198,14 @@ class Plans:
                     own = FLOORPLANS.c.tenant == tenant, columns.id.in_(wanted[first : first + _BATCH_SIZE])
                     found = connection.execute(_select_heads(current=current).where(*own))
                     rows |= {row.revision_id: (row, current) for row in found}
-            plans = {key: self._cache.plan(tenant, row.id, key) for key, (row, _) in rows.items()}
-            unknown = [revision_id for revision_id, plan in plans.items() if plan is None]
+            known = {key: self._cache.get(tenant, row.id, key) for key, (row, _) in rows.items()}
+            unknown = [revision_id for revision_id, record in known.items() if record is None]
             for first in range(0, len(unknown), _BATCH_SIZE):
                 query = select(columns.id, columns.document, columns.document_sha256, columns.warnings)
                 for row in connection.execute(query.where(columns.id.in_(unknown[first : first + _BATCH_SIZE]))):
                     documents[row.id] = PlanDocument(row.document, row.document_sha256, row.warnings)
-        return {
-            revision_id: FoundPlan(row, plan, current)
-            for revision_id, (row, current) in rows.items()
-            if (plan := plans[revision_id] or documents.get(revision_id)) is not None
-        }
+        plans = documents | {key: record.plan for key, record in known.items() if record is not None}
+        return {key: FoundPlan(row, plans[key], current) for key, (row, current) in rows.items() if key in plans}
 
     def record(self, found: FoundPlan) -> PlanRecord:
         """Parse a plan unless it is in memory. This is slow for large plans, and does not touch the database.
@@ -365,8 +362,8 @@ class Plans:
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
-        if (plan := self._cache.plan(row.tenant, row.id, row.revision_id)) is not None:
-            return FoundPlan(row, plan, current)
+        if (known := self._cache.get(row.tenant, row.id, row.revision_id)) is not None:
+            return FoundPlan(row, known.plan, current)
         return FoundPlan(row, _document(connection, row.revision_id), current)
 
 

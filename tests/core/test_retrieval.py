@@ -449,3 +449,12 @@ def test_lowest_costs_of_slices_equal_those_of_the_whole(seed: int, limit: int) 
     finite = np.sort(cost[np.isfinite(cost)])
     np.testing.assert_array_equal(found, finite[:limit])
     np.testing.assert_array_equal(cost.ravel()[pair], found)
+
+
+@given(seeds(), st.integers(0, 40))
+def test_equal_costs_are_ordered_by_pair(seed: int, poses: int) -> None:
+    cost = np.random.default_rng(seed).integers(0, 20, (poses, 3)) / 8.0
+    lowest = LowestCosts(1000)
+    lowest.offer(np.arange(poses), cost)
+    _, pair = lowest.ranked()
+    np.testing.assert_array_equal(pair, np.argsort(cost.ravel(), kind="stable"))
