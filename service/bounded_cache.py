@@ -39,6 +39,11 @@ class BoundedCache(Generic[K, V]):
         self._making = SingleFlight[K, Any]()
 
     @property
+    def limit_bytes(self) -> int:
+        """Maximum total size of the values in bytes."""
+        return int(self._values.maxsize)
+
+    @property
     def bytes(self) -> int:
         """Total size of the values in bytes."""
         return int(self._values.currsize)

@@ -23,14 +23,13 @@ from service.schemas import PlanStatus
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes
+from service.storage.plan_cache import UNREAD_SHARE
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.tenancy.fair_share import FairSemaphore
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16
-# Share of the cache that small grids may fill before a query reads them.
-_UNREAD_SHARE = 1.0 / 32.0
 # Maximum size of all pose grids that are computed during the upload of several plans, in `inline_grid_poses`: a second
 # or two of a core, and 0.6 kB per pose until they are stored.
 _INLINE_TOTAL = 80
@@ -232,7 +231,7 @@ class GridProvider:
         """
         if prepared is not None:
             is_small, limit_bytes = len(prepared.grid.poses) <= RENDERED, self._settings.storage.grid_cache_bytes
-            if not is_small or self._cache.bytes < _UNREAD_SHARE * limit_bytes:
+            if not is_small or self._cache.bytes < UNREAD_SHARE * limit_bytes:
                 self._cache.put(prepared.key(record.revision_id), prepared.grid)
             return
         # A grid that cannot be queued now is queued later, here or by another replica.

@@ -8,6 +8,9 @@ from lalaloc_core.floorplan import FloorPlan
 from service.bounded_cache import BoundedCache
 from service.storage.records import PlanRecord
 
+# Share of a cache that plans and grids may fill before a query reads them.
+UNREAD_SHARE = 1.0 / 32.0
+
 
 class PlanCache:
     """Plans by tenant and id, bounded in bytes; safe to share between threads."""
@@ -25,6 +28,11 @@ class PlanCache:
     def put(self, record: PlanRecord) -> None:
         """Keep a plan at its current revision, as of now."""
         self._records.put((record.tenant, record.id), (record, monotonic()))
+
+    def put_unread(self, record: PlanRecord) -> None:
+        """Keep a new plan in a share of the cache, so that thousands do not displace those that queries use."""
+        if self._records.bytes < UNREAD_SHARE * self._records.limit_bytes:
+            self.put(record)
 
     def get(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
         """Return a plan if it is in memory at this revision."""

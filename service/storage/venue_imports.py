@@ -58,7 +58,7 @@ class VenueImports:
 
         Args:
             database: the database.
-            cache: receives every plan that is stored.
+            cache: receives the plans that are stored, as far as it has room for unread ones.
             quota: counts the stored bytes.
         """
         self._database = database
@@ -171,7 +171,7 @@ class VenueImports:
 
     def _cached(self, records: list[PlanRecord]) -> list[PlanRecord]:
         for record in records:
-            self._cache.put(record)
+            self._cache.put_unread(record)
         return records
 
 

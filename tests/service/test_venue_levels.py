@@ -19,6 +19,7 @@ from benchmarks.large_venue import random_home
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import UnknownVenueError
 from service.storage.database import Database
+from service.storage.plan_cache import plan_bytes
 from service.storage.records import Original
 from service.storage.store import Store
 from service.storage.venue_imports import NewPlan
@@ -327,6 +328,18 @@ def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: Data
 def new_plans(count: int = 3) -> list[NewPlan]:
     plans = [FloorPlan.from_dict(FLAT | {"name": f"Level {number}"}) for number in range(count)]
     return [NewPlan(plan=plan, level=float(level), original=Original(b"{}")) for level, plan in enumerate(plans)]
+
+
+def test_plans_of_a_long_file_do_not_displace_those_in_use(tmp_path: Path) -> None:
+    cache_bytes = 30 * plan_bytes(FloorPlan.from_dict(FLAT))
+    store = Store(f"sqlite:///{tmp_path / 'store.sqlite3'}", plan_cache_bytes=cache_bytes)
+    used = store.plans.add("t", "used", FloorPlan.from_dict(FLAT), original=Original(b"{}"), limit=99)
+    store.venue_imports.add("t", uuid.uuid4().hex, "street", new_plans(60), max_plans=99, max_venues=9)
+    assert store.plan_cache.revisions() == {used.revision_id}
+    read = store.plans.list_plans("t", limit=99)[0]
+    assert store.plans.get("t", read.id) is not None
+    assert store.plan_cache.revisions() == {used.revision_id, read.revision_id}
+    store.close()
 
 
 def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: DatabaseOf) -> None:
