@@ -24,13 +24,13 @@ demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
 	$(BIN)/python -m examples.serve --port $(PORT)
 
-# Two processes with one thread each; each takes over tests of the other when it has no more of its own. Browsers need an
-# otherwise idle machine, so their tests are last and alone; they run even if others fail.
+# Three processes with one thread each keep two cores busy, as many tests wait; a process without tests takes over those
+# of others. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
 ALONE := tests/web
 test: $(STAMP) ## lint, build the site, run the tests
 	$(MAKE) --no-print-directory -j 2 lint site
 	@status=0; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ALONE:%=--ignore=%) || status=1; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal $(ALONE:%=--ignore=%) || status=1; \
 	$(BIN)/python -m pytest $(ALONE) || status=1; \
 	exit $$status
 
