@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
+from weakref import WeakValueDictionary
 
 import numpy as np
 from cachetools import LRUCache
@@ -102,6 +104,8 @@ class PlanIndices:
         )
         # Keys of the last index of all plans of a venue that are ready, which the next one begins with.
         self._latest: LRUCache[str, bytes] = LRUCache(_MAX_LATEST)
+        # One query at a time makes the index with a key.
+        self._turns: WeakValueDictionary[bytes, asyncio.Lock] = WeakValueDictionary()
         self._file: PrototypeFile | None = None
         self._building = threading.Lock()
 
@@ -121,15 +125,10 @@ class PlanIndices:
         digest = ready.digest
         indexed = self._indices.get(digest)
         if indexed is None:
-            latest = None if venue_id is None else self._latest.get(venue_id)
-            base = None if latest is None else self._indices.get(latest)
-            if base is not None and 2 * int((base.numbers(ready) >= 0).sum()) < max(len(ready), len(base.keys)):
-                base = None
-            indexed = await self._make_index(tenant, ready, compute, base)
-            if base is not None and latest != digest:
-                # Queries in progress keep it; most of its memory is in the new one as well.
-                self._indices.drop(lambda key, _: key == latest)
-            self._indices.put(digest, indexed)
+            # Other queries wait, and find what the first one made.
+            async with self._turns.setdefault(digest, asyncio.Lock()):
+                latest = None if venue_id is None else self._latest.get(venue_id)
+                indexed = self._indices.get(digest) or await self._make_index(tenant, ready, compute, latest)
         if venue_id is not None:
             self._latest[venue_id] = digest
         if len(indexed.keys) == len(ready):
@@ -145,8 +144,11 @@ class PlanIndices:
         if self._file is not None:
             self._file.close()
 
-    async def _make_index(self, tenant: str, ready: PlanList, compute: Compute, base: Indexed | None) -> Indexed:
-        """Return the index of plans, beginning with that of most of them if there is one."""
+    async def _make_index(self, tenant: str, ready: PlanList, compute: Compute, latest: bytes | None) -> Indexed:
+        """Return the index of plans, beginning with the one with the key `latest` if it has most of them."""
+        base = None if latest is None else self._indices.get(latest)
+        if base is not None and 2 * int((base.numbers(ready) >= 0).sum()) < max(len(ready), len(base.keys)):
+            base = None
         is_known = np.zeros(len(ready), bool) if base is None else base.numbers(ready) >= 0
         unknown = [ready[k] for k in np.flatnonzero(~is_known).tolist()]
         found = await compute(partial(self._in_file, unknown))
@@ -156,15 +158,24 @@ class PlanIndices:
         if not there:
             # All were deleted or replaced just now; a retry finds the current ones.
             raise StoreUnavailableError
+
+        def kept(make: Callable[[], PlanIndex]) -> Indexed:
+            # On the thread of the computation, which ends even if the query's deadline passes.
+            indexed = Indexed(there.keys, make())
+            if base is not None:
+                # Queries in progress keep it; most of its memory is in the new one as well.
+                self._indices.drop(lambda key, _: key == latest)
+            self._indices.put(ready.digest, indexed)
+            return indexed
+
         try:
-            index = await compute(partial(self._indexed, there, fresh, base))
+            return await compute(partial(kept, partial(self._indexed, there, fresh, base)))
         except _NotInFileError:
             if base is not None:
                 return await self._make_index(tenant, ready, compute, None)
             # The file has no room for all of them, so this index keeps them in memory.
             fresh |= await self._fetched(tenant, [row for row in there if _key(row) not in fresh])
-            index = await compute(partial(self._in_memory, there, fresh))
-        return Indexed(there.keys, index)
+            return await compute(partial(kept, partial(self._in_memory, there, fresh)))
 
     def _in_file(self, ready: Sequence[Row[Any]]) -> dict[BlockKey, tuple[int, int]]:
         with self._building:

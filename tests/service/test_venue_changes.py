@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,8 +17,11 @@ from sqlalchemy import update
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.render.sampling import PoseSet
+from service.bounded_cache import BoundedCache
 from service.query import venue_plans
+from service.query.plan_indices import Indexed
 from service.query.venue_plans import VenuePlans
 from service.storage import Store
 from service.storage.records import GridKey, Original, VenueMember
@@ -158,6 +162,58 @@ def test_other_changes_leave_the_rows_in_memory(replicas: list[Replica], monkeyp
     monkeypatch.setattr(first.store.venues, "searchable_plans", lambda *_: pytest.fail("read of the rows"))
     second.store.plans.add(TENANT, "a" * 32, FloorPlan.from_dict(FLAT), original=Original(b"{}"), limit=99)
     assert first.rows() == before
+
+
+@pytest.mark.one_replica
+def test_first_queries_share_one_index(
+    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
+    built, build = [], PlanIndex.build
+
+    def counted(*args: Any, **options: Any) -> PlanIndex:
+        built.append(1)
+        # Long enough for the other queries to arrive.
+        time.sleep(1.0)
+        return build(*args, **options)
+
+    monkeypatch.setattr(PlanIndex, "build", counted)
+    with start_app(tmp_path, request_deadline_s=120.0) as client, ThreadPoolExecutor(4) as threads:
+        venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
+        answers = threads.map(lambda _: ask(client, venue_id, panorama, refine="none"), range(4))
+        assert [answer.status_code for answer in answers] == [200] * 4
+    assert len(built) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.one_replica
+def test_index_is_kept_for_the_next_query_if_the_first_misses_its_deadline(
+    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
+    built, build, missed = [], PlanIndex.build, threading.Event()
+    put, kept = BoundedCache.put, threading.Event()
+
+    def slow(*args: Any, **options: Any) -> PlanIndex:
+        built.append(1)
+        missed.wait(60.0)
+        return build(*args, **options)
+
+    def observed(cache: BoundedCache[Any, Any], key: Any, value: Any) -> int:
+        evictions = put(cache, key, value)
+        if isinstance(value, Indexed):
+            kept.set()
+        return evictions
+
+    monkeypatch.setattr(PlanIndex, "build", slow)
+    monkeypatch.setattr(BoundedCache, "put", observed)
+    with start_app(tmp_path, request_deadline_s=6.0) as client:
+        venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
+        assert ask(client, venue_id, panorama, refine="none").status_code == 504
+        missed.set()
+        assert kept.wait(60.0)
+        assert ask(client, venue_id, panorama, refine="none").status_code == 200
+    assert len(built) == 1
 
 
 @pytest.mark.one_replica
