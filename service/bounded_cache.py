@@ -14,6 +14,9 @@ K = TypeVar("K")
 V = TypeVar("V")
 M = TypeVar("M")
 
+# Share of a cache that values may fill before anybody asks for them.
+_UNREAD_SHARE = 1.0 / 32.0
+
 
 class _CountingLruCache(LRUCache[K, V]):
     """LRU cache that counts evictions."""
@@ -39,11 +42,6 @@ class BoundedCache(Generic[K, V]):
         self._making = SingleFlight[K, Any]()
 
     @property
-    def limit_bytes(self) -> int:
-        """Maximum total size of the values in bytes."""
-        return int(self._values.maxsize)
-
-    @property
     def bytes(self) -> int:
         """Total size of the values in bytes."""
         return int(self._values.currsize)
@@ -61,6 +59,11 @@ class BoundedCache(Generic[K, V]):
             if self._values.getsizeof(value) <= self._values.maxsize:
                 self._values[key] = value
             return self._values.evictions - before
+
+    def put_unread(self, key: K, value: V) -> None:
+        """Store a value that nobody asked for, in a share of the cache: thousands do not displace those in use."""
+        if self.bytes < _UNREAD_SHARE * self._values.maxsize:
+            self.put(key, value)
 
     def get_or_make(self, key: K, make: Callable[[], M]) -> V | M:
         """Return a value; if it is missing, make and store it, once for all threads that ask meanwhile.

@@ -23,7 +23,6 @@ from service.schemas import PlanStatus
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes
-from service.storage.plan_cache import UNREAD_SHARE
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.tenancy.fair_share import FairSemaphore
@@ -230,9 +229,8 @@ class GridProvider:
         of thousands of homes does not displace the grids that queries use.
         """
         if prepared is not None:
-            is_small, limit_bytes = len(prepared.grid.poses) <= RENDERED, self._settings.storage.grid_cache_bytes
-            if not is_small or self._cache.bytes < UNREAD_SHARE * limit_bytes:
-                self._cache.put(prepared.key(record.revision_id), prepared.grid)
+            put = self._cache.put_unread if len(prepared.grid.poses) <= RENDERED else self._cache.put
+            put(prepared.key(record.revision_id), prepared.grid)
             return
         # A grid that cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):

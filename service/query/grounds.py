@@ -151,6 +151,7 @@ class Grounds:
             form=query.document,
             hints=ready.hints,
             warnings=ready.warnings,
+            context=query.context,
             compute=compute,
             favour=partial(_favour, by_plan, levels),
         )

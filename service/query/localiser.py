@@ -17,7 +17,7 @@ from lalaloc_core.localise.pipeline import Localisation, localise_steps
 from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
 from lalaloc_core.localise.sequence import SequenceJob
 from lalaloc_core.photograph import View
-from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
+from service.errors import PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
 from service.query.answers import compose_answer, locate_in, posterior_answer
@@ -241,11 +241,8 @@ class Localiser:
         Raises:
             DeadlineExceededError: the deadline passed.
         """
-        try:
-            async with asyncio.timeout(max(context.left_s, 0.0)):
-                return await self._threads.run(context.client, work)
-        except TimeoutError as error:
-            raise DeadlineExceededError(context.limit_s) from error
+        async with context.bounded():
+            return await self._threads.run(context.client, work)
 
     async def run_search(self, steps: SearchSteps[T], context: QueryContext) -> T:
         """Run a search on the compute threads; it holds none in its pauses (None) and while a worker refines poses."""

@@ -160,13 +160,15 @@ class PlanIndices:
             raise StoreUnavailableError
 
         def kept(make: Callable[[], PlanIndex]) -> Indexed:
-            # On the thread of the computation, which ends even if the query's deadline passes.
-            indexed = Indexed(there.keys, make())
-            if base is not None:
-                # Queries in progress keep it; most of its memory is in the new one as well.
-                self._indices.drop(lambda key, _: key == latest)
-            self._indices.put(ready.digest, indexed)
-            return indexed
+            def indexed() -> Indexed:
+                made = Indexed(there.keys, make())
+                if base is not None:
+                    # Queries in progress keep it; most of its memory is in the new one as well.
+                    self._indices.drop(lambda key, _: key == latest)
+                return made
+
+            # Once on all threads: this one makes it to the end, even if its query misses the deadline.
+            return self._indices.get_or_make(ready.digest, indexed)
 
         try:
             return await compute(partial(kept, partial(self._indexed, there, fresh, base)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Protocol, Self
@@ -12,6 +14,7 @@ from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.photograph import View
+from service.errors import DeadlineExceededError
 from service.pools import PoolState
 from service.schemas import (
     EarthPoint,
@@ -81,6 +84,19 @@ class QueryContext:
     def left_s(self) -> float:
         """Time (s) until the deadline; negative past it."""
         return self.deadline - monotonic()
+
+    @asynccontextmanager
+    async def bounded(self) -> AsyncIterator[None]:
+        """End the block at the deadline.
+
+        Raises:
+            DeadlineExceededError: the deadline passed.
+        """
+        try:
+            async with asyncio.timeout(max(self.left_s, 0.0)):
+                yield
+        except TimeoutError as error:
+            raise DeadlineExceededError(self.limit_s) from error
 
     def __reduce__(self) -> tuple[Callable[..., QueryContext], tuple[str, float, float]]:
         return _received, (self.client, self.deadline - self.begin, self.spent_s)

@@ -96,6 +96,7 @@ class VenueLocaliser:
                         form=form,
                         hints=hints,
                         warnings=warnings,
+                        context=context,
                         compute=partial(self._localiser.compute, context),
                         # Measured motions must not lead from one plan to its neighbour.
                         gap_m=GAP_M + max(map(_reach_m, form.steps(count))),
@@ -169,7 +170,7 @@ class VenueLocaliser:
         encoded = (await compute(partial(encode, self._encoder, [photograph], [known], height, clock)))[0]
         with clock.stage("shortlist"):
             searched = await self._search.searched(
-                venue, ready, [encoded], form=form, hints=hints, warnings=warnings, compute=compute
+                venue, ready, [encoded], form=form, hints=hints, warnings=warnings, context=context, compute=compute
             )
         steps = localise_steps(
             searched.merged.plan,

@@ -149,7 +149,10 @@ class VenuePlans:
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
-        """Return chosen plans with their pose grids, without those that were deleted or replaced meanwhile."""
+        """Return chosen plans with their pose grids.
+
+        Plans that are not in memory are left out if they were deleted or replaced since their rows were read.
+        """
         keys = {row.revision_id: self._grids.key(row.revision_id, row.camera_height_m) for row in members}
         in_memory = [self._store.plan_cache.get(tenant, row.plan_id, row.revision_id) for row in members]
         records = {record.revision_id: record for record in in_memory if record is not None}
@@ -157,7 +160,7 @@ class VenuePlans:
             plans = self._store.plans
             missing = [revision_id for revision_id in keys if revision_id not in records]
             found = await self._reads.run(tenant, plans.find_revisions, tenant, missing)
-            parsed = await self._reads.process(tenant, list, map(plans.record, found.values()))
+            parsed = await self._reads.process(tenant, lambda: [plans.record(plan) for plan in found.values()])
             records |= {record.revision_id: record for record in parsed}
         grids = {key: grid for key in keys.values() if (grid := self._grids.cached(key)) is not None}
         if len(grids) < len(keys):

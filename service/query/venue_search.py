@@ -135,6 +135,7 @@ class VenueSearch:
         form: CameraFields,
         hints: VenueHints,
         warnings: list[str],
+        context: QueryContext,
         compute: Callable[..., Any],
         favour: Favour | None = None,
         gap_m: float = GAP_M,
@@ -148,6 +149,7 @@ class VenueSearch:
             form: the stated camera height.
             hints: the hints.
             warnings: warnings so far.
+            context: context of the query.
             compute: runs CPU work.
             favour: log factors by which plans are preferred in the choice alone.
             gap_m: distance between the plans in the merged frame.
@@ -156,6 +158,7 @@ class VenueSearch:
             InvalidHintError: strict hints exclude every plan, or no searched plan has a room.
             InvalidPoseError: the camera height is above all ceilings.
             VenueNotReadyError: all plans were deleted meanwhile.
+            DeadlineExceededError: the deadline passed.
         """
         query = max(queries, key=lambda one: len(one.roll))
         rows, log_mass, index = ready, None, list(range(len(ready)))
@@ -163,7 +166,9 @@ class VenueSearch:
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
             whole_venue = venue.id if possible is ready else None
-            known, plan_index = await self._indices.index(venue.tenant, possible, compute, venue_id=whole_venue)
+            # Another query may be making the index, in the time that it has itself.
+            async with context.bounded():
+                known, plan_index = await self._indices.index(venue.tenant, possible, compute, venue_id=whole_venue)
             manifest = self._encoder.networks.manifest
             choosing = [(one, manifest.evidence_for(view=one.is_view)) for one in queries]
             log_prior = hints.log_prior(known, shares)

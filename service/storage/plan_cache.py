@@ -8,9 +8,6 @@ from lalaloc_core.floorplan import FloorPlan
 from service.bounded_cache import BoundedCache
 from service.storage.records import PlanRecord
 
-# Share of a cache that plans and grids may fill before a query reads them.
-UNREAD_SHARE = 1.0 / 32.0
-
 
 class PlanCache:
     """Plans by tenant and id, bounded in bytes; safe to share between threads."""
@@ -30,9 +27,8 @@ class PlanCache:
         self._records.put((record.tenant, record.id), (record, monotonic()))
 
     def put_unread(self, record: PlanRecord) -> None:
-        """Keep a new plan in a share of the cache, so that thousands do not displace those that queries use."""
-        if self._records.bytes < UNREAD_SHARE * self._records.limit_bytes:
-            self.put(record)
+        """Keep one of many new plans; see `BoundedCache.put_unread`."""
+        self._records.put_unread((record.tenant, record.id), (record, monotonic()))
 
     def get(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
         """Return a plan if it is in memory at this revision."""
