@@ -31,7 +31,7 @@ from benchmarks.harness import argument_parser
 from benchmarks.large_venue import measure
 from benchmarks.pairs import bursts_of, differences_of, running_checkout
 from benchmarks.venues import recall
-from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.bundle import Bundle, default_bundle
 
 # Figure, aim, and one value per checkout.
 _Row = tuple[str, str, Sequence[str]]

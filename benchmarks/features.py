@@ -20,12 +20,12 @@ from jaxtyping import Float
 from PIL import Image
 
 from benchmarks.harness import argument_parser
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.image_network import SphereNetwork
+from lalaloc_core.localise.encode.sphere_network import SphereNetwork
 
 _ROWS = 32
 # Sectors on each side of a column whose features the decoder sees.

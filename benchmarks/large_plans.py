@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from benchmarks.harness import argument_parser
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
@@ -26,13 +27,11 @@ from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.poses import PoseGrid, Query
-from lalaloc_core.localise.retrieval import grid_costs
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.search.retrieval import grid_costs
 from service.grids.embedding import embed, grid_bytes
 
 # Buildings are a little larger than asked for; the limit is 200,000 m².

@@ -36,7 +36,7 @@ from benchmarks.venues import recall
 from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, VenuePlan
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.bundle import Bundle
 
 _CLIENTS, _PAGE, _ROUNDS, _FILE = 4, 500, 3, 200
 _TIMEOUT_S = 7200.0

@@ -18,18 +18,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import argument_parser
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, localise
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import Localisation, localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.search import localise_sequence
@@ -104,7 +104,9 @@ def note(tally: Tally, shot: Shot, answer: Localisation, confidence: float | Non
     """Add an answer to the tally."""
     best = answer.candidates[0]
     tally.errors_m.append(float(np.linalg.norm(best.position_m - shot.position_m)))
-    tally.heading_errors_deg.append(abs(math.degrees(wrap_angle(panorama_heading(answer.query, best) - shot.heading))))
+    tally.heading_errors_deg.append(
+        abs(math.degrees(wrap_angle(photograph_heading(answer.query, best) - shot.heading)))
+    )
     tally.confidence.append(confidence or 0.0)
     tally.spent_s.append(spent_s)
 

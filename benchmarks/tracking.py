@@ -28,6 +28,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from benchmarks.harness import argument_parser
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
@@ -42,13 +43,11 @@ from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.pipeline import Refiner, run_steps
-from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.search.pipeline import Refiner, run_steps
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.ground import Ground

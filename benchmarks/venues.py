@@ -31,16 +31,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import argument_parser
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.search.pipeline import localise
 from lalaloc_core.localise.venue.index_search import ALIGNED, COMPARED, SCANNED, SearchLimits
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
@@ -53,10 +52,10 @@ from lalaloc_core.localise.venue.prototypes import (
     unpacked_openings,
 )
 from scripts.make_prototype_cells import grid_without_latents
-from service.query.prototype_file import BlockKey, PrototypeFile
 from service.query.venue_localiser import VENUE_CONFIG
-from service.query.venue_plans import MAX_SEARCHED, most_poses
 from service.settings import Settings
+from service.venues.prototype_file import BlockKey, PrototypeFile
+from service.venues.venue_plans import MAX_SEARCHED, most_poses
 
 _TEST = SPLIT_NUMBERS["test"]
 _FIRST = 20

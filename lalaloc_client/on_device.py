@@ -13,8 +13,8 @@ from lalaloc_client.errors import OnDeviceError
 from lalaloc_client.requests import Photograph, QueryOptions, ViewOptions, picture_file
 
 if TYPE_CHECKING:
-    from lalaloc_core.localise.features import FeatureEncoder
-    from lalaloc_core.photograph import StatedView
+    from lalaloc_core.localise.encode.features import FeatureEncoder
+    from lalaloc_core.photograph import StatedCamera
 
 _CAMERA = frozenset(ViewOptions.__optional_keys__)
 
@@ -32,9 +32,9 @@ class OnDeviceModel:
             OnDeviceError: the extra is not installed, or the service sent no manifest of a model.
         """
         try:
+            from lalaloc_core.bundle import MANIFEST_NAME, Bundle, Manifest
             from lalaloc_core.errors import BundleError
-            from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle, Manifest
-            from lalaloc_core.localise.features import DEVICE_FILES
+            from lalaloc_core.localise.encode.features import DEVICE_FILES
         except ImportError as error:
             raise OnDeviceError(
                 f"on_device=True needs the package '{error.name}': pip install 'lalaloc[onnx]'"
@@ -91,7 +91,7 @@ class OnDeviceModel:
             OnDeviceError: a file is missing or altered, or the model gives no features.
         """
         from lalaloc_core.errors import BundleError
-        from lalaloc_core.localise.features import FeatureEncoder
+        from lalaloc_core.localise.encode.features import FeatureEncoder
 
         try:
             self._encoder = FeatureEncoder(self._bundle)
@@ -104,10 +104,10 @@ class OnDeviceModel:
         Raises:
             OnDeviceError: the photograph cannot be read, or the model gives no features of such photographs.
         """
-        from lalaloc_core.errors import InvalidPanoramaError
-        from lalaloc_core.localise.features import is_features
-        from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
-        from lalaloc_core.photograph import open_view
+        from lalaloc_core.errors import InvalidPhotographError
+        from lalaloc_core.localise.encode.features import is_features
+        from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+        from lalaloc_core.photograph import open_photograph
 
         assert self._encoder is not None
         content = picture_file(photograph)
@@ -115,14 +115,14 @@ class OnDeviceModel:
             return content
         manifest = self._bundle.manifest
         try:
-            view = open_view(
+            view = open_photograph(
                 content,
                 sphere_size=sphere_size(manifest),
                 patch_size=patch_size(manifest),
                 stated=_stated(options),
             )
             return self._encoder.features(view)
-        except InvalidPanoramaError as error:
+        except InvalidPhotographError as error:
             raise OnDeviceError(str(error)) from error
 
 
@@ -132,8 +132,8 @@ def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], 
     return camera, cast("QueryOptions", {name: value for name, value in options.items() if name not in _CAMERA})
 
 
-def _stated(options: Mapping[str, Any]) -> StatedView:
-    from lalaloc_core.photograph import Intrinsics, StatedView
+def _stated(options: Mapping[str, Any]) -> StatedCamera:
+    from lalaloc_core.photograph import Intrinsics, StatedCamera
 
     intrinsics = options.get("intrinsics")
-    return StatedView(**{**options, "intrinsics": None if intrinsics is None else Intrinsics(**intrinsics)})
+    return StatedCamera(**{**options, "intrinsics": None if intrinsics is None else Intrinsics(**intrinsics)})

@@ -13,7 +13,8 @@ The query side:
 `learn/` trains models, `evaluate/` measures them, `cli/` is the command line. All of them use `conventions.py` (axes,
 units, pixels), `errors.py`, `files.py`, `file_kinds.py` and `configuration.py` (dataclasses from plain data).
 
-Begin with `localise/pipeline.py`, the path of a query. Importing this package loads neither torch nor onnxruntime.
+Begin with `localise/search/pipeline.py`, the path of a query. Importing this package loads neither torch nor
+onnxruntime.
 """
 
 __version__ = "0.5.0"

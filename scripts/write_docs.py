@@ -25,7 +25,7 @@ from scripts.figures import (
     uninformative_table,
     views_table,
 )
-from service import cli as service_cli
+from service.cli import entry_point as service_cli
 from service.openapi import openapi_text
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.settings import settings_table

@@ -2,25 +2,26 @@
 
 Begin with `app.py`, the application, and `runtime.py`, its parts; a query begins in `routes/localise.py`.
 
-http/       layer between socket and routes: slots, uploads, idempotency, errors, middleware
-security/   API keys, scopes, rate limits
+http/       layer between socket and routes: uploads, idempotency, errors, middleware
 routes/     HTTP routes
 schemas/    requests and answers of the API
-query/      computation of answers
+query/      photographs to answers, in a plan or a venue
+decoding/   files to photographs, in worker processes
+venues/     the plans of a venue that a photograph is compared with
 grids/      pose grids of plans, computed once for all replicas
+plan_files/ plan files, read and written in worker processes
 storage/    database: plans, pose grids, keys, kept answers
+capacity/   who may compute, send bytes, or hold memory, now
 pools/      pools of worker processes
-workers/    programs of the worker processes
-tenancy/    sharing of CPU time and uploads between tenants
+workers/    common loop of the worker processes
+security/   API keys, scopes, rate limits
 telemetry/  metrics, logs and traces
-renditions/ files made from plans
-conversion/ plan files, read and written in worker processes
+settings/   settings, read from the environment
+cli/        command line
 on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
-Also here: `settings.py`, `setting_groups.py`, `setting_types.py`, `errors.py`, `problem_kinds.py` (errors over HTTP),
-`cores.py` (division of the cores), `threads.py`, `bounded_cache.py`, `stored_plan.py`, `uploaded_file.py`, and the
-command lines `cli.py`, `openapi.py`, `__main__.py`.
+Also here: `errors.py`, `problem_kinds.py` (errors over HTTP), `stored_plan.py`, `uploaded_file.py`, `openapi.py`.
 """
 
 import os

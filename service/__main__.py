@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lalaloc_core.errors import LaLaLocError
-from service.cli import add_serve_arguments, serve
+from service.cli.entry_point import add_serve_arguments, serve
 from service.settings import settings_table
 
 

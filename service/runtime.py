@@ -13,28 +13,28 @@ from fastapi import Request
 from sqlalchemy.engine import make_url
 
 from lalaloc_core import __version__
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from service.conversion import Converter, RenditionCache
-from service.cores import usable_cores
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from service.capacity.admission_control import Admission, AdmissionLimits
+from service.capacity.cores import usable_cores
+from service.capacity.cpu_accounts import PROBES
+from service.capacity.fair_share import FairSemaphore, with_headroom
+from service.capacity.threads import BoundedReads, IdleCores, Threads
+from service.decoding.decoder import Decoder
 from service.grids import GridProvider, Sweeper
-from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
+from service.plan_files.converter import Converter
+from service.plan_files.rendition_cache import RenditionCache
 from service.query import (
-    Decoder,
     Grounds,
-    IndexSource,
     Localiser,
     LocaliserBackend,
     LpoPool,
     OptimiserBackend,
-    PlanIndices,
     SessionTracker,
     TrackerBackend,
     VenueLocaliser,
     VenueLocaliserBackend,
-    VenuePlans,
-    VenueSearch,
 )
 from service.schemas import ModelAnswer
 from service.security import AccessControl, AuditTrail
@@ -43,9 +43,9 @@ from service.storage import PlanLookup, Store, open_store
 from service.storage.records import DEFAULT_TENANT
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
-from service.tenancy.cpu_accounts import PROBES
-from service.tenancy.fair_share import FairSemaphore, with_headroom
-from service.threads import BoundedReads, IdleCores, Threads
+from service.venues.plan_indices import IndexSource, PlanIndices
+from service.venues.venue_plans import VenuePlans
+from service.venues.venue_search import VenueSearch
 
 # Queries read little: a plan, and a pose grid that is not in memory.
 _READ_THREADS = 4

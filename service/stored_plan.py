@@ -16,7 +16,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ExportFormat
 
 if TYPE_CHECKING:
-    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.bundle import Bundle
 
 # Files made from a plan: description (a part of the answer to GET), walls, rooms as SVG without and with the areas that
 # became no room, mesh, exports; which photographs are found, and the map of that for each kind of them.

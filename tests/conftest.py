@@ -56,9 +56,9 @@ def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
     """Return the tiny bundle with an encoder of views, whose weights are random, and the measured errors of another."""
     import dataclasses
 
+    from lalaloc_core.bundle import Bundle, default_bundle, write_manifest
     from lalaloc_core.learn.export.bundle_export import add_view_encoder
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.localise.bundle import Bundle, default_bundle, write_manifest
     from lalaloc_core.nets.view_encoder import ViewEncoder
 
     origin = Bundle.open(tiny_bundle)

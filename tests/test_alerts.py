@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.cli import build_parser
+from service.cli.entry_point import build_parser
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docker" / "grafana"

@@ -29,19 +29,22 @@ LAYERS = {
     # The query side.
     "lalaloc_core.floorplan.earth": 0,
     "lalaloc_core.floorplan": 1,
-    "lalaloc_core.localise.prediction_errors": 1,
-    "lalaloc_core.localise.bundle": 2,
-    "lalaloc_core.panorama": 2,
+    "lalaloc_core.bundle": 2,
     "lalaloc_core.photograph": 3,
     "lalaloc_core.render": 2,
     "lalaloc_core.nets": 3,
     "lalaloc_core.localise": 4,
-    "lalaloc_core.localise.descent": 5,
-    "lalaloc_core.localise.optimise": 6,
-    "lalaloc_core.localise.sequence": 5,
-    "lalaloc_core.localise.venue": 5,
-    "lalaloc_core.localise.tracking": 6,
-    "lalaloc_core.draw": 5,
+    "lalaloc_core.localise.query": 4,
+    "lalaloc_core.localise.match": 5,
+    "lalaloc_core.localise.encode": 6,
+    "lalaloc_core.localise.belief": 6,
+    "lalaloc_core.localise.refine": 7,
+    "lalaloc_core.localise.search": 8,
+    "lalaloc_core.localise.localisability": 9,
+    "lalaloc_core.localise.sequence": 9,
+    "lalaloc_core.localise.venue": 9,
+    "lalaloc_core.localise.tracking": 10,
+    "lalaloc_core.draw": 10,
     "lalaloc_core.importers.common": 2,
     "lalaloc_core.importers.drawing": 3,
     "lalaloc_core.importers.picture": 4,
@@ -58,31 +61,31 @@ LAYERS = {
     "lalaloc_core.learn.synth.furniture": 3,
     "lalaloc_core.learn.synth.augmentation": 4,
     "lalaloc_core.learn.synth.scene": 4,
-    "lalaloc_core.learn.synth.rendering": 5,
+    "lalaloc_core.learn.synth.rendering": 10,
     # Independent of synth; neither imports the other.
     "lalaloc_core.learn.heldout": 3,
-    "lalaloc_core.learn.data": 5,
-    "lalaloc_core.learn.data.synthetic": 6,
-    "lalaloc_core.learn.training": 7,
-    "lalaloc_core.learn.export": 9,
-    "lalaloc_core.learn": 9,
+    "lalaloc_core.learn.data": 10,
+    "lalaloc_core.learn.data.synthetic": 11,
+    "lalaloc_core.learn.training": 12,
+    "lalaloc_core.learn.export": 14,
+    "lalaloc_core.learn": 14,
     # Evaluation.
-    "lalaloc_core.evaluate.methods": 7,
-    "lalaloc_core.evaluate.runs": 8,
-    "lalaloc_core.evaluate.calibrate": 9,
-    "lalaloc_core.evaluate.report": 9,
-    "lalaloc_core.evaluate.reproduce": 10,
-    "lalaloc_core.evaluate.bench": 10,
-    "lalaloc_core.evaluate": 10,
-    "lalaloc_core.cli": 11,
+    "lalaloc_core.evaluate.methods": 12,
+    "lalaloc_core.evaluate.runs": 13,
+    "lalaloc_core.evaluate.calibrate": 14,
+    "lalaloc_core.evaluate.report": 14,
+    "lalaloc_core.evaluate.reproduce": 15,
+    "lalaloc_core.evaluate.bench": 15,
+    "lalaloc_core.evaluate": 15,
+    "lalaloc_core.cli": 16,
     # The client imports nothing from the other packages, except to encode photographs, when it is asked to.
     "lalaloc_client": 0,
-    "lalaloc_client.on_device": 5,
-    "lalaloc_client.asynchronous": 6,
-    "lalaloc_client.blocking": 6,
+    "lalaloc_client.on_device": 9,
+    "lalaloc_client.asynchronous": 10,
+    "lalaloc_client.blocking": 10,
 }
 # Forbidden imports of a package, regardless of layers.
-QUERY_SIDE = ("floorplan", "importers", "panorama", "photograph", "render", "nets", "localise", "draw")
+QUERY_SIDE = ("bundle", "floorplan", "importers", "photograph", "render", "nets", "localise", "draw")
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),
@@ -91,22 +94,26 @@ FORBIDDEN = {
 }
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
-    "tenancy uploaded_file",
-    "cores settings setting_groups setting_types errors problem_kinds schemas stored_plan threads single_flight "
-    "bounded_cache telemetry",
-    "renditions",
-    # `workers` runs in worker processes and does not import their supervisors.
-    "workers",
+    "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.single_flight "
+    "capacity.bounded_cache",
+    "settings errors problem_kinds schemas stored_plan",
+    "telemetry",
+    "capacity",
+    # Programs of worker processes, which do not import their supervisors.
+    "workers plan_files.plan_description plan_files.plan_mesh plan_files.localisability_rendition",
+    "decoding.decode_worker plan_files.renditions",
+    "plan_files.convert_worker",
     "pools storage",
-    "grids security conversion",
-    "http",
+    "grids security decoding plan_files",
+    "http venues",
     "query http.middleware",
     "runtime",
     "routes",
-    "app cli command_parts tenant_commands audit_commands backup_commands openapi __main__",
-    "on_ray",
+    "app openapi",
+    "cli",
+    "__main__ on_ray",
 )
-_LOWEST_OF_SERVICE = 20
+_LOWEST_OF_SERVICE = 30
 LAYERS |= {
     f"service.{name}": _LOWEST_OF_SERVICE + index
     for index, names in enumerate(SERVICE_LAYERS)
@@ -115,7 +122,7 @@ LAYERS |= {
 # Only these packages load torch when imported.
 TORCH_PACKAGES = (
     "lalaloc_core.nets",
-    "lalaloc_core.localise.optimise",
+    "lalaloc_core.localise.refine.latent_refiner",
     "lalaloc_core.learn.synth",
     "lalaloc_core.learn.data.synthetic",
     "lalaloc_core.learn.training",

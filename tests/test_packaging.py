@@ -22,8 +22,8 @@ from packaging.utils import canonicalize_name
 from lalaloc_core import __version__
 from scripts import install_torch
 from scripts.write_locks import extras_of
-from service.cores import share_cores
-from service.http.admission_control import Admission, AdmissionLimits
+from service.capacity.admission_control import Admission, AdmissionLimits
+from service.capacity.cores import share_cores
 from service.routes import ROUTERS
 from service.settings import PREFIX, SETTING_NAMES, Settings
 from service.telemetry import Telemetry

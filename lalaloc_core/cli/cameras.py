@@ -11,10 +11,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPanoramaError
+from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPhotographError
 
 if TYPE_CHECKING:
-    from lalaloc_core.photograph import Assumed, Intrinsics, StatedView, View
+    from lalaloc_core.photograph import Assumed, Intrinsics, Photograph, StatedCamera
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
@@ -65,15 +65,15 @@ def _intrinsics(text: str) -> Intrinsics:
         ) from error
 
 
-def stated_view(arguments: argparse.Namespace) -> StatedView:
+def stated_camera(arguments: argparse.Namespace) -> StatedCamera:
     """Return the statements of `add_camera_options`.
 
     Raises:
-        InvalidPanoramaError: a value is out of range, or two values exclude each other.
+        InvalidPhotographError: a value is out of range, or two values exclude each other.
     """
-    from lalaloc_core.photograph import StatedView
+    from lalaloc_core.photograph import StatedCamera
 
-    stated = StatedView(
+    stated = StatedCamera(
         projection=arguments.projection,
         hfov_deg=arguments.hfov,
         intrinsics=arguments.intrinsics,
@@ -88,15 +88,15 @@ def content_of(path: Path) -> bytes:
     """Return the bytes of a photograph.
 
     Raises:
-        InvalidPanoramaError: the file cannot be read.
+        InvalidPhotographError: the file cannot be read.
     """
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InvalidPanoramaError(f"'{path}' cannot be read: {error.strerror}") from error
+        raise InvalidPhotographError(f"'{path}' cannot be read: {error.strerror}") from error
 
 
-def view_document(view: View) -> dict[str, Any]:
+def view_document(view: Photograph) -> dict[str, Any]:
     """Return what was assumed about a photograph, with the field names of the API."""
 
     def angle(assumed: Assumed) -> dict[str, Any]:
@@ -116,6 +116,6 @@ def named(path: Path) -> Iterator[None]:
     try:
         yield
     except (InvalidFeaturesError, ForeignFeaturesError) as error:
-        raise InvalidPanoramaError(f"'{path}': {error}") from error
-    except InvalidPanoramaError as error:
-        raise InvalidPanoramaError(f"'{path}': {error}; see docs/how-to/take-photographs.md") from error
+        raise InvalidPhotographError(f"'{path}': {error}") from error
+    except InvalidPhotographError as error:
+        raise InvalidPhotographError(f"'{path}': {error}; see docs/how-to/take-photographs.md") from error

@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli.arguments import positive
-from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import atomic_write
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 
 _HEIGHT_M = 1.5
 
@@ -52,18 +52,20 @@ def add_commands(commands: Any) -> None:
 
 
 def _encode(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.localise.features import FeatureEncoder
-    from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
-    from lalaloc_core.photograph import open_view
+    from lalaloc_core.localise.encode.features import FeatureEncoder
+    from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+    from lalaloc_core.photograph import open_photograph
 
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
-    stated, bundle = stated_view(arguments), Bundle.open(arguments.bundle)
+    stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
     for path in arguments.photographs:
         content = content_of(path)
         with named(path):
-            view = open_view(content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest))
+            view = open_photograph(
+                content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
+            )
             features = encoder.features(view)
         out = arguments.out or path.with_suffix(".features")
         try:
@@ -75,9 +77,9 @@ def _encode(arguments: argparse.Namespace) -> None:
 
 def _features(arguments: argparse.Namespace) -> None:
     from lalaloc_core.draw.seen_room import draw_seen_room, seen_room
-    from lalaloc_core.localise.camera_height import CameraHeight
-    from lalaloc_core.localise.features import read_features
-    from lalaloc_core.localise.photograph_encoder import PhotographEncoder
+    from lalaloc_core.localise.encode.features import read_features
+    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+    from lalaloc_core.localise.query import CameraHeight
 
     if arguments.out is not None:
         check_picture_name(arguments.out)

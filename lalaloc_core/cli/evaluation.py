@@ -11,11 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
-from lalaloc_core.localise.bundle import default_bundle
 
 # Ratio of calibration homes to homes that get photographs of other homes.
 _PER_MISMATCHED_HOME = 1
@@ -262,9 +262,9 @@ def _worst(arguments: argparse.Namespace) -> None:
 
 
 def _measure_errors(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.evaluate.bench.prediction_errors import measure_errors, outcomes_of
-    from lalaloc_core.localise.bundle import Bundle
-    from lalaloc_core.localise.localisability import errors_of
+    from lalaloc_core.localise.localisability.predicted_localisability import errors_of
 
     bundle = Bundle.open(arguments.bundle)
     if bundle.manifest.view is None:
@@ -278,6 +278,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     if arguments.errors:
         _measure_errors(arguments)
         return
+    from lalaloc_core.bundle import Bundle, MatchingWeights
     from lalaloc_core.evaluate.appearance import fit_appearance
     from lalaloc_core.evaluate.calibrate import (
         Answers,
@@ -291,9 +292,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluate.runs.run import run_evaluation
     from lalaloc_core.learn.data.synthetic import training_plans
-    from lalaloc_core.localise.bundle import Bundle, MatchingWeights
-    from lalaloc_core.localise.cohort import cohort_of
-    from lalaloc_core.localise.encoders import Encoders
+    from lalaloc_core.localise.encode.encoders import Encoders
+    from lalaloc_core.localise.match import cohort_of
 
     def run_info(generated: dict[str, Any], known: bool, source: str) -> RunInfo:
         heading = "known" if known else "searched"

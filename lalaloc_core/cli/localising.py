@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli.answer_files import add_file_options, check_file_options, write_files
 from lalaloc_core.cli.arguments import heading, positive, tolerance
-from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
-from lalaloc_core.errors import InvalidInputError, InvalidPanoramaError
-from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
     from lalaloc_core.draw.answer import DrawnAnswer
     from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.photograph import StatedView
+    from lalaloc_core.photograph import StatedCamera
 
 _GRID_STEP_M = 0.5
 
@@ -94,7 +94,7 @@ def add_commands(commands: Any) -> None:
 
 def _localise(arguments: argparse.Namespace) -> None:
     from lalaloc_core.draw.answer import draw_answer
-    from lalaloc_core.localise.features import is_features
+    from lalaloc_core.localise.encode.features import is_features
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
         raise InvalidInputError("--heading-tolerance needs --heading, which is missing")
@@ -103,7 +103,7 @@ def _localise(arguments: argparse.Namespace) -> None:
     plan = read_plan(arguments.plan, arguments).plan()
     _check_height(arguments.camera_height, plan)
     check_file_options(arguments, plan)
-    stated, several = stated_view(arguments), len(arguments.photographs) > 1
+    stated, several = stated_camera(arguments), len(arguments.photographs) > 1
     documents, rows, places = [], [], []
     for number, answer in enumerate(_answers(arguments, plan, stated)):
         documents.append(answer.document)
@@ -128,26 +128,28 @@ def _localise(arguments: argparse.Namespace) -> None:
         print_table(_HEAD, rows)
     if len(rows) < len(documents):
         failed = len(documents) - len(rows)
-        raise InvalidPanoramaError(f"{failed} of {len(documents)} photographs were not localised; see the errors above")
+        raise InvalidPhotographError(
+            f"{failed} of {len(documents)} photographs were not localised; see the errors above"
+        )
 
 
-def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedView) -> Iterator[_Found]:
+def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamera) -> Iterator[_Found]:
     """Yield the answers in the order of the photographs, with a progress bar on a terminal.
 
     Raises:
-        InvalidPanoramaError: the only photograph is invalid; one of several becomes an answer with an error.
+        InvalidPhotographError: the only photograph is invalid; one of several becomes an answer with an error.
     """
     from tqdm import tqdm
 
     from lalaloc_core.draw.answer import drawn_answer
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-    from lalaloc_core.localise.features import is_features, read_features
-    from lalaloc_core.localise.information import advice_for, information_bits
-    from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-    from lalaloc_core.localise.pipeline import localise
-    from lalaloc_core.localise.retrieval import build_grid
-    from lalaloc_core.localise.stated_camera import known_heading, stated_height
-    from lalaloc_core.photograph import StatedView, open_view
+    from lalaloc_core.localise.belief import advice_for, information_bits
+    from lalaloc_core.localise.encode.features import is_features, read_features
+    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+    from lalaloc_core.localise.query import known_heading, stated_height
+    from lalaloc_core.localise.search.pipeline import localise
+    from lalaloc_core.localise.search.retrieval import build_grid
+    from lalaloc_core.photograph import StatedCamera, open_photograph
 
     bundle = Bundle.open(arguments.bundle)
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
@@ -165,15 +167,15 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedView)
             content = content_of(path)
             with named(path):
                 if is_features(content):
-                    if stated != StatedView():
-                        raise InvalidPanoramaError("the camera is stated to `lalaloc encode`; leave its options out")
+                    if stated != StatedCamera():
+                        raise InvalidPhotographError("the camera is stated to `lalaloc encode`; leave its options out")
                     view = read_features(content, bundle)
                 else:
-                    view = open_view(
+                    view = open_photograph(
                         content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
                     )
                 encoder.check(view)
-        except InvalidPanoramaError as error:
+        except InvalidPhotographError as error:
             if len(arguments.photographs) == 1:
                 raise
             yield _Found(path, content, None, {"photograph": str(path), "error": str(error)})
@@ -252,15 +254,15 @@ def _row(photograph: Path, drawn: DrawnAnswer) -> tuple[str, ...]:
     )
 
 
-def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedView) -> Any:
+def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
     """Read the photograph in the size of the picture."""
     from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
-    from lalaloc_core.photograph.view import open_picture, open_view
+    from lalaloc_core.photograph.photograph import open_photograph, open_picture
 
     if drawn.view is not None:
         return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
-    view = open_view(content, sphere_size=(height, width), stated=stated)
+    view = open_photograph(content, sphere_size=(height, width), stated=stated)
     assert view.panorama is not None
     return view.panorama.pixels
 

@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.annotated import GALLERIES
-from lalaloc_core.localise.bundle import default_bundle
 
 _GROUPS = (
     "rendering",
@@ -101,8 +101,8 @@ def add_commands(commands: Any) -> None:
 
 def _bench(arguments: argparse.Namespace) -> None:
     if arguments.profile:
+        from lalaloc_core.bundle import Bundle
         from lalaloc_core.evaluate.bench.profile import profile_table
-        from lalaloc_core.localise.bundle import Bundle
 
         print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
         return

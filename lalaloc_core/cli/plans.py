@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
-from lalaloc_core.localise.bundle import default_bundle
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
@@ -142,10 +142,10 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the report of a plan's localisability, and its summary; draw it on request."""
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.localisability import localisability_svg
-    from lalaloc_core.localise.bundle import Bundle
-    from lalaloc_core.localise.localisability import localisability
-    from lalaloc_core.localise.localisability_report import report_of, summary_of
+    from lalaloc_core.localise.localisability.localisability_report import report_of, summary_of
+    from lalaloc_core.localise.localisability.predicted_localisability import localisability
 
     if arguments.picture is not None:
         check_picture_name(arguments.picture, "--picture")

@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli.arguments import heading, positive
-from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_view, view_document
+from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.localise.tracking.filter import Tracked
     from lalaloc_core.localise.tracking.trajectories import Trajectory
-    from lalaloc_core.photograph import StatedView
+    from lalaloc_core.photograph import StatedCamera
 
 _GRID_STEP_M = 0.5
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})
@@ -73,7 +73,7 @@ def _track(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         check_picture_name(arguments.out)
     plan = read_plan(arguments.plan, arguments).plan()
-    stated = stated_view(arguments)
+    stated = stated_camera(arguments)
     photographs = _photographs(arguments.folder)
     trajectory = None if arguments.odometry is None else read_trajectory(_text(arguments.odometry))
     found = _followed(arguments, plan, photographs, trajectory, stated)
@@ -119,21 +119,21 @@ def _followed(
     plan: FloorPlan,
     photographs: list[tuple[float, Path]],
     trajectory: Trajectory | None,
-    stated: StatedView,
+    stated: StatedCamera,
 ) -> list[_Found]:
     """Return the answer of each photograph, with a progress bar on a terminal."""
     from tqdm import tqdm
 
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-    from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-    from lalaloc_core.localise.pipeline import run_steps
-    from lalaloc_core.localise.retrieval import build_grid
-    from lalaloc_core.localise.stated_camera import known_heading, stated_height
+    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+    from lalaloc_core.localise.query import known_heading, stated_height
+    from lalaloc_core.localise.search.pipeline import run_steps
+    from lalaloc_core.localise.search.retrieval import build_grid
     from lalaloc_core.localise.tracking import TrackState
     from lalaloc_core.localise.tracking.filter import track_steps
     from lalaloc_core.localise.tracking.ground import Ground
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
-    from lalaloc_core.photograph import open_view
+    from lalaloc_core.photograph import open_photograph
 
     bundle = Bundle.open(arguments.bundle)
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
@@ -153,7 +153,7 @@ def _followed(
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
         content = content_of(path)
         with named(path):
-            view = open_view(content, sphere_size=sphere, stated=stated, patch_size=patch)
+            view = open_photograph(content, sphere_size=sphere, stated=stated, patch_size=patch)
             query = encoder.query(view, None, height)
         state = state or TrackState.first(len(query.roll))
         motion = None

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.localise.bundle import Bundle
 
 # Four panoramas each; rendering one takes a third of a second, and validation uses all of them every few minutes.
 _VALIDATION_HOMES = 50

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
@@ -17,13 +18,11 @@ from lalaloc_core.draw.outline import LayoutOutline, ViewOutline, layout_outline
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import ConfidenceModel
-from lalaloc_core.localise.covariance import pose_uncertainty
-from lalaloc_core.localise.pipeline import Localisation
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, probability_map
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.photograph import View
+from lalaloc_core.localise.belief import RIGHT_WITHIN_M, photograph_heading, pose_uncertainty, probability_map
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import Candidate, Query
+from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.photograph import Photograph
 
 Picture = Literal["both", "plan", "photograph"]
 
@@ -70,7 +69,7 @@ class DrawnAnswer:
     confidence: float | None
     rivals: tuple[DrawnCandidate, ...] = ()
     heat: HeatMap | None = None
-    view: View | None = None
+    view: Photograph | None = None
 
     @property
     def outline(self) -> LayoutOutline | ViewOutline:
@@ -88,7 +87,7 @@ def drawn_answer(
     model: ConfidenceModel | None,
     heading_source: str,
     *,
-    view: View | None = None,
+    view: Photograph | None = None,
 ) -> DrawnAnswer:
     """Collect the contents of the picture of a localisation.
 
@@ -139,8 +138,8 @@ def draw_answer(
 ) -> str:
     """Draw an answer as an SVG document, 1600 pixels wide.
 
-    The photograph is a levelled full sphere from `panorama.images.open_panorama`, or that of `answer.view` from
-    `photograph.view.open_picture`; it is required unless `picture` is "plan".
+    The photograph is a levelled full sphere from `photograph.spheres.open_sphere`, or that of `answer.view` from
+    `photograph.photograph.open_picture`; it is required unless `picture` is "plan".
     The default title is the room. `rooms` is a cached result of `draw_rooms` for the plan.
     """
     room = answer.plan.rooms[answer.room_index].name
@@ -277,4 +276,4 @@ def _length(metres: float) -> str:
 
 
 def _heading_deg(query: Query, candidate: Candidate) -> float:
-    return heading_to_degrees(panorama_heading(query, candidate))
+    return heading_to_degrees(photograph_heading(query, candidate))

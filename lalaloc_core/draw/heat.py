@@ -15,7 +15,7 @@ from scipy.ndimage import find_objects, gaussian_filter
 from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml_text
 from lalaloc_core.draw.plan import floor_path
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.posterior import ProbabilityMap
+from lalaloc_core.localise.belief import ProbabilityMap
 from lalaloc_core.render.sampling import PoseSet
 
 # ColorBrewer's YlGnBu: safe for colour-blind readers, and monotonic in grey.

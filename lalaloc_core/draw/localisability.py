@@ -13,7 +13,7 @@ from lalaloc_core.draw.canvas import document, words
 from lalaloc_core.draw.heat import Cells, HeatMap, colour_bar, heat_image
 from lalaloc_core.draw.plan import plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M
+from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 
 _WIDTH, _PAD, _HEAD, _FOOT = 1000, 20, 40, 84
 _FOUND = {

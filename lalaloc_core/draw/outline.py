@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.profile import nearest_walls
 
 _COLUMNS = 1024
@@ -76,7 +76,7 @@ class ViewOutline:
     openings: tuple[OpeningOutline, ...]
 
 
-def outline_in_view(outline: LayoutOutline, view: View) -> ViewOutline:
+def outline_in_view(outline: LayoutOutline, view: Photograph) -> ViewOutline:
     """Return the parts of an outline that a photograph with a camera shows."""
     return ViewOutline(
         [part for line in outline.edges for part in _seen_parts(line, view)],
@@ -88,7 +88,7 @@ def outline_in_view(outline: LayoutOutline, view: View) -> ViewOutline:
     )
 
 
-def _seen_parts(line: Line, view: View) -> list[Line]:
+def _seen_parts(line: Line, view: Photograph) -> list[Line]:
     """Return the visible parts of a line in a panorama, as lines in a view."""
     direction = (line - 0.5) * (TWO_PI, -math.pi)
     steps = np.ceil(np.abs(np.diff(direction, axis=0)).max(axis=1) / _VIEW_STEP).clip(1).astype(int)

@@ -21,9 +21,9 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import layouts_at
+from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.render.sampling import PoseSet
 
 # Shares of homes with each convention, the sill of floor-length windows (m), and the width of doorways (m).

@@ -3,7 +3,7 @@
 * `fit_matching_weights` fits the weight of each term and the temperature of the posterior, so that the right candidates
   are the most probable.
 * `with_heading_doubt` adds how well a right heading usually fits, and how much better the best of all headings does.
-* `store_cohort` stores the matching costs of unknown places (`localise.cohort`), from training homes.
+* `store_cohort` stores the matching costs of unknown places (`localise.match.cohort`), from training homes.
 * `fit_confidence` fits the covariance and the probability that a photograph belongs to its plan, which turns the
   posterior into the probability of "within 1 m". Its queries are photographs of the plan's home, disturbed photographs,
   because real cameras and plans are worse than rendered ones, and photographs of unknown places.
@@ -18,13 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from lalaloc_core.conventions import heading_from_degrees, wrap_angle
-from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
-from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
-from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.metrics import Accuracy
-from lalaloc_core.localise.bundle import (
+from lalaloc_core.bundle import (
     COHORT,
     Bundle,
     ConfidenceModel,
@@ -33,10 +27,14 @@ from lalaloc_core.localise.bundle import (
     MatchingWeights,
     write_manifest,
 )
-from lalaloc_core.localise.cohort import Cohort
-from lalaloc_core.localise.covariance import marginal_information
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M
-from lalaloc_core.localise.ranking import HEADING_SEPARATION
+from lalaloc_core.conventions import heading_from_degrees, wrap_angle
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
+from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
+from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.metrics import Accuracy
+from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M, marginal_information
+from lalaloc_core.localise.match import Cohort
 
 # Weight of unknown places in the fit, chosen on annotated photographs among 0.25, 0.4, 0.5 and 0.6: the lowest with
 # which at most 2 % of them have a confidence above 0.5 in plans of other buildings.

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
+from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
@@ -153,6 +153,15 @@ class FloorPlan:
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
         )
+
+    def anchor_within(self, venue_anchor: Anchor | None) -> Anchor | None:
+        """Return the plan's own anchor, else the venue's.
+
+        Returns None without either, and for a plan too far from the venue's origin for the projection to hold.
+        """
+        if self.anchor is not None or venue_anchor is None:
+            return self.anchor
+        return venue_anchor if float(np.abs(self.bounds_m).max()) <= MAX_FROM_ORIGIN_M else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan in the native format; `from_dict` reads an equal plan from it."""

@@ -1,22 +1,8 @@
-"""Search for the pose of an encoded panorama; service and evaluation run the same code.
+"""Localisation of a photograph in a floor plan; service and evaluation run the same code.
 
-Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's pose grid, `vogel.py` samples
-more poses around the best, `optimise/` refines them (LPO, the only part that imports torch), and `posterior.py`,
-`confidence.py` and `covariance.py` state the answer's uncertainty. `matching_cost.py` is the cost by which poses are
-compared; `encoders.py` runs the networks on onnxruntime. `venue/` searches several plans as one, `sequence/` localises
-several photographs jointly, `tracking/` one after the other. Worker processes load parts of this package, so only plain
-values are re-exported.
+The rooms in the order of a query: `query/` has what is known of a photograph, `encode/` runs the networks, `match/`
+compares poses, `search/` finds them, `refine/` moves them to the best fit, and `belief/` states how certain the answer
+is. `sequence/` localises several photographs jointly, `tracking/` one after the other, `venue/` in many plans, and
+`localisability/` predicts where photographs will be found. Begin with `search/pipeline.py`, the path of a query. Worker
+processes load parts of this package, so it exports nothing.
 """
-
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query, RefinementJob, RefinementResult
-
-__all__ = [
-    "Candidate",
-    "MatchingConfig",
-    "PoseGrid",
-    "PredictedProfile",
-    "Query",
-    "RefinementJob",
-    "RefinementResult",
-]

@@ -4,7 +4,7 @@ Begin with `image_encoder.py` and `layout_encoder.py`, the two of the shipped mo
 pretrained on photographs (`trunk.py`), predicts `image_features.py`, and uses the attention of `horizon_attention.py`.
 `ring_image_encoder.py` is an image encoder without a trunk, `paper_encoders.py` has the encoders of the paper, and
 `decoder.py` reconstructs layout depth from a latent. `loading.py` rebuilds networks from a bundle. The exported
-networks run in `localise/encoders.py`, without torch.
+networks run in `localise/encode/encoders.py`, without torch.
 """
 
 from lalaloc_core.nets.decoder import LayoutDecoder

@@ -7,9 +7,9 @@ from typing import Any
 import safetensors.torch
 from torch import nn
 
+from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperLayoutEncoder

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.panorama.levelling import camera_axes
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.lines import Lines, lines_of
+from lalaloc_core.photograph.sphere_levelling import camera_axes
 
 # Angular error of a segment: modelling, and of its ends in pixels.
 _SIGMA = math.radians(0.6)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.panorama.levelling import camera_axes
 from lalaloc_core.photograph.cameras import Camera
+from lalaloc_core.photograph.sphere_levelling import camera_axes
 
 # Colour of pixels that the photograph does not show.
 UNSEEN = 127

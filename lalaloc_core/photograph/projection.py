@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.panorama.photo_sphere import PhotoSphere
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.exif import ExifLens
-from lalaloc_core.photograph.stated import (
+from lalaloc_core.photograph.photo_sphere import PhotoSphere
+from lalaloc_core.photograph.stated_camera import (
     AUTO,
     HFOV_RANGE_DEG,
     Projection,
-    StatedView,
+    StatedCamera,
     camera_of_hfov,
     camera_of_intrinsics,
 )
@@ -76,7 +76,7 @@ def find_lens(
     width: int,
     height: int,
     *,
-    stated: StatedView,
+    stated: StatedCamera,
     sphere: PhotoSphere,
     exif: ExifLens,
     looks_spherical: Callable[[], bool],
@@ -92,7 +92,7 @@ def find_lens(
         looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
 
     Raises:
-        InvalidPanoramaError: a statement is invalid, or nothing says what the picture shows.
+        InvalidPhotographError: a statement is invalid, or nothing says what the picture shows.
     """
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
@@ -123,12 +123,12 @@ def find_lens(
             projection=projection, projection_source=source, camera=camera, hfov_source="gpano", focal_sd=_GIVEN_SD
         )
     if projection == "cylindrical":
-        raise InvalidPanoramaError(
+        raise InvalidPhotographError(
             f"nothing tells which angle the strip of {width} x {height} shows; send hfov_deg, its horizontal field of "
             "view (up to 360)"
         )
     if projection == "fisheye":
-        raise InvalidPanoramaError(
+        raise InvalidPhotographError(
             "a fisheye photograph needs hfov_deg, its horizontal field of view, or intrinsics (OpenCV's fisheye model)"
         )
     return _perspective(width, height, source, exif)
@@ -162,7 +162,7 @@ def _is_twice_as_wide(width: int, height: int) -> bool:
 def _projection(
     width: int,
     height: int,
-    stated: StatedView,
+    stated: StatedCamera,
     sphere: PhotoSphere,
     exif: ExifLens,
     looks_spherical: Callable[[], bool],
@@ -184,12 +184,12 @@ def _projection(
     if exif.panorama:
         return "cylindrical", "exif"
     if exif.focal is None and twice_as_wide:
-        raise InvalidPanoramaError(
+        raise InvalidPhotographError(
             f"the photograph of {width} x {height} is not a full 360° sphere: its borders do not continue each other, "
             f"or its poles are not uniform; {_HELP}, or projection=equirectangular if it is one"
         )
     if max(width, height) > _LONGEST * min(width, height):
-        raise InvalidPanoramaError(
+        raise InvalidPhotographError(
             f"the photograph of {width} x {height} is a strip; send projection=cylindrical and hfov_deg, its "
             "horizontal field of view (up to 360)"
         )

@@ -7,8 +7,16 @@ floor and ceiling, and `gradient.py` computes derivatives by the pose. These mod
 """
 
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.layout import LayoutView, layout_view
+from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import cast_rays, wall_profile
 from lalaloc_core.render.sweep import profiles_at
 
-__all__ = ["LayoutView", "back_project", "cast_rays", "layout_depth", "layout_view", "profiles_at", "wall_profile"]
+__all__ = [
+    "RenderedLayout",
+    "back_project",
+    "cast_rays",
+    "layout_depth",
+    "profiles_at",
+    "render_layout",
+    "wall_profile",
+]

@@ -16,7 +16,7 @@ from lalaloc_core.render.profile import BEYOND_M, cast_rays, nearest_walls
 
 
 @dataclass(frozen=True, eq=False)
-class LayoutView:
+class RenderedLayout:
     """Distances and opening kinds per pose and azimuth column.
 
     Attributes:
@@ -31,14 +31,14 @@ class LayoutView:
     behind_m: Float[Array, "b w"]
 
 
-def layout_view(
+def render_layout(
     position_m: Float[Array, "b 2"],
     heading: Float[Array, "b"],
     room_index: Int[Array, "b"],
     geometry: PlanGeometry,
     columns: int,
     camera_height_m: Float[Array, "b"] | float,
-) -> LayoutView:
+) -> RenderedLayout:
     """Render the layout view of each pose, one value per azimuth column of a panorama with that heading.
 
     The distances are differentiable in position and heading almost everywhere. Positions are inside their rooms; use
@@ -56,7 +56,7 @@ def layout_view(
     eye_m = xp.asarray(camera_height_m, **like_positions) + xp.zeros_like(heading)
     opening = _opening_met(position_m, azimuth, distance_m, wall, room_index, geometry, eye_m)
     behind_m = _look_through(position_m, azimuth, distance_m, opening, room_index, geometry)
-    return LayoutView(distance_m, _at_opening(geometry.opening_kind, room_index, opening), behind_m)
+    return RenderedLayout(distance_m, _at_opening(geometry.opening_kind, room_index, opening), behind_m)
 
 
 def _opening_met(

@@ -23,7 +23,7 @@ _PAIRS = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class SweptViews:
+class SweptLayouts:
     """Layout views of n poses in w columns each.
 
     Attributes:
@@ -47,7 +47,7 @@ def swept_views(
     walls: WallTable,
     columns: int,
     eye_m: float | Float[np.ndarray, "m"],
-) -> SweptViews:
+) -> SweptLayouts:
     """Render the layout views of poses of a plan, or of several plans with a joined table.
 
     Positions are inside their rooms; `heading` is the azimuth of the centre column, radians. An opening is visible if
@@ -73,7 +73,7 @@ def swept_views(
         through_columns.append(column[through])
         behind_m.append(seen_m[through].astype(np.float32))
     rows, columns_through = np.concatenate(through_rows), np.concatenate(through_columns)
-    return SweptViews(distance_m, kind, rows, columns_through, np.concatenate(behind_m))
+    return SweptLayouts(distance_m, kind, rows, columns_through, np.concatenate(behind_m))
 
 
 def profiles_at(

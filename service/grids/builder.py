@@ -10,8 +10,9 @@ from time import monotonic
 
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
+from service.capacity.fair_share import FairSemaphore
 from service.errors import (
     PlanFailedError,
     PlanNotReadyError,
@@ -28,7 +29,6 @@ from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
 from service.storage.records import millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
-from service.tenancy.fair_share import FairSemaphore
 
 # Duration and interval (s) of retries to store a finished grid.
 _KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0

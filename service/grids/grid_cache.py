@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from lalaloc_core.localise.poses import PoseGrid
-from service.bounded_cache import BoundedCache
+from lalaloc_core.localise.match import PoseGrid
+from service.capacity.bounded_cache import BoundedCache
 from service.grids.embedding import grid_bytes
 from service.storage import Store
 from service.storage.records import GridKey

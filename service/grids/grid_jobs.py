@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from service.errors import OverloadedError, StoppingError
 from service.storage.records import GridKey
 

@@ -11,9 +11,10 @@ from functools import partial
 from typing import Self
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.render.sampling import grid_size
+from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
 from service.grids.embedding import RENDERED, check_size, embed, embed_small
@@ -25,7 +26,6 @@ from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
-from service.tenancy.fair_share import FairSemaphore
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16

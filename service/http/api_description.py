@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 
-from service.http import admission_control as admission
+from service.capacity import admission_control as admission
 from service.http.problems import add_problems
 from service.schemas import (
     EarthPoint,

@@ -15,13 +15,13 @@ from time import monotonic
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from service.capacity.admission_control import Admission
+from service.capacity.threads import BoundedReads
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider
-from service.http.admission_control import Admission
 from service.schemas import PlanEvent
 from service.storage import Store
 from service.telemetry import LOGGER_NAME
-from service.threads import BoundedReads
 
 _POLL_INTERVAL_S = 0.25
 HEARTBEAT_S = 15.0

@@ -19,7 +19,8 @@ from contextlib import suppress
 from starlette.requests import Request
 from starlette.responses import Response
 
-from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPanoramaError, InvalidPoseError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPhotographError, InvalidPoseError
+from service.capacity.threads import BoundedReads
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -36,7 +37,6 @@ from service.pools import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Claimed, Conflict, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
-from service.threads import BoundedReads
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MAX_KEY_CHARACTERS = 255
@@ -45,7 +45,7 @@ _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 _PERMANENT_ERRORS = (
     InvalidFloorPlanError,
     InvalidHintError,
-    InvalidPanoramaError,
+    InvalidPhotographError,
     InvalidPoseError,
     InvalidRequestError,
     PlanTooLargeError,

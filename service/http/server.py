@@ -25,7 +25,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode, Frame
 
 from lalaloc_core.errors import ConfigError
-from service.http.admission_control import Admission, AdmissionLimits
+from service.capacity.admission_control import Admission, AdmissionLimits
 from service.settings import Settings
 from service.telemetry import LOGGER_NAME
 

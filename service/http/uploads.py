@@ -47,7 +47,7 @@ _TOO_MANY_FILES = "Too many files"
 _UTF_8 = b"utf-8"
 
 # Settings that limit an upload.
-Settable = Literal["max_plan_bytes", "max_panorama_bytes", "max_sequence_bytes", "max_venue_bytes"]
+Settable = Literal["max_plan_bytes", "max_photograph_bytes", "max_sequence_bytes", "max_venue_bytes"]
 Model = TypeVar("Model", bound=BaseModel)
 
 

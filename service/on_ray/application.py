@@ -9,11 +9,11 @@ from ray import serve
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.localise.bundle import Bundle
+from service.capacity.fair_share import with_headroom
 from service.on_ray.replicas import EncoderReplica, IndexReplica, IngressReplica, LpoReplica, SearchReplica
 from service.settings import Settings
-from service.tenancy.fair_share import with_headroom
 
 Replicas = Annotated[int, Field(ge=1, le=1000)]
 

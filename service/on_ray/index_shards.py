@@ -26,11 +26,11 @@ from lalaloc_core.localise.venue.index_search import (
     ShardSizes,
 )
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from service.bounded_cache import BoundedCache
+from service.capacity.bounded_cache import BoundedCache
 from service.errors import DeadlineExceededError
 from service.on_ray.outcome import Failure, Success
-from service.query.plan_list import ROW_BYTES, PlanList
 from service.settings import Settings
+from service.venues.plan_list import ROW_BYTES, PlanList
 
 # A shard stores nothing, so calls are repeated if its replica dies.
 _ATTEMPTS = 2

@@ -11,16 +11,16 @@ from ray.exceptions import RayError
 from ray.serve.exceptions import BackPressureError
 from ray.serve.handle import DeploymentHandle
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
 from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
-from service.query import PanoramaQuery, PictureRequest, QueryContext, SequenceQuery, TrackOutcome, TrackQuery
+from service.query import PhotographQuery, PictureRequest, QueryContext, SequenceQuery, TrackOutcome, TrackQuery
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
@@ -44,17 +44,17 @@ class RemotePhotographEncoder(PhotographEncoder):
 
     def query(
         self,
-        view: View,
+        view: Photograph,
         heading: float | None,
         camera_height: CameraHeight,
         *,
         heading_tolerance: float = 0.0,
-        others: Sequence[tuple[View, float]] = (),
+        others: Sequence[tuple[Photograph, float]] = (),
     ) -> Query:
         """Compute a query as `PhotographEncoder.query` does; blocks, so call it from a thread.
 
         Raises:
-            InvalidPanoramaError: see `PhotographEncoder.query`.
+            InvalidPhotographError: see `PhotographEncoder.query`.
             DeadlineExceededError: no answer in time, or two replicas died.
         """
         self.check(view)
@@ -179,14 +179,14 @@ class RemoteLocaliser(_SearchCaller):
         """See `Localiser.model`."""
         return self._model
 
-    async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, record: PlanRecord, query: PhotographQuery) -> LocaliseAnswer:
         """See `Localiser.localise`, for the errors as well."""
         found = await self._call("localise", record.id, query.context, record.tenant, record.id, query)
         self._observe(found)
         return found
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
+        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         found, drawn = await self._call(
@@ -205,7 +205,7 @@ class RemoteLocaliser(_SearchCaller):
 class RemoteVenueLocaliser(_SearchCaller):
     """Remote `VenueLocaliser`."""
 
-    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, venue: VenueRecord, query: PhotographQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.localise`."""
         found = await self._call("localise_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
         self._observe(found)
@@ -218,7 +218,7 @@ class RemoteVenueLocaliser(_SearchCaller):
         return found
 
     async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.localise_near`."""
         found = await self._call("localise_near", str(place), query.context, tenant, place, within_m, query)

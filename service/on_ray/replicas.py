@@ -15,12 +15,12 @@ from ray import serve
 from ray.serve.handle import DeploymentHandle
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.localise.venue.index_search import ShardSizes
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
 from service.app import create_app
 from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlanError, UnknownVenueError
 from service.on_ray.index_shards import RemoteIndices, Stage
@@ -32,13 +32,13 @@ from service.on_ray.remote import (
     RemoteTracker,
     RemoteVenueLocaliser,
 )
-from service.query import PanoramaQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery
-from service.query.plan_list import PlanList
+from service.query import PhotographQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery
 from service.runtime import Backends, Localisers, start_runtime, warm_encoder
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
+from service.venues.plan_list import PlanList
 from service.workers.lpo import load_refiner
 
 # Indices that a shard makes at a time; they outlive the queries that wait for them.
@@ -58,11 +58,11 @@ class EncoderReplica:
 
     def query(
         self,
-        view: View,
+        view: Photograph,
         heading: float | None,
         camera_height: CameraHeight,
         heading_tolerance: float,
-        others: Sequence[tuple[View, float]],
+        others: Sequence[tuple[Photograph, float]],
     ) -> Query:
         """See `PhotographEncoder.query`."""
         return self._encoder.query(view, heading, camera_height, heading_tolerance=heading_tolerance, others=others)
@@ -165,13 +165,13 @@ class SearchReplica(_ServiceReplica):
     """Search of plans and venues."""
 
     @returning_failures
-    async def localise(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, tenant: str, plan_id: str, query: PhotographQuery) -> LocaliseAnswer:
         """See `Localiser.localise`."""
         return await self._runtime.localiser.localise(await self._plan(tenant, plan_id), query)
 
     @returning_failures
     async def localise_and_draw(
-        self, tenant: str, plan_id: str, query: PanoramaQuery, request: PictureRequest
+        self, tenant: str, plan_id: str, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, request)
@@ -182,7 +182,7 @@ class SearchReplica(_ServiceReplica):
         return await self._runtime.localiser.localise_sequence(await self._plan(tenant, plan_id), query)
 
     @returning_failures
-    async def localise_in_venue(self, tenant: str, venue_id: str, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise_in_venue(self, tenant: str, venue_id: str, query: PhotographQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.localise`."""
         return await self._runtime.venue_localiser.localise(await self._venue(tenant, venue_id), query)
 
@@ -193,7 +193,7 @@ class SearchReplica(_ServiceReplica):
 
     @returning_failures
     async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.localise_near`."""
         return await self._runtime.venue_localiser.localise_near(tenant, place, within_m, query)

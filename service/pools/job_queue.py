@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from cachetools import TTLCache
 
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairQueue, Shares
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairQueue, Shares
 
 LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
 

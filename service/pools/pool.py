@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairSemaphore, Shares
 from service.pools.job_queue import JobLostError, JobQueue, PendingJob
 from service.pools.supervisor import Supervisor, WorkerSpec
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairSemaphore, Shares
 
 # Several, so that no client waits while large jobs of others are copied.
 _SUBMITTING_THREADS = 8

@@ -6,21 +6,18 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.bundle import Bundle, Manifest
-from lalaloc_core.localise.confidence import Confidence
-from lalaloc_core.localise.covariance import pose_uncertainty
-from lalaloc_core.localise.pipeline import Localisation
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
-from lalaloc_core.localise.posterior import Posterior, probability_map
-from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.localise.belief import Confidence, Posterior, photograph_heading, pose_uncertainty, probability_map
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import Candidate, KnownHeading, Query
+from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.search import SequenceLocalisation
-from lalaloc_core.localise.stated_camera import KnownHeading
 from service.query.geopose import geopose_at
-from service.query.stated_camera import heading_warnings
+from service.query.stated_pose import heading_warnings
 from service.schemas import (
     CandidateAnswer,
     LocaliseAnswer,
@@ -134,7 +131,7 @@ def compose_answer(
 def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
     candidate = place.candidate
     room = place.plan.rooms[candidate.room_index]
-    heading_deg = heading_to_degrees(panorama_heading(query, candidate))
+    heading_deg = heading_to_degrees(photograph_heading(query, candidate))
     camera_height_m = query.camera_height.height_m * math.exp(candidate.height_offset)
     return CandidateAnswer(
         floorplan_id=place.plan_id,

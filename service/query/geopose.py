@@ -6,22 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.floorplan import MAX_FROM_ORIGIN_M, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAnswer, SequenceAnswer
 
 # Nine decimals of a degree are a tenth of a millimetre.
 _DECIMALS = 9
-
-
-def plan_anchor(plan: FloorPlan, venue_anchor: Anchor | None = None) -> Anchor | None:
-    """Return the plan's own anchor, else the venue's.
-
-    Returns None without either, and for a plan too far from the venue's origin for the projection to hold.
-    """
-    if plan.anchor is not None or venue_anchor is None:
-        return plan.anchor
-    return venue_anchor if float(np.abs(plan.bounds_m).max()) <= MAX_FROM_ORIGIN_M else None
 
 
 def geopose_at(

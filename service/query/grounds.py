@@ -12,25 +12,24 @@ from jaxtyping import Float
 from sqlalchemy import Row
 
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.hints import NO_HINTS, Hints
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
 from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.ground import Ground, LeftOut
 from lalaloc_core.localise.tracking.motion import WalkGraph
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
-from service.bounded_cache import BoundedCache
+from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError, VenueUnsearchableError
 from service.query.answers import Place
-from service.query.geopose import plan_anchor
 from service.query.localiser import Localiser
-from service.query.plan_list import PlanList
 from service.query.queries import TrackQuery
-from service.query.stated_camera import stated_height, stated_hints
-from service.query.venue_hints import VenueHints
-from service.query.venue_plans import VenuePlans
-from service.query.venue_search import SearchedPlans, VenueSearch
+from service.query.stated_pose import stated_height, stated_hints
 from service.schemas import SessionDocument
 from service.storage.records import PlanRecord, VenueRecord
+from service.venues.plan_list import PlanList
+from service.venues.venue_hints import VenueHints
+from service.venues.venue_plans import VenuePlans
+from service.venues.venue_search import SearchedPlans, VenueSearch
 
 # Poses of a plan whose belief is computed for every photograph; a belief has a weight for each pose and heading.
 MAX_POSES = 65_536
@@ -155,7 +154,7 @@ class Grounds:
             compute=compute,
             favour=partial(_favour, by_plan, levels),
         )
-        anchors = [plan_anchor(record.plan, venue.anchor) for record in searched.records]
+        anchors = [record.plan.anchor_within(venue.anchor) for record in searched.records]
         return await compute(partial(self._levels, searched, anchors, levels))
 
     def _levels(

@@ -9,30 +9,31 @@ from functools import partial
 from time import monotonic
 from typing import TypeVar
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, localise_steps
-from lalaloc_core.localise.poses import PoseGrid, Query, RefinementJob
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.refine import RefinementJob
+from lalaloc_core.localise.search.pipeline import Localisation, localise_steps
 from lalaloc_core.localise.sequence import SequenceJob
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
+from service.capacity.admission_control import Slots
+from service.capacity.fair_share import FairSemaphore, with_headroom
+from service.capacity.threads import BoundedReads, Threads
+from service.decoding.decoder import Decoder
 from service.errors import PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
-from service.http.admission_control import Slots
 from service.query.answers import compose_answer, locate_in, posterior_answer
-from service.query.decoding import Decoder
-from service.query.photographs import Photograph, encode, view_answer
-from service.query.queries import OptimiserBackend, PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
+from service.query.photographs import Spot, encode, view_answer
+from service.query.queries import OptimiserBackend, PhotographQuery, PictureRequest, QueryContext, SequenceQuery
 from service.query.search_steps import SearchSteps, StepRunner, completed
 from service.query.sequences import SequenceGround, SequenceSearch
-from service.query.stated_camera import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
+from service.query.stated_pose import hint_warnings, known_heading, stated_height, stated_heights, stated_hints
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.settings import Settings, work_factor
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
-from service.tenancy.fair_share import FairSemaphore, with_headroom
-from service.threads import BoundedReads, Threads
 
 # LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
 _RESERVED_S = 0.25
@@ -48,7 +49,7 @@ class _Outcome:
     """An answer, and the photograph, search result and pose grid behind it."""
 
     answer: LocaliseAnswer
-    view: View
+    view: Photograph
     found: Localisation
     grid: PoseGrid
 
@@ -90,11 +91,11 @@ class Localiser:
         """Name, version and digest of the model."""
         return ModelAnswer.of(self._bundle)
 
-    async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, record: PlanRecord, query: PhotographQuery) -> LocaliseAnswer:
         """Localise a photograph in a stored plan.
 
         Raises:
-            InvalidPanoramaError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
+            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
             InvalidPoseError: the camera height is above the ceiling.
             InvalidHintError: the hints do not match the plan, or exclude all of it.
             PlanFailedError: the plan's pose grid could not be computed.
@@ -107,7 +108,7 @@ class Localiser:
             return (await self._localise(record, query)).answer
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
+        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """Localise as `localise` does, and return the answer with its picture, a PNG or SVG file.
 
@@ -132,17 +133,17 @@ class Localiser:
         """Wait for the computations in progress, and stop the threads."""
         self._threads.close()
 
-    async def _localise(self, record: PlanRecord, query: PanoramaQuery) -> _Outcome:
+    async def _localise(self, record: PlanRecord, query: PhotographQuery) -> _Outcome:
         form, context, clock = query.form, query.context, query.context.clock
         height, hints = stated_height(form, record), stated_hints(form, record.plan)
         # Decode first, so that an unreadable picture is refused without waiting for the plan.
         with clock.stage("decode"):
-            view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
-        known = known_heading(form, record.plan.north, view, self._settings.panoramas.compass_tolerance_deg)
+            view = await self._decoder.decode(query.content, form.stated_camera, context.deadline, context.client)
+        known = known_heading(form, record.plan.north, view, self._settings.photographs.compass_tolerance_deg)
         if not hints.are_none:
             # On a compute thread, because checking many rooms is slow.
             await self.compute(context, partial(hints.check, record.plan))
-        photograph = Photograph(view)
+        photograph = Spot(view)
         encoded = await self.compute(context, partial(encode, self._encoder, [photograph], [known], height, clock))
         grid = await self.grid(record, height, context)
         steps = localise_steps(
@@ -205,15 +206,15 @@ class Localiser:
                 raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
 
     async def _draw(
-        self, record: PlanRecord, outcome: _Outcome, query: PanoramaQuery, request: PictureRequest
+        self, record: PlanRecord, outcome: _Outcome, query: PhotographQuery, request: PictureRequest
     ) -> bytes:
         context, photograph, view = query.context, None, outcome.view
         if request.picture != "plan":
-            assert not isinstance(query.content, View)
+            assert not isinstance(query.content, Photograph)
             # Decode again, because the encoder's input is too small for a picture.
             photograph = await self._decoder.picture(
                 query.content,
-                query.form.stated_view,
+                query.form.stated_camera,
                 context.deadline,
                 context.client,
                 is_sphere=view.is_sphere,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import get_args
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from service.capacity.fair_share import FairSemaphore
 from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import run_worker
 
 # Loading torch takes seconds, on a busy machine many.

@@ -11,8 +11,8 @@ import shapely
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import LocalFrame
-from lalaloc_core.localise.hints import RADIUS_RANGE_M
-from lalaloc_core.localise.posterior import HEADING_WITHIN, RIGHT_WITHIN_M
+from lalaloc_core.localise.belief import HEADING_WITHIN, RIGHT_WITHIN_M
+from lalaloc_core.localise.query import RADIUS_RANGE_M
 from service.errors import InvalidRequestError, UnanchoredPlanError
 from service.schemas import EarthPoint, GeoPose, LocaliseAnswer
 from service.schemas.oscp import (

@@ -7,21 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.confidence import Confidence
-from lalaloc_core.localise.information import advice_for, information_bits, union_of_arcs
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, StageClock
-from lalaloc_core.localise.poses import PoseGrid, Query
-from lalaloc_core.localise.stated_camera import KnownHeading
-from lalaloc_core.photograph import Assumed, View
+from lalaloc_core.localise.belief import Confidence, advice_for, information_bits, union_of_arcs
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
+from lalaloc_core.localise.search.pipeline import Localisation, StageClock
+from lalaloc_core.photograph import Assumed, Photograph
 from lalaloc_core.photograph.cameras import Around, Fisheye
-from lalaloc_core.photograph.stated import intrinsics_of
+from lalaloc_core.photograph.stated_camera import intrinsics_of
 from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, ViewAnswer
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class Spot:
     """A decoded photograph of a query, or several that were taken from one spot.
 
     Attributes:
@@ -29,8 +27,8 @@ class Photograph:
         others: further photographs from its place, each with its heading minus that of `view` (radians).
     """
 
-    view: View
-    others: Sequence[tuple[View, float]] = ()
+    view: Photograph
+    others: Sequence[tuple[Photograph, float]] = ()
 
     @property
     def arcs(self) -> list[tuple[float, float]]:
@@ -41,7 +39,7 @@ class Photograph:
 
 def encode(
     encoder: PhotographEncoder,
-    photographs: Sequence[Photograph],
+    spots: Sequence[Spot],
     known: Sequence[KnownHeading],
     height: CameraHeight,
     clock: StageClock,
@@ -49,38 +47,38 @@ def encode(
     """Encode decoded photographs, each with its known heading; all queries go through here.
 
     Raises:
-        InvalidPanoramaError: a photograph is no sphere, and the model has no encoder of views.
+        InvalidPhotographError: a photograph is no sphere, and the model has no encoder of views.
     """
     with clock.stage("encode"):
         return [
             encoder.query(
-                photograph.view,
+                spot.view,
                 heading.heading,
                 height,
                 heading_tolerance=heading.tolerance,
-                others=photograph.others,
+                others=spot.others,
             )
-            for photograph, heading in zip(photographs, known, strict=True)
+            for spot, heading in zip(spots, known, strict=True)
         ]
 
 
 def view_answer(
-    photograph: Photograph, found: Localisation, confidence: Confidence | None, plan: FloorPlan, grid: PoseGrid
+    spot: Spot, found: Localisation, confidence: Confidence | None, plan: FloorPlan, grid: PoseGrid
 ) -> ViewAnswer:
     """Return the answer's part about its photograph; `plan` and `grid` are those that were searched."""
     bits = information_bits(plan, grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
     return ViewAnswer(
-        **vars(read_view(photograph)),
+        **vars(read_view(spot)),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
-        advice=advice_for(photograph.arcs, sure),
+        advice=advice_for(spot.arcs, sure),
     )
 
 
-def read_view(photograph: Photograph) -> ReadView:
+def read_view(spot: Spot) -> ReadView:
     """Return what was assumed about a photograph."""
-    view = photograph.view
+    view = spot.view
     return ReadView(
         projection=view.projection,
         projection_source=view.projection_source,
@@ -88,7 +86,7 @@ def read_view(photograph: Photograph) -> ReadView:
         pitch=_angle(view.pitch),
         roll=_angle(view.roll),
         camera=_camera(view),
-        seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in photograph.arcs],
+        seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
         warnings=list(view.warnings),
     )
 
@@ -97,7 +95,7 @@ def _angle(assumed: Assumed) -> AssumedAngle:
     return AssumedAngle(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
 
 
-def _camera(view: View) -> CameraAnswer | None:
+def _camera(view: Photograph) -> CameraAnswer | None:
     camera = view.camera
     if camera is None or isinstance(camera, Around):
         return None

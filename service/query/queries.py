@@ -10,10 +10,10 @@ from time import monotonic
 from typing import Protocol, Self
 
 from lalaloc_core.draw.answer import Picture
-from lalaloc_core.localise.pipeline import StageClock
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from lalaloc_core.localise.search.pipeline import StageClock
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError
 from service.pools import PoolState
 from service.schemas import (
@@ -31,8 +31,8 @@ from service.settings import work_factor
 from service.storage.records import PlanRecord, VenueRecord
 from service.uploaded_file import UploadedFile
 
-# Photograph of a query: a file, or a photograph that was encoded on its device (`localise.features`).
-Content = bytes | UploadedFile | View
+# Photograph of a query: a file, or a photograph that was encoded on its device (`localise.encode.features`).
+Content = bytes | UploadedFile | Photograph
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class QueryContext:
     Pickling keeps the elapsed time and restarts the clock, because machines do not share `monotonic`.
 
     Attributes:
-        client: fairness group that shares decoders, threads and workers; see `service.tenancy.fair_share`.
+        client: fairness group that shares decoders, threads and workers; see `service.capacity.fair_share`.
         begin: end of the upload (`monotonic`).
         deadline: time limit of the answer (`monotonic`).
         clock: durations of the stages, failed ones and the wait for the plan's grid included.
@@ -107,7 +107,7 @@ def _received(client: str, limit_s: float, spent_s: float) -> QueryContext:
 
 
 @dataclass(frozen=True, eq=False)
-class PanoramaQuery:
+class PhotographQuery:
     """Query about one panorama.
 
     Attributes:
@@ -188,12 +188,12 @@ class LocaliserBackend(Protocol):
         """See `Localiser.model`."""
         ...
 
-    async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, record: PlanRecord, query: PhotographQuery) -> LocaliseAnswer:
         """See `Localiser.localise`."""
         ...
 
     async def localise_and_draw(
-        self, record: PlanRecord, query: PanoramaQuery, request: PictureRequest
+        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         ...
@@ -206,7 +206,7 @@ class LocaliserBackend(Protocol):
 class VenueLocaliserBackend(Protocol):
     """Localisation in a venue; `VenueLocaliser` implements and documents it."""
 
-    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, venue: VenueRecord, query: PhotographQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.localise`."""
         ...
 
@@ -215,7 +215,7 @@ class VenueLocaliserBackend(Protocol):
         ...
 
     async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.localise_near`."""
         ...

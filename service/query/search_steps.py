@@ -11,9 +11,8 @@ from collections.abc import Callable, Generator
 from time import monotonic
 from typing import Any, TypeVar
 
-from lalaloc_core.localise.descent import refine_walls, refined_by_walls
-from lalaloc_core.localise.pipeline import next_step
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
+from lalaloc_core.localise.search.pipeline import next_step
 from lalaloc_core.localise.sequence import SequenceJob
 from service.pools import LostReason
 from service.query.queries import OptimiserBackend

@@ -7,24 +7,23 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, TypeVar
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
-from lalaloc_core.localise.poses import PoseGrid, Query
-from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
 from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
 from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
-from lalaloc_core.localise.stated_camera import KnownHeading
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
+from service.decoding.decoder import Decoder
 from service.query.answers import Locate, compose_answer, compose_sequence_answer
-from service.query.decoding import Decoder
-from service.query.photographs import Photograph, encode, view_answer
+from service.query.photographs import Spot, encode, view_answer
 from service.query.queries import QueryContext, SequenceQuery
 from service.query.search_steps import SearchSteps
-from service.query.stated_camera import known_heading
+from service.query.stated_pose import known_heading
 from service.schemas import SequenceAnswer
 from service.settings import Settings
 
@@ -93,7 +92,7 @@ class SequenceSearch:
         self._encoder = encoder
         self._decoder = decoder
 
-    async def views(self, query: SequenceQuery) -> list[View]:
+    async def views(self, query: SequenceQuery) -> list[Photograph]:
         """Decode the photographs of a query.
 
         Raises:
@@ -109,14 +108,14 @@ class SequenceSearch:
         # Decode one photograph at a time, so that a query occupies one decoder.
         with context.clock.stage("decode"):
             return [
-                await self._decoder.decode(content, form.stated_view, context.deadline, context.client)
+                await self._decoder.decode(content, form.stated_camera, context.deadline, context.client)
                 for content in query.contents
             ]
 
     async def answer(
         self,
         query: SequenceQuery,
-        views: Sequence[View],
+        views: Sequence[Photograph],
         heights: Sequence[CameraHeight],
         north: float | None,
         find_ground: FindGround,
@@ -131,7 +130,7 @@ class SequenceSearch:
             find_ground: finds the places to search.
         """
         form, context = query.form, query.context
-        compass_deg = self._settings.panoramas.compass_tolerance_deg
+        compass_deg = self._settings.photographs.compass_tolerance_deg
         known = [known_heading(form.heading_of(index), north, view, compass_deg) for index, view in enumerate(views)]
         # A sphere shows all that other photographs from its spot could add.
         one_query = form.motion == "turn" and not any(view.is_sphere for view in views)
@@ -170,7 +169,7 @@ class SequenceSearch:
     async def _search_sequence(
         self,
         query: SequenceQuery,
-        views: Sequence[View],
+        views: Sequence[Photograph],
         known: Sequence[KnownHeading],
         heights: Sequence[CameraHeight],
         find_ground: FindGround,
@@ -181,7 +180,7 @@ class SequenceSearch:
         # One at a time, so that queries of others come in between.
         with clock.stage("encode"):
             for view, heading, height in zip(views, known, heights, strict=True):
-                one = partial(encode, self._encoder, [Photograph(view)], [heading], height, StageClock())
+                one = partial(encode, self._encoder, [Spot(view)], [heading], height, StageClock())
                 encoded += await self._computer.compute(context, one)
         ground = await find_ground(encoded)
         steps = localise_sequence_steps(
@@ -199,7 +198,7 @@ class SequenceSearch:
     async def _search_turn(
         self,
         query: SequenceQuery,
-        views: Sequence[View],
+        views: Sequence[Photograph],
         known: Sequence[KnownHeading],
         turns: Sequence[float],
         height: CameraHeight,
@@ -210,7 +209,7 @@ class SequenceSearch:
         They are one query that sees more azimuths, so that overlapping parts count once.
         """
         form, context, clock = query.form, query.context, query.context.clock
-        photograph = Photograph(views[0], list(zip(views[1:], turns[1:], strict=True)))
+        photograph = Spot(views[0], list(zip(views[1:], turns[1:], strict=True)))
         stated = (
             replace(heading, heading=heading.heading - turn)
             for heading, turn in zip(known, turns, strict=True)
@@ -233,13 +232,13 @@ class SequenceSearch:
         return ground, await self._computer.run_search(steps, context)
 
 
-def _photographs(views: Sequence[View], found: SequenceLocalisation, *, one_spot: bool) -> list[Photograph]:
+def _photographs(views: Sequence[Photograph], found: SequenceLocalisation, *, one_spot: bool) -> list[Spot]:
     """Return each photograph of a sequence, together with all others from its spot."""
     if not one_spot:
-        return [Photograph(view) for view in views]
-    headings = [panorama_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
+        return [Spot(view) for view in views]
+    headings = [photograph_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
     return [
-        Photograph(
+        Spot(
             view,
             [(other, heading - headings[index]) for other, heading in zip(views, headings, strict=True)],
         )

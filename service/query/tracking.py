@@ -8,29 +8,26 @@ from functools import partial
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import StageClock
-from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
+from lalaloc_core.localise.search.pipeline import StageClock
 from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
+from service.capacity.admission_control import Slots
+from service.decoding.decoder import Decoder
 from service.errors import SessionOutdatedError
-from service.http.admission_control import Slots
 from service.query.answers import Place
-from service.query.decoding import Decoder
 from service.query.geopose import geopose_at
 from service.query.grounds import Grounds, SessionGround
 from service.query.localiser import Localiser
-from service.query.photographs import Photograph, encode, read_view
+from service.query.photographs import Spot, encode, read_view
 from service.query.queries import TrackOutcome, TrackQuery
-from service.query.stated_camera import known_heading, stated_height, stated_hints
-from service.query.venue_plans import venue_height
+from service.query.stated_pose import known_heading, stated_height, stated_hints
 from service.schemas import (
     ModelAnswer,
     PathPoint,
@@ -44,6 +41,7 @@ from service.schemas import (
 )
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
+from service.venues.venue_plans import venue_height
 
 _UNKNOWN = KnownHeading(None, 0.0, "searched")
 # Stages of tracking that answers report as a stage of a single query.
@@ -101,8 +99,8 @@ class SessionTracker:
         clock, compute = context.clock, partial(self._localiser.compute, context)
         odometry = form.odometry
         with clock.stage("decode"):
-            view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
-        compass_deg = self._settings.panoramas.compass_tolerance_deg
+            view = await self._decoder.decode(query.content, form.stated_camera, context.deadline, context.client)
+        compass_deg = self._settings.photographs.compass_tolerance_deg
         try:
             state = None if query.state is None else TrackState.from_bytes(query.state)
             if isinstance(place, VenueRecord):
@@ -135,11 +133,16 @@ class SessionTracker:
         timings_ms = self._localiser.observe(context, tracked.stage)
         return TrackOutcome(tracked.state.to_bytes(), self._stored(found, tracked, view, form, timings_ms))
 
-    def _encode(self, view: View, height: CameraHeight, clock: StageClock) -> Callable[[], list[Query]]:
-        return partial(encode, self._encoder, [Photograph(view)], [_UNKNOWN], height, clock)
+    def _encode(self, view: Photograph, height: CameraHeight, clock: StageClock) -> Callable[[], list[Query]]:
+        return partial(encode, self._encoder, [Spot(view)], [_UNKNOWN], height, clock)
 
     def _stored(
-        self, ground: SessionGround, found: Tracked, view: View, form: PhotographForm, timings_ms: dict[str, float]
+        self,
+        ground: SessionGround,
+        found: Tracked,
+        view: Photograph,
+        form: PhotographForm,
+        timings_ms: dict[str, float],
     ) -> StoredPose:
         """Compose the part of the answer that is stored with the session; its path is the new pose alone."""
         pose, query, best = found.pose, found.query, found.candidates[0]
@@ -149,7 +152,7 @@ class SessionTracker:
         position = Position(x_m=pose.x_m, y_m=pose.y_m)
         camera_height_m = query.camera_height.height_m * math.exp(best.height_offset)
         rivals = [
-            _rival(ground.place(rival), heading_to_degrees(panorama_heading(query, rival)), probability)
+            _rival(ground.place(rival), heading_to_degrees(photograph_heading(query, rival)), probability)
             for rival, probability in zip(found.candidates, found.probability, strict=True)
         ]
         totals = {
@@ -171,7 +174,7 @@ class SessionTracker:
             motion_contradicted=list(found.contradicted),
             warnings=[*_warnings(found, form), *ground.warnings],
             geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
-            view=read_view(Photograph(view)),
+            view=read_view(Spot(view)),
             timings_ms=TimingsAnswer(**totals),
             model=ModelAnswer.of(self._bundle),
         )

@@ -10,29 +10,29 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.venue.merged_plans import GAP_M
+from service.capacity.admission_control import Slots
+from service.decoding.decoder import Decoder
 from service.errors import NoPlanNearbyError
-from service.http.admission_control import Slots
 from service.query.answers import compose_answer
-from service.query.decoding import Decoder
 from service.query.localiser import Localiser
-from service.query.photographs import Photograph, encode, view_answer
-from service.query.queries import PanoramaQuery, SequenceQuery
+from service.query.photographs import Spot, encode, view_answer
+from service.query.queries import PhotographQuery, SequenceQuery
 from service.query.search_steps import completed
 from service.query.sequences import SequenceGround
-from service.query.stated_camera import heights_of, known_heading
-from service.query.venue_hints import VenueHints
-from service.query.venue_plans import VenuePlans, venue_height
-from service.query.venue_search import ReadPlans, SearchedPlans, VenueSearch
+from service.query.stated_pose import heights_of, known_heading
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability, SequenceAnswer
 from service.settings import Settings
 from service.storage.records import VenueRecord
+from service.venues.venue_hints import VenueHints
+from service.venues.venue_plans import VenuePlans, venue_height
+from service.venues.venue_search import ReadPlans, SearchedPlans, VenueSearch
 
 # Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
@@ -66,7 +66,7 @@ class VenueLocaliser:
         self._decoder = decoder
         self._queries = queries
 
-    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+    async def localise(self, venue: VenueRecord, query: PhotographQuery) -> LocaliseAnswer:
         """Localise a photograph in the plans of a venue.
 
         Raises:
@@ -116,7 +116,7 @@ class VenueLocaliser:
         return answer.model_copy(update={"venue_id": venue.id})
 
     async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
     ) -> LocaliseAnswer:
         """Localise a photograph in the tenant's anchored plans within `within_m` of a place on Earth.
 
@@ -149,24 +149,24 @@ class VenueLocaliser:
         """
         VenueHints.from_form(form, venue.anchor).check(await self._plans.members(venue.tenant, venue.id))
 
-    async def _localise(self, venue: VenueRecord, query: PanoramaQuery, read_plans: ReadPlans) -> LocaliseAnswer:
+    async def _localise(self, venue: VenueRecord, query: PhotographQuery, read_plans: ReadPlans) -> LocaliseAnswer:
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._localise_in_slot(venue, query, read_plans)
 
     async def _localise_in_slot(
-        self, venue: VenueRecord, query: PanoramaQuery, read_plans: ReadPlans
+        self, venue: VenueRecord, query: PhotographQuery, read_plans: ReadPlans
     ) -> LocaliseAnswer:
         form, context, clock = query.form, query.context, query.context.clock
         hints = VenueHints.from_form(form, venue.anchor)
         with clock.stage("decode"):
-            view = await self._decoder.decode(query.content, form.stated_view, context.deadline, context.client)
+            view = await self._decoder.decode(query.content, form.stated_camera, context.deadline, context.client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
-        known = known_heading(form, north, view, self._settings.panoramas.compass_tolerance_deg)
+        known = known_heading(form, north, view, self._settings.photographs.compass_tolerance_deg)
         with clock.stage("wait"):
             ready, warnings = await self._search.ready(venue, read_plans, hints, context)
         height = venue_height(form, ready)
         compute = partial(self._localiser.compute, context)
-        photograph = Photograph(view)
+        photograph = Spot(view)
         encoded = (await compute(partial(encode, self._encoder, [photograph], [known], height, clock)))[0]
         with clock.stage("shortlist"):
             searched = await self._search.searched(

@@ -27,7 +27,7 @@ async def _client_of(request: Request) -> str:
 
 Running = Annotated[Runtime, Depends(get_runtime)]
 Tenant = Annotated[str, Depends(_tenant_of)]
-# Tenant or client address that the request's share of slots counts for; see `service.tenancy.fair_share`.
+# Tenant or client address that the request's share of slots counts for; see `service.capacity.fair_share`.
 Client = Annotated[str, Depends(_client_of)]
 
 

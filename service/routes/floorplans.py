@@ -8,7 +8,6 @@ from fastapi import APIRouter, Query, Request, Response, status
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.importers import building_name
-from service.conversion import PlanFile, convert
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -25,7 +24,8 @@ from service.http.conditional import expected_revision, not_modified, tagged_ans
 from service.http.cursors import cursor_text, parse_cursor
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.renditions import describe, with_head
+from service.plan_files.plan_description import describe, with_head
+from service.plan_files.plan_file import PlanFile, convert
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,

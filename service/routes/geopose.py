@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from lalaloc_core.errors import InvalidHintError
-from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.search.pipeline import StageClock
 from service.errors import (
     FeaturesRequiredError,
     InvalidRequestError,
@@ -24,7 +24,7 @@ from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.request_end import on_request_end
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
-from service.query import PanoramaQuery, QueryContext
+from service.query import PhotographQuery, QueryContext
 from service.query.oscp import (
     camera_fields,
     compose_oscp_answer,
@@ -89,12 +89,12 @@ async def geopose(
         raise InvalidRequestError([("venue_id", "floorplan_id is given as well; give at most one of the two")])
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
     media_type(request, (JSON,))
-    if settings.panoramas.require_features:
+    if settings.photographs.require_features:
         raise FeaturesRequiredError
-    clock, max_bytes = StageClock(), settings.panoramas.max_panorama_bytes
+    clock, max_bytes = StageClock(), settings.photographs.max_photograph_bytes
     add_log_fields(request, clock=clock)
     with clock.stage("upload"):
-        limits = UploadLimits.of(settings, "max_panorama_bytes")
+        limits = UploadLimits.of(settings, "max_photograph_bytes")
         body = await read_body(request, replace(limits, max_bytes=4 * -(-max_bytes // 3) + _ENVELOPE_BYTES))
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
 
@@ -173,12 +173,12 @@ class _Query:
                 warnings = [_contradicted(f"has no say: {error.reason}")]
         return await localiser.localise(venue, self._about(form)), warnings
 
-    def _about(self, form: LocaliseForm) -> PanoramaQuery:
-        return PanoramaQuery(form, self._content, self._context)
+    def _about(self, form: LocaliseForm) -> PhotographQuery:
+        return PhotographQuery(form, self._content, self._context)
 
     def _form(self, **about: str) -> LocaliseForm:
         form = LocaliseForm.model_validate(about | self._camera)
-        return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.panoramas.max_top_k)})
+        return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.photographs.max_top_k)})
 
 
 def _contradicted(reason: str) -> str:

@@ -7,11 +7,11 @@ from typing import Any
 
 from fastapi import APIRouter
 
+from service.capacity.fair_share import max_per_client
 from service.errors import StoreUnavailableError
 from service.http.problems import problem_responses
 from service.routes.dependencies import Client, Running, Tenant
 from service.schemas import BytesInFlightAnswer, LimitsAnswer, StoredBytesAnswer, StoredBytesByKind, UsageAnswer
-from service.tenancy.fair_share import max_per_client
 
 router = APIRouter(tags=["operations"])
 
@@ -26,8 +26,8 @@ async def get_limits(runtime: Running) -> LimitsAnswer:
         "max_queries_per_tenant": max_per_client(settings.query_limit),
         "max_pending_requests": settings.pending_limit,
     }
-    values = settings.values() | resolved
-    return LimitsAnswer(**{name: values[name] for name in LimitsAnswer.model_fields})
+    named = {name: settings.value(name) for name in LimitsAnswer.model_fields.keys() - resolved.keys()}
+    return LimitsAnswer(**named, **resolved)
 
 
 @router.get("/usage", summary="Get the tenant's usage", responses=problem_responses(StoreUnavailableError))

@@ -23,7 +23,7 @@ from service.http import IdempotentRequest
 from service.http.accept import preferred
 from service.http.problems import problem_responses
 from service.http.uploads import GEOJSON, JSON, MULTIPART, media_type
-from service.query import PanoramaQuery, PictureRequest
+from service.query import PhotographQuery, PictureRequest
 from service.query.geopose import geojson_feature
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.query_request import (
@@ -106,7 +106,7 @@ async def localise(
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
     form, parts, context = await read_query(
-        request, runtime.settings, client, LocaliseForm, "max_panorama_bytes", files={PHOTO}
+        request, runtime.settings, client, LocaliseForm, "max_photograph_bytes", files={PHOTO}
     )
     if form.venue_id is not None and media in (_PNG, _SVG):
         raise InvalidRequestError(
@@ -119,7 +119,7 @@ async def localise(
         picture = None if picture is None and media in (JSON, GEOJSON) else "plan"
 
     async def respond() -> Response:
-        query = PanoramaQuery(form, content, context)
+        query = PhotographQuery(form, content, context)
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)

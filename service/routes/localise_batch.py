@@ -12,6 +12,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from service.capacity.admission_control import BATCH
 from service.errors import (
     OverloadedError,
     PlanFailedError,
@@ -24,11 +25,10 @@ from service.errors import (
     VenueNotReadyError,
     VenueUnsearchableError,
 )
-from service.http.admission_control import BATCH
 from service.http.lines import NDJSON, LinesResponse
 from service.http.problems import problem_document, problem_responses
 from service.http.uploads import MULTIPART, Repeats, media_type
-from service.query import Content, PanoramaQuery, QueryContext
+from service.query import Content, PhotographQuery, QueryContext
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.localise import kept_answer
 from service.routes.query_request import (
@@ -67,7 +67,7 @@ _COMMON_ERRORS = (
 _BUSY_PAUSE_S = 0.25
 _MAX_NAME = 255
 
-Localise = Callable[[PanoramaQuery], Awaitable[LocaliseAnswer]]
+Localise = Callable[[PhotographQuery], Awaitable[LocaliseAnswer]]
 
 
 @router.post(
@@ -92,7 +92,7 @@ async def localise_batch(request: Request, runtime: Running, tenant: Tenant, cli
     settings = runtime.settings
     check_idempotent_media(request, NDJSON)
     media_type(request, (MULTIPART,))
-    most = settings.panoramas.max_batch_photographs
+    most = settings.photographs.max_batch_photographs
     form, parts, _ = await read_query(
         request,
         settings,
@@ -186,9 +186,9 @@ class _Batch:
     async def _answer(self, file: UploadedFile, photograph: Content) -> LocaliseAnswer:
         """Localise one photograph; wait for a slot while the tenant's other queries have them all."""
         settings = self._runtime.settings
-        limit = settings.panoramas.max_panorama_bytes
+        limit = settings.photographs.max_photograph_bytes
         if len(file) > limit:
-            raise UploadTooLargeError("max_panorama_bytes", limit, len(file))
+            raise UploadTooLargeError("max_photograph_bytes", limit, len(file))
         context = QueryContext.starting(self._client, settings.requests.request_deadline_s)
         while True:
             if self._runtime.admission.stopping:
@@ -196,7 +196,7 @@ class _Batch:
             if self._common_error is not None:
                 raise self._common_error
             try:
-                answer = await self._localise(PanoramaQuery(self._form, photograph, context))
+                answer = await self._localise(PhotographQuery(self._form, photograph, context))
                 return await kept_answer(answer, self._tenant, self._runtime)
             except OverloadedError:
                 if context.left_s < _BUSY_PAUSE_S:

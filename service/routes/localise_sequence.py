@@ -42,7 +42,7 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
     "items": {"type": "string", "format": "binary"},
     "minItems": _MIN_PHOTOGRAPHS,
     "description": "Photographs in the order in which they were taken, one part named `photo` each, as for "
-    "`POST /localise`; limits: `max_sequence_panoramas`, and `max_sequence_bytes` together.",
+    "`POST /localise`; limits: `max_sequence_photographs`, and `max_sequence_bytes` together.",
 }
 
 
@@ -78,8 +78,8 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     check_idempotent_media(request, media)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
     media_type(request, (MULTIPART,))
-    most = settings.panoramas.max_sequence_panoramas
-    repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_panoramas")}
+    most = settings.photographs.max_sequence_photographs
+    repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs")}
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )
@@ -116,9 +116,9 @@ def _photographs(parts: Parts, form: SequenceForm, runtime: Runtime) -> list[Con
         InvalidFeaturesError, ForeignFeaturesError: see `photographs_of`.
         InvalidRequestError: fields that do not fit the number of photographs.
     """
-    limit = runtime.settings.panoramas.max_panorama_bytes
+    limit = runtime.settings.photographs.max_photograph_bytes
     if (largest := max(map(len, parts.named(PHOTO)), default=0)) > limit:
-        raise UploadTooLargeError("max_panorama_bytes", limit, largest)
+        raise UploadTooLargeError("max_photograph_bytes", limit, largest)
     contents = photographs_of(parts, form, runtime.bundle)
     if faults := form.faults(len(contents)):
         raise InvalidRequestError(faults)

@@ -9,8 +9,8 @@ from pathlib import Path
 from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from lalaloc_core.localise.bundle import MANIFEST_NAME
-from lalaloc_core.localise.features import DEVICE_FILES, device_manifest
+from lalaloc_core.bundle import MANIFEST_NAME
+from lalaloc_core.localise.encode.features import DEVICE_FILES, device_manifest
 from service.errors import InvalidRequestError, UnknownModelFileError
 from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses

@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 from service.grids import GridProvider, GridState
 from service.http.conditional import revision_etag
-from service.renditions import state_of_description
+from service.plan_files.plan_description import state_of_description
 from service.schemas import FloorPlanSummary
 from service.storage.records import PlanSummary
 from service.stored_plan import Rendition

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
 from lalaloc_core.importers import ImportOptions
-from service.conversion import seems_native
+from service.capacity.threads import Threads
 from service.errors import (
     BytesInFlightError,
     ConverterNotReadyError,
@@ -27,9 +27,9 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.plan_files.plan_file import seems_native
 from service.runtime import Runtime
 from service.schemas import ImportForm, LevelsForm
-from service.threads import Threads
 from service.uploaded_file import UploadedFile
 
 _FILE = "file"

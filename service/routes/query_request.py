@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 from fastapi import Request
 from pydantic import BaseModel
 
-from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPanoramaError, InvalidPoseError
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.features import MAX_BYTES, read_features
-from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPhotographError, InvalidPoseError
+from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
+from lalaloc_core.localise.search.pipeline import StageClock
 from service.errors import (
     BytesInFlightError,
     DeadlineExceededError,
@@ -49,7 +49,7 @@ from service.http.uploads import (
 from service.query import Content, QueryContext
 from service.routes.dependencies import IDEMPOTENCY_KEY
 from service.schemas import LocaliseForm, PhotographForm, SequenceForm
-from service.schemas.photographs import ViewFields
+from service.schemas.photographs import PhotographFields
 from service.settings import Settings
 from service.telemetry import add_log_fields
 
@@ -59,7 +59,7 @@ PANORAMA = "panorama"
 Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
 # Errors of a query.
 QUERY_ERRORS: tuple[type[Exception], ...] = (
-    InvalidPanoramaError,
+    InvalidPhotographError,
     InvalidFeaturesError,
     ForeignFeaturesError,
     FeaturesRequiredError,
@@ -144,9 +144,9 @@ async def read_query(
     """
     clock = StageClock()
     add_log_fields(request, clock=clock)
-    bounds = {"max_top_k": settings.panoramas.max_top_k}
+    bounds = {"max_top_k": settings.photographs.max_top_k}
     limits = UploadLimits.of(settings, limit)
-    if settings.panoramas.require_features:
+    if settings.photographs.require_features:
         # Small, and never written to disk.
         count = max((repeats.most for repeats in (repeated or {}).values()), default=1)
         limits = replace(limits, max_bytes=min(limits.max_bytes, count * MAX_BYTES), memory_bytes=0)
@@ -163,19 +163,19 @@ async def read_query(
                 substitutes={FEATURES: PHOTO},
             )
         except UploadTooLargeError as error:
-            if settings.panoramas.require_features:
+            if settings.photographs.require_features:
                 raise FeaturesRequiredError from error
             raise
-    if settings.panoramas.require_features and parts.named(PHOTO):
+    if settings.photographs.require_features and parts.named(PHOTO):
         raise FeaturesRequiredError
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)
     if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
-        form = form.model_copy(update={"top_k": min(form.top_k, settings.panoramas.max_top_k)})
+        form = form.model_copy(update={"top_k": min(form.top_k, settings.photographs.max_top_k)})
     return form, parts, context
 
 
-def photographs_of(parts: Parts, form: ViewFields, bundle: Bundle) -> list[Content]:
+def photographs_of(parts: Parts, form: PhotographFields, bundle: Bundle) -> list[Content]:
     """Return the photographs of a query in order: their files, or what was read of their features.
 
     Raises:
@@ -185,7 +185,7 @@ def photographs_of(parts: Parts, form: ViewFields, bundle: Bundle) -> list[Conte
     features = parts.named(FEATURES)
     if not features:
         return [*parts.named(PHOTO)]
-    if stated := sorted(form.model_fields_set & ViewFields.model_fields.keys()):
+    if stated := sorted(form.model_fields_set & PhotographFields.model_fields.keys()):
         raise InvalidRequestError(
             [(name, f"is stated when {FEATURES} are computed; leave it out of the query") for name in stated]
         )

@@ -11,8 +11,8 @@ from fastapi import APIRouter
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from service.capacity.admission_control import Admission
 from service.errors import ExposedWithoutKeysError, OverloadedError, StoppingError
-from service.http.admission_control import Admission
 from service.http.problems import problem_answer
 from service.http.socket_requests import (
     FileHead,
@@ -75,7 +75,7 @@ async def _serve(socket: WebSocket, requests: SocketRequests, path: str, runtime
     try:
         while (text := await _next_text(socket, runtime.admission, settings.storage.session_ttl_s)) is not None:
             left_bytes = await requests.post_file(path, PHOTO, FileHead.parse(text), send)
-            if left_bytes > settings.panoramas.max_panorama_bytes:
+            if left_bytes > settings.photographs.max_photograph_bytes:
                 await _close(socket, _TOO_LARGE, "the photograph is too large to skip it")
                 return
             async with asyncio.timeout(settings.uploads.deadline_s):

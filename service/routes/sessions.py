@@ -38,15 +38,7 @@ from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body
 from service.query import MAX_POSES, TrackQuery
-from service.routes.dependencies import (
-    IDEMPOTENCY_KEY,
-    Client,
-    Running,
-    Tenant,
-    is_id,
-    plan_for_query,
-    venue_for_query,
-)
+from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, is_id, plan_for_query, venue_for_query
 from service.routes.query_request import PHOTO, QUERY_ERRORS, body_schema, photographs_of, read_query
 from service.runtime import Runtime
 from service.schemas import PhotographForm, SessionAnswer, SessionDocument, StoredPose
@@ -184,7 +176,7 @@ async def add_photograph(
     media_type(request, (MULTIPART,))
     await runtime.reads.run(tenant, runtime.store.sessions.get, tenant, _id(session_id))
     form, parts, context = await read_query(
-        request, runtime.settings, client, PhotographForm, "max_panorama_bytes", files={PHOTO}
+        request, runtime.settings, client, PhotographForm, "max_photograph_bytes", files={PHOTO}
     )
     # Checked before the session is claimed.
     _ = form.odometry
@@ -259,7 +251,7 @@ def _limited(document: SessionDocument, runtime: Runtime) -> SessionDocument:
     Raises:
         InvalidRequestError: it states more.
     """
-    limit = runtime.settings.panoramas.max_top_k
+    limit = runtime.settings.photographs.max_top_k
     if document.top_k > limit and "top_k" in document.model_fields_set:
         raise InvalidRequestError([("top_k", f"is {document.top_k}; the limit is {limit} (max_top_k)")])
     return document.model_copy(update={"top_k": min(document.top_k, limit)})

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lalaloc_core.importers import building_name
-from service.conversion import PlanFile, convert_levels
 from service.errors import InvalidRequestError
+from service.plan_files.plan_file import PlanFile, convert_levels
 from service.routes.plan_uploads import PlanUpload
 from service.runtime import Runtime
 from service.storage.records import JSON, ComputedGrid, Original, PlanRecord, VenueRecord

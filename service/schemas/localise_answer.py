@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field
 
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.bundle import Bundle
 from service.schemas.fields import (
     Degrees,
     HeadingDeg,

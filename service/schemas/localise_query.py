@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from service.schemas.fields import Finite
-from service.schemas.photographs import ViewFields
+from service.schemas.photographs import PhotographFields
 from service.schemas.query_fields import CameraFields, HintFields, check_plan_or_venue
 
 HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
 
 
-class LocaliseForm(CameraFields, HintFields, ViewFields):
+class LocaliseForm(CameraFields, HintFields, PhotographFields):
     """Form fields of a query, without the photograph; an empty field counts as left out."""
 
     venue_id: str | None = Field(None, min_length=1, description="Id of a venue, to search all its plans.")

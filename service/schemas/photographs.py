@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from lalaloc_core.photograph import Intrinsics, StatedView
-from lalaloc_core.photograph.stated import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
+from lalaloc_core.photograph import Intrinsics, StatedCamera
+from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
 from service.schemas.fields import Degrees, Finite, ResponseModel, Score, Share, SignedDegrees
 
 Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
@@ -40,7 +40,7 @@ class StatedIntrinsics(BaseModel):
     p2: _Number = 0.0
 
 
-class ViewFields(BaseModel):
+class PhotographFields(BaseModel):
     """Form fields about the camera of a photograph."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -88,10 +88,10 @@ class ViewFields(BaseModel):
         return value
 
     @property
-    def stated_view(self) -> StatedView:
+    def stated_camera(self) -> StatedCamera:
         """The statements for the core, which checks them."""
         intrinsics = None if self.intrinsics is None else Intrinsics(**self.intrinsics.model_dump())
-        return StatedView(
+        return StatedCamera(
             projection=self.projection,
             hfov_deg=self.hfov_deg,
             intrinsics=intrinsics,

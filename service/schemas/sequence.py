@@ -15,7 +15,7 @@ from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
-from service.schemas.photographs import ViewAnswer, ViewFields
+from service.schemas.photographs import PhotographFields, ViewAnswer
 from service.schemas.query_fields import CameraFields, check_plan_or_venue
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
@@ -87,7 +87,7 @@ class StatedHeading(BaseModel):
     heading_tolerance_deg: float
 
 
-class SequenceForm(CameraFields, ViewFields):
+class SequenceForm(CameraFields, PhotographFields):
     """Form fields of a query with several photographs; an empty field counts as left out.
 
     The fields about the camera hold for all photographs.

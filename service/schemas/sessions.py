@@ -15,7 +15,7 @@ from lalaloc_core.localise.tracking.motion import MAX_STEP_M, MAX_TURN
 from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import HEADING_MEANING
-from service.schemas.photographs import ReadView, ViewFields
+from service.schemas.photographs import PhotographFields, ReadView
 from service.schemas.query_fields import CameraFields, EarthPoint, PlanPoint, check_plan_or_venue
 
 # `Odometry` checks the limits of motions, which this only describes.
@@ -78,7 +78,7 @@ class SessionDocument(CameraFields):
         return self
 
 
-class PhotographForm(ViewFields):
+class PhotographForm(PhotographFields):
     """Form fields of a photograph of a session; an empty field counts as left out.
 
     The motion is that since the photograph before, in the frame of the camera at that photograph.

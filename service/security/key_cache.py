@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
-from service.bounded_cache import BoundedCache
+from service.capacity.bounded_cache import BoundedCache
 from service.errors import StoreBusyError, StoreUnavailableError
 from service.security.keys import PresentedKey
 from service.storage.api_keys import ApiKeys

@@ -24,8 +24,8 @@ from joserfc.jwt import JWTClaimsRegistry
 from service.errors import IssuerUnavailableError, UnauthenticatedError
 from service.schemas.admin import TENANT
 from service.security.permissions import Identity, Permission
-from service.setting_groups import AccessSettings
-from service.setting_types import secure_url
+from service.settings.setting_groups import AccessSettings
+from service.settings.setting_types import secure_url
 from service.telemetry import LOGGER_NAME
 
 # Signatures with public keys only: neither `none` nor shared secrets.

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
 from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, joined, prototypes_of
 from lalaloc_core.render.sampling import PoseSet

@@ -5,7 +5,7 @@ from __future__ import annotations
 from time import monotonic
 
 from lalaloc_core.floorplan import FloorPlan
-from service.bounded_cache import BoundedCache
+from service.capacity.bounded_cache import BoundedCache
 from service.storage.records import PlanRecord
 
 

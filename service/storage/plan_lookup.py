@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from time import monotonic
 
+from service.capacity.threads import BoundedReads
 from service.errors import StoreBusyError, StoreUnavailableError
 from service.storage.circuit_breaker import CircuitBreaker
 from service.storage.plans import FoundPlan, Plans
 from service.storage.records import PlanRecord
 from service.storage.store import Store
-from service.threads import BoundedReads
 
 
 class PlanLookup:

@@ -12,7 +12,7 @@ from typing import Any, Self
 from sqlalchemy import Connection, func, select
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M
+from lalaloc_core.localise.query import DEFAULT_STD_M
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_places import place_columns

@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, true, update
 
 from lalaloc_core.floorplan import FloorPlan
+from service.capacity.single_flight import SingleFlight
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
-from service.single_flight import SingleFlight
 from service.storage.database import Database
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_rows import (

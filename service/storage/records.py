@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from service.storage.grid_format import SortedPrototypes
 from service.stored_plan import PlanHead
 

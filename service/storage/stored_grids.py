@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from service.storage.database import Database
 from service.storage.grid_format import (
     PackedGrid,

@@ -18,14 +18,7 @@ from service.storage.plan_rows import PlanContent, count_plans, insert_plans, ne
 from service.storage.records import ComputedGrid, Original, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, VENUES
-from service.storage.venue_rows import (
-    check_count,
-    check_members,
-    find_venue,
-    insert_members,
-    insert_venue,
-    lock_venue,
-)
+from service.storage.venue_rows import check_count, check_members, find_venue, insert_members, insert_venue, lock_venue
 from service.stored_plan import PlanDocument
 
 

@@ -12,33 +12,13 @@ from datetime import UTC, datetime
 from typing import Any
 
 from cachetools import LRUCache
-from sqlalchemy import (
-    Connection,
-    FromClause,
-    Row,
-    and_,
-    case,
-    delete,
-    distinct,
-    func,
-    literal,
-    or_,
-    select,
-    update,
-)
+from sqlalchemy import Connection, FromClause, Row, and_, case, delete, distinct, func, literal, or_, select, update
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_places import lies_in_box
-from service.storage.records import (
-    Cursor,
-    VenueCounts,
-    VenueMember,
-    VenuePlace,
-    VenueRecord,
-    VenueState,
-)
+from service.storage.records import Cursor, VenueCounts, VenueMember, VenuePlace, VenueRecord, VenueState
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES

@@ -8,11 +8,4 @@ from service.telemetry.log_fields import RequestLogFields, add_log_fields, reque
 from service.telemetry.logs import LOGGER_NAME, configure_logging
 from service.telemetry.metrics import Telemetry
 
-__all__ = [
-    "LOGGER_NAME",
-    "RequestLogFields",
-    "Telemetry",
-    "add_log_fields",
-    "configure_logging",
-    "request_id_of",
-]
+__all__ = ["LOGGER_NAME", "RequestLogFields", "Telemetry", "add_log_fields", "configure_logging", "request_id_of"]

@@ -12,7 +12,7 @@ from starlette.requests import HTTPConnection
 from service.telemetry.trace_context import TraceContext
 
 if TYPE_CHECKING:
-    from lalaloc_core.localise.pipeline import StageClock
+    from lalaloc_core.localise.search.pipeline import StageClock
 
 _SCOPE_KEY = "lalaloc.log_fields"
 

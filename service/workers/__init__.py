@@ -1,5 +1,5 @@
-"""Programs of the worker processes: `decode.py` for pictures, `convert.py` for plan files, `lpo.py` for refinement.
+"""Worker processes: `process.py` has their common loop, `lpo.py` the program that refines poses.
 
-Begin with `process.py`, the common loop. `service.pools` starts and supervises these processes. This package re-exports
-nothing, because every worker would load it.
+Begin with `process.py`. Programs for photographs and plan files are in `decoding/` and `plan_files/`. `service.pools`
+starts and supervises these processes. This package re-exports nothing, because every worker would load it.
 """

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Bundle, Manifest
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
 if TYPE_CHECKING:
-    from lalaloc_core.localise.optimise import PoseRefiner
+    from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 
 
 def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int, by_latents: bool) -> None:
@@ -55,7 +55,7 @@ def load_refiner(
     def refiner() -> PoseRefiner:
         import torch
 
-        from lalaloc_core.localise.optimise import PoseRefiner
+        from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 
         torch.set_num_threads(threads)
         loaded = PoseRefiner.from_bundle(bundle)

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from lalaloc_client import ConflictError, InvalidError, OnDeviceError, UnauthorisedError
-from lalaloc_core.localise.bundle import default_bundle
+from lalaloc_core.bundle import default_bundle
 from tests.client.conftest import FailingServer, MakeClient, Planned
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp, upload

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import PoseRefiner
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from tests.core.questions import PaintedSession
 

@@ -14,10 +14,9 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunInfo
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
@@ -33,7 +32,7 @@ def question_at(
     step_m: float = 0.5,
     heading: float = 0.0,
     heading_known: bool = True,
-    photograph: Photograph | None = None,
+    photograph: DatasetPhotograph | None = None,
     camera_height_m: float = CAMERA_M,
     grid: PoseSet | None = None,
 ) -> Question:
@@ -91,7 +90,7 @@ def prediction_of(truth: Pose, **changes: Any) -> Prediction:
 
 @dataclass(frozen=True, eq=False)
 class BareRoom:
-    """Photograph of an empty room with the depth of its layout and no pixels."""
+    """DatasetPhotograph of an empty room with the depth of its layout and no pixels."""
 
     plan: FloorPlan
     position_m: tuple[float, float]

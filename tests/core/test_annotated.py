@@ -34,8 +34,8 @@ from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.render.layout import layout_view
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of
 from tests.strategies import present
@@ -221,7 +221,7 @@ class TestGalleries:
         scene, hall = dataset.load("hall-0"), read_annotation(root / "hall.json")
         (camera,) = scene.cameras
         plan, rooms = scene.plan, np.array([camera.room_index])
-        view = layout_view(
+        view = render_layout(
             camera.position_m[None], np.array([camera.heading]), rooms, plan.geometry, WIDTH, camera.camera_height_m
         )
         assert np.count_nonzero(view.kind[0] != hall.classes(WIDTH)) <= 6

@@ -17,12 +17,12 @@ import shapely
 from hypothesis import given, settings
 from PIL import Image
 
-from lalaloc_core.errors import InvalidFloorPlanError, InvalidPanoramaError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
 from lalaloc_core.floorplan.rooms import interior_point
-from lalaloc_core.panorama.images import open_panorama
-from lalaloc_core.panorama.photo_sphere import read_photo_sphere
-from lalaloc_core.panorama.segments import check_segments
+from lalaloc_core.photograph.file_segments import check_segments
+from lalaloc_core.photograph.photo_sphere import read_photo_sphere
+from lalaloc_core.photograph.spheres import open_sphere
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 from tests.growth import assert_no_worse_than_linear
@@ -332,8 +332,8 @@ def test_many_segments_are_read_in_linear_time(kind: str) -> None:
         content = plain[:offset] + piece * count + plain[offset:]
 
         def work() -> None:
-            with suppress(InvalidPanoramaError):
-                open_panorama(content, height=32, width=64)
+            with suppress(InvalidPhotographError):
+                open_sphere(content, height=32, width=64)
 
         return work
 
@@ -343,11 +343,11 @@ def test_many_segments_are_read_in_linear_time(kind: str) -> None:
 def test_million_segments_are_refused_early() -> None:
     jpeg, png = _picture("JPEG"), _picture("PNG")
     for piece, message in ((_segment(0xFE, b""), "2000 segments"), (_segment(0xE1, b"Exif\0\0x"), "16 Exif segments")):
-        with pytest.raises(InvalidPanoramaError, match=message):
-            open_panorama(jpeg[:2] + piece * 1_000_000 + jpeg[2:], height=32, width=64)
+        with pytest.raises(InvalidPhotographError, match=message):
+            open_sphere(jpeg[:2] + piece * 1_000_000 + jpeg[2:], height=32, width=64)
     for piece in (_chunk(b"tEXt", b"a\0b"), _chunk(b"IDAT", b"")):
-        with pytest.raises(InvalidPanoramaError, match="20000 chunks"):
-            open_panorama(png[:33] + piece * 1_000_000 + png[33:], height=32, width=64)
+        with pytest.raises(InvalidPhotographError, match="20000 chunks"):
+            open_sphere(png[:33] + piece * 1_000_000 + png[33:], height=32, width=64)
 
 
 def test_usual_segment_counts_are_accepted() -> None:

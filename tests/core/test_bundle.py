@@ -14,15 +14,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from lalaloc_core.errors import BundleError, ExportError
-from lalaloc_core.learn.export import bundle_export as export
-from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run import reexport_bundle
-from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
-from lalaloc_core.localise.bundle import (
+from lalaloc_core.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
     HEAD_ONNX,
@@ -39,9 +31,17 @@ from lalaloc_core.localise.bundle import (
     Manifest,
     write_manifest,
 )
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import PoseRefiner
+from lalaloc_core.errors import BundleError, ExportError
+from lalaloc_core.learn.export import bundle_export as export
+from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.learn.export.run import reexport_bundle
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets import load_decoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from tests.core.test_training import small_paper

@@ -13,6 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import (
+    COHORT,
+    Bundle,
+    ConfidenceModel,
+    LogisticModel,
+    MatchingWeights,
+    default_bundle,
+    write_manifest,
+)
 from lalaloc_core.errors import BundleError, InvalidInputError
 from lalaloc_core.evaluate.appearance import fit_appearance, mixtures, redrawn
 from lalaloc_core.evaluate.calibrate import (
@@ -28,22 +37,13 @@ from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Pre
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans
-from lalaloc_core.localise.bundle import (
-    COHORT,
-    Bundle,
-    ConfidenceModel,
-    LogisticModel,
-    MatchingWeights,
-    default_bundle,
-    write_manifest,
-)
-from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, cost_by_chance, log_cost_to_chance
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import LocaliseConfig, localise
-from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.retrieval import build_grid, grid_costs
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import Cohort, MatchingConfig, cohort_of, cost_by_chance, log_cost_to_chance
+from lalaloc_core.localise.match.cohort import SIZE
+from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise
+from lalaloc_core.localise.search.retrieval import build_grid, grid_costs
 from tests.core.questions import perfect_query, prediction_of
 from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from PIL import ExifTags, Image
 
+import lalaloc_core
 from lalaloc_core import __version__
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
-from lalaloc_core.localise import bundle
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import jpeg, sphere, take
 
@@ -304,7 +304,7 @@ def test_default_bundle_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(ROOT)
     assert default_bundle() == Path("models/default")
     monkeypatch.chdir(tmp_path)
-    assert default_bundle() == Path(bundle.__file__).resolve().parents[2] / "models" / "default"
+    assert default_bundle() == Path(lalaloc_core.bundle.__file__).resolve().parents[2] / "models" / "default"
     assert Bundle.open(default_bundle()).manifest.name == "default"
 
 
@@ -332,6 +332,6 @@ def test_wheel_contains_the_model(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["room"] == "kitchen"
-    where = [python, "-c", "from lalaloc_core.localise.bundle import default_bundle; print(default_bundle())"]
+    where = [python, "-c", "from lalaloc_core.bundle.manifest import default_bundle; print(default_bundle())"]
     found = subprocess.run(where, cwd=empty, env=environment, capture_output=True, text=True, check=True).stdout
     assert Path(found.strip()) == (installed / "share" / "lalaloc" / "models" / "default").resolve()

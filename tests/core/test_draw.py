@@ -19,7 +19,7 @@ from lalaloc_core.draw.outline import layout_outline
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.posterior import ProbabilityMap
+from lalaloc_core.localise.belief import ProbabilityMap
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 from lalaloc_core.render.sweep import profiles_at
 

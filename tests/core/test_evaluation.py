@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidInputError, RunError
@@ -20,8 +21,7 @@ from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.synth.scene.facts import facts_of
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
 from tests.core.questions import run_info
 from tests.strategies import present
 

@@ -14,6 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
 from lalaloc_core.evaluate.methods.alignment import depth_aligner
@@ -23,12 +24,11 @@ from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import DepthGrid, Layout
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import LpoConfig, PoseOptimiser
-from lalaloc_core.localise.pipeline import LocaliseConfig
-from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.refine import LpoConfig, RefinementJob
+from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
+from lalaloc_core.localise.search.pipeline import LocaliseConfig
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile

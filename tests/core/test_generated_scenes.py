@@ -17,7 +17,7 @@ from lalaloc_core.learn.data.synthetic.disturbed import DisturbedPhotograph, Dis
 from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.synthetic.mismatched import Cropped, MismatchedScenes, OutdoorPhotograph, UpsideDown
-from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.layout import render_layout
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)
 FURNISHED = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
@@ -61,7 +61,7 @@ def test_every_photograph_identifies_its_copy() -> None:
         for camera in scene.cameras:
             whole, room = divmod(camera.room_index, rooms)
             away = np.arange(4) - whole
-            seen = layout_view(
+            seen = render_layout(
                 camera.position_m + away[:, None] * np.array([step_m, 0.0]),
                 np.zeros(4),
                 room + rooms * np.arange(4),

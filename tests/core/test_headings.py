@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet
@@ -133,7 +133,7 @@ class TestPerfectEncoder:
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert np.hypot(*(best.position_m - POSE.position_m[0])) < 0.02
-        assert abs(wrap_angle(panorama_heading(query, best) - heading)) < math.radians(1.0)
+        assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
 
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)
@@ -147,5 +147,5 @@ class TestPerfectEncoder:
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert best.room_index == pose.room_index[0]
         assert np.hypot(*(best.position_m - position)) < 0.02
-        assert abs(wrap_angle(panorama_heading(query, best) - heading)) < math.radians(1.0)
-        assert -math.pi <= panorama_heading(query, best) <= math.pi
+        assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
+        assert -math.pi <= photograph_heading(query, best) <= math.pi

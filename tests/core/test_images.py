@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageChops
 
-from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.panorama.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
-from lalaloc_core.panorama.segments import count_scans
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.file_segments import count_scans
+from lalaloc_core.photograph.spheres import NEUTRAL, PhotographLimits, open_sphere, read_sphere
 from tests.growth import assert_no_worse_than_linear
 
 HEIGHT, WIDTH = 32, 64
@@ -38,8 +38,8 @@ def encoded(image: Image.Image, kind: str = "PNG", **options: object) -> bytes:
     return buffer.getvalue()
 
 
-def read(content: bytes, limits: PanoramaLimits | None = None) -> np.ndarray:
-    return read_panorama(content, height=HEIGHT, width=WIDTH, limits=limits)
+def read(content: bytes, limits: PhotographLimits | None = None) -> np.ndarray:
+    return read_sphere(content, height=HEIGHT, width=WIDTH, limits=limits)
 
 
 def png(width: int, height: int, rows: bytes, *, depth: int = 8, colour_type: int = 2) -> bytes:
@@ -189,7 +189,7 @@ class TestAccepted:
     def test_location_metadata_do_not_reach_the_pixels(self) -> None:
         exif = Image.Exif()
         exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 1.0), 3: "E", 4: (11.0, 34.0, 2.0)})
-        found = open_panorama(encoded(picture(), "JPEG", exif=exif), height=HEIGHT, width=WIDTH)
+        found = open_sphere(encoded(picture(), "JPEG", exif=exif), height=HEIGHT, width=WIDTH)
         assert {name: type(value) for name, value in vars(found).items()} == {
             "pixels": np.ndarray,
             "compass_heading": type(None),
@@ -205,7 +205,7 @@ class TestAccepted:
         assert read(encoded(Image.new("RGB", (width, 256)))).shape == (HEIGHT, WIDTH, 3)
 
     def test_limits_use_the_size_before_scaling(self) -> None:
-        limits = PanoramaLimits(min_height=600)
+        limits = PhotographLimits(min_height=600)
         assert read(encoded(picture(height=640), "JPEG"), limits).shape == (HEIGHT, WIDTH, 3)
 
 
@@ -229,9 +229,9 @@ class TestScans:
         assert read(of_scans(256, 128, added)).shape == (HEIGHT, WIDTH, 3)
 
     def test_scan_limit_is_inclusive(self) -> None:
-        limits = PanoramaLimits(max_scans=8)
+        limits = PhotographLimits(max_scans=8)
         read(of_scans(256, 128, 2), limits)
-        with pytest.raises(InvalidPanoramaError, match=r"more than 8 scans"):
+        with pytest.raises(InvalidPhotographError, match=r"more than 8 scans"):
             read(of_scans(256, 128, 3), limits)
 
     @pytest.mark.slow
@@ -275,7 +275,7 @@ class TestRefused:
         ],
     )
     def test_invalid_panorama_error_names_the_reason(self, content: bytes, reason: str) -> None:
-        with pytest.raises(InvalidPanoramaError, match=reason):
+        with pytest.raises(InvalidPhotographError, match=reason):
             read(content)
 
     @pytest.mark.parametrize("kind", NEARLY)
@@ -283,19 +283,21 @@ class TestRefused:
     def test_truncated_file_is_refused(self, kind: str, share: float) -> None:
         noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8)
         content = encoded(Image.fromarray(noise), kind, **NEARLY[kind])
-        with pytest.raises(InvalidPanoramaError):
+        with pytest.raises(InvalidPhotographError):
             read(content[: int(share * len(content))])
 
     @pytest.mark.parametrize(("width", "height"), [(20_000, 10_000), (14_200, 7_100), (2**31 - 1, 2**30)])
     def test_decompression_bomb_is_refused_by_header(self, width: int, height: int) -> None:
         # The file has almost no pixels.
-        with pytest.raises(InvalidPanoramaError, match=r"pixels|damaged"):
+        with pytest.raises(InvalidPhotographError, match=r"pixels|damaged"):
             read(png(width, height, b"\0" * 100))
 
     def test_jpeg_with_many_scans_is_refused(self) -> None:
         content = of_scans(14_000, 7_000, 400)
         assert len(content) < 700_000
-        with pytest.raises(InvalidPanoramaError, match=r"JPEG with more than 20 scans, the limit \(LALALOC_MAX_SCANS"):
+        with pytest.raises(
+            InvalidPhotographError, match=r"JPEG with more than 20 scans, the limit \(LALALOC_MAX_SCANS"
+        ):
             read(content)
 
     @pytest.mark.parametrize("kind", [b"VP8X", b"VP8L", b"VP8 "])
@@ -308,18 +310,18 @@ class TestRefused:
         }
         content = b"RIFF" + struct.pack("<I", 100) + b"WEBP" + kind + struct.pack("<I", 88) + heads[kind] + bytes(78)
         with pytest.raises(
-            InvalidPanoramaError, match=r"16383 x 16383 = \d+ pixels; the limit is 1000 \(LALALOC_MAX_PIXELS\)"
+            InvalidPhotographError, match=r"16383 x 16383 = \d+ pixels; the limit is 1000 \(LALALOC_MAX_PIXELS\)"
         ):
-            read(content, PanoramaLimits(max_pixels=1000))
+            read(content, PhotographLimits(max_pixels=1000))
 
     def test_pixel_limit_is_configurable(self) -> None:
-        with pytest.raises(InvalidPanoramaError, match="the limit is 1000"):
-            read(encoded(picture()), PanoramaLimits(max_pixels=1000))
+        with pytest.raises(InvalidPhotographError, match="the limit is 1000"):
+            read(encoded(picture()), PhotographLimits(max_pixels=1000))
 
     def test_sideways_orientation_is_refused(self) -> None:
         exif = Image.Exif()
         exif[0x0112] = 6
-        with pytest.raises(InvalidPanoramaError, match="128 x 256"):
+        with pytest.raises(InvalidPhotographError, match="128 x 256"):
             read(encoded(picture(), "JPEG", exif=exif.tobytes()))
 
     # Pillow warns about damaged metadata.
@@ -337,6 +339,6 @@ class TestRefused:
             content[data.draw(st.integers(0, min(last, len(content) - 1)))] = data.draw(st.integers(0, 255))
         try:
             pixels = read(bytes(content))
-        except InvalidPanoramaError:
+        except InvalidPhotographError:
             return
         assert pixels.shape == (HEIGHT, WIDTH, 3)

@@ -17,13 +17,14 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
-from lalaloc_core.localise.layouts import Layouts, layouts_at, layouts_of_plans
+from lalaloc_core.localise.match import Layouts, layouts_at
+from lalaloc_core.localise.match.layouts import layouts_of_plans
 from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient
-from lalaloc_core.render.layout import LayoutView, layout_view
+from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_view
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.render.sweep import SweptViews, profiles_at, swept_views
+from lalaloc_core.render.sweep import SweptLayouts, profiles_at, swept_views
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, scene_of, seeds, spiral
 
 COLUMNS, EYE_M = 64, 1.5
@@ -34,16 +35,16 @@ DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
 
 def view_along(
     plan: FloorPlan, position_m: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M
-) -> LayoutView:
+) -> RenderedLayout:
     count = len(azimuths_deg)
     positions = np.tile(position_m, (count, 1)).astype(float)
     room = plan.room_index_at(positions)
     # With a single column a pose's ray is along its heading.
-    return layout_view(positions, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
+    return render_layout(positions, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
 
 
-def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:
-    return layout_view(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
+def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> RenderedLayout:
+    return render_layout(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
 
 
 @pytest.mark.slow
@@ -83,7 +84,7 @@ def test_view_matches_the_wall_profile_and_torch(seed: int) -> None:
     np.testing.assert_array_equal(view.behind_m[~open_kinds], view.distance_m[~open_kinds])
     position, angle, room = map(torch.tensor, (poses.position_m, heading, poses.room_index))
     eye = torch.full((4,), EYE_M, dtype=torch.float64)
-    in_torch = layout_view(position, angle, room, plan.geometry, COLUMNS, eye)
+    in_torch = render_layout(position, angle, room, plan.geometry, COLUMNS, eye)
     np.testing.assert_array_equal(in_torch.kind.numpy(), view.kind)
     np.testing.assert_allclose(in_torch.distance_m.numpy(), view.distance_m, rtol=1e-12)
     np.testing.assert_allclose(in_torch.behind_m.numpy(), view.behind_m, rtol=1e-9)
@@ -95,7 +96,7 @@ def test_gradients_match_differences() -> None:
     heading = torch.tensor([0.3, 2.0], dtype=torch.float64, requires_grad=True)
 
     def distances(position_m: torch.Tensor, heading: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        view = layout_view(position_m, heading, torch.tensor([0, 1]), plan.geometry, 16, EYE_M)
+        view = render_layout(position_m, heading, torch.tensor([0, 1]), plan.geometry, 16, EYE_M)
         assert (view.behind_m > view.distance_m).any()
         return view.distance_m, view.behind_m
 
@@ -157,12 +158,12 @@ def test_padding_changes_nothing() -> None:
     plan = FloorPlan.from_dict(document)
     assert plan.geometry.wall_count.tolist() == [4, 43]
     position = torch.tensor([[2.0, -2.0]], dtype=torch.float64)
-    view = layout_view(position, torch.full((1,), math.pi), torch.tensor([0]), plan.geometry, 1, EYE_M)
+    view = render_layout(position, torch.full((1,), math.pi), torch.tensor([0]), plan.geometry, 1, EYE_M)
     assert int(view.kind[0, 0]) == DOOR_CODE
 
 
-def full_behind_m(view: SweptViews) -> np.ndarray:
-    """Return the distances behind openings in the form of `LayoutView`: the wall's distance for other rays."""
+def full_behind_m(view: SweptLayouts) -> np.ndarray:
+    """Return the distances behind openings in the form of `RenderedLayout`: the wall's distance for other rays."""
     behind_m = view.distance_m.copy()
     behind_m[view.row, view.column] = view.behind_m
     return behind_m
@@ -171,7 +172,7 @@ def full_behind_m(view: SweptViews) -> np.ndarray:
 def assert_the_same(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, misses: float = 0.0) -> None:
     """Check that both renderers agree on all rays but a share `misses` that graze a corner, where rounding decides."""
     swept = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
-    cast = layout_view(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
+    cast = render_layout(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
     differs = ~np.isclose(swept.distance_m, cast.distance_m, rtol=1e-4) | (swept.kind != cast.kind)
     differs |= ~np.isclose(full_behind_m(swept), cast.behind_m, rtol=1e-3)
     assert differs.mean() <= misses
@@ -318,10 +319,10 @@ def test_gradient_through_an_opening(plan: FloorPlan, seed: int) -> None:
     room = torch.tensor(scene.poses.room_index)
 
     def log_behind(unknowns: torch.Tensor) -> torch.Tensor:
-        return layout_view(unknowns[:, :2], unknowns[:, 2], room, plan.geometry, COLUMNS, EYE_M).behind_m.log()
+        return render_layout(unknowns[:, :2], unknowns[:, 2], room, plan.geometry, COLUMNS, EYE_M).behind_m.log()
 
     pose = torch.cat([position, heading[:, None]], dim=1)
-    view = layout_view(position, heading, room, plan.geometry, COLUMNS, EYE_M)
+    view = render_layout(position, heading, room, plan.geometry, COLUMNS, EYE_M)
     row, column = torch.nonzero(view.behind_m > view.distance_m, as_tuple=True)
     if not len(row):
         return

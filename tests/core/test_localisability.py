@@ -7,15 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import Bundle, Manifest, default_bundle
+from lalaloc_core.bundle.prediction_errors import correlated
 from lalaloc_core.conditions import CONDITIONS, HARDEST, condition_of, parts_of
 from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.bench.prediction_errors import measured
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Bundle, Manifest, default_bundle
-from lalaloc_core.localise.localisability import Errors, Searches, errors_of, localisability, spacing_m
-from lalaloc_core.localise.localisability_report import report_of, summary_of
-from lalaloc_core.localise.prediction_errors import correlated
+from lalaloc_core.localise.localisability.localisability_report import report_of, summary_of
+from lalaloc_core.localise.localisability.predicted_localisability import (
+    Errors,
+    Searches,
+    errors_of,
+    localisability,
+    spacing_m,
+)
 from lalaloc_core.render.sampling import PoseSet
 
 

@@ -11,15 +11,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, WALL_CODE, WINDOW_CODE
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.cost_terms import class_losses, precisions
-from lalaloc_core.localise.layouts import Layouts, SeenThrough
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.poses import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType, Query
+from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost
+from lalaloc_core.localise.match.cost_terms import class_losses, precisions
+from lalaloc_core.localise.match.layouts import SeenThrough
+from lalaloc_core.localise.query import (
+    CameraHeight,
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    Query,
+)
 from tests.strategies import seeds
 
 CONFIG = MatchingConfig()

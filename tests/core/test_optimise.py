@@ -13,13 +13,11 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
-from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.descent import LpoConfig, refine_walls
-from lalaloc_core.localise.descent.methods import descend
-from lalaloc_core.localise.descent.problem import Problem
-from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine import LpoConfig, Problem, RefinementJob, RefinementResult, refine_walls
+from lalaloc_core.localise.refine.descent_methods import descend
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet

@@ -15,10 +15,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
-from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.panorama.images import NEUTRAL, Panorama, open_panorama
-from lalaloc_core.panorama.levelling import level
-from lalaloc_core.panorama.photo_sphere import PhotoSphere, read_photo_sphere
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
+from lalaloc_core.photograph.sphere_levelling import level
+from lalaloc_core.photograph.spheres import NEUTRAL, Sphere, open_sphere
 
 HEIGHT, WIDTH = 64, 128
 FULL_HEIGHT, FULL_WIDTH = 512, 1024
@@ -105,8 +105,8 @@ def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) 
     return buffer.getvalue()
 
 
-def opened(content: bytes) -> Panorama:
-    return open_panorama(content, height=HEIGHT, width=WIDTH)
+def opened(content: bytes) -> Sphere:
+    return open_sphere(content, height=HEIGHT, width=WIDTH)
 
 
 FULL = world(directions(FULL_HEIGHT, FULL_WIDTH))
@@ -165,7 +165,7 @@ class TestParts:
             opened(encoded(FULL[:320, :640], "PNG", packet)).pixels, opened(encoded(FULL[:320, :640])).pixels
         )
         flat = encoded(FULL[:256, :640], "PNG", xmp(**(crop(128, 64, 640, 256) | changes)))
-        with pytest.raises(InvalidPanoramaError, match=f"640 x 256; .* twice as wide as high, .*: .*{reason}"):
+        with pytest.raises(InvalidPhotographError, match=f"640 x 256; .* twice as wide as high, .*: .*{reason}"):
             opened(flat)
 
     @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ class TestParts:
     )
     def test_unusable_projection_or_part_is_refused(self, changes: dict[str, object], reason: str) -> None:
         packet = xmp(**(crop(128, 64, 640, 320) | changes))
-        with pytest.raises(InvalidPanoramaError, match=reason):
+        with pytest.raises(InvalidPhotographError, match=reason):
             opened(encoded(FULL[:320, :640], "PNG", packet))
 
 

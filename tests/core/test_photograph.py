@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.view_encoder import ViewEncoderConfig
-from lalaloc_core.panorama.levelling import level
-from lalaloc_core.panorama.pictures import PanoramaLimits
-from lalaloc_core.photograph import Intrinsics, PatchSize, StatedView, View, open_view
+from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.patches import UNSEEN, patch_azimuths
+from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
+from lalaloc_core.photograph.sphere_levelling import level
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 
 Tag = ExifTags.Base
@@ -33,8 +33,8 @@ GPANO = (
 )
 
 
-def opened(content: bytes, **stated: Any) -> View:
-    return open_view(content, sphere_size=(128, 256), stated=StatedView(**stated))
+def opened(content: bytes, **stated: Any) -> Photograph:
+    return open_photograph(content, sphere_size=(128, 256), stated=StatedCamera(**stated))
 
 
 def view_of(camera: Camera, name: str = "living_room", heading_deg: float = 0.0) -> np.ndarray:
@@ -84,7 +84,7 @@ class TestProjection:
             "noise": np.random.default_rng(0).integers(0, 256, (256, 512, 3)).astype(np.uint8),
         }
         for pixels in pictures.values():
-            with pytest.raises(InvalidPanoramaError, match=r"not a full 360° sphere.*send hfov_deg"):
+            with pytest.raises(InvalidPhotographError, match=r"not a full 360° sphere.*send hfov_deg"):
                 opened(jpeg(np.ascontiguousarray(pixels)))
 
     def test_stated_field_of_view_makes_a_crop_usable(self) -> None:
@@ -115,9 +115,9 @@ class TestProjection:
 
     def test_strip_asks_for_its_angle(self) -> None:
         strip = view_of(Around(width=1200, height=300, hfov=math.radians(240.0)))
-        with pytest.raises(InvalidPanoramaError, match="is a strip; send projection=cylindrical and hfov_deg"):
+        with pytest.raises(InvalidPhotographError, match="is a strip; send projection=cylindrical and hfov_deg"):
             opened(jpeg(strip))
-        with pytest.raises(InvalidPanoramaError, match="which angle the strip of 1200 x 300 shows; send hfov_deg"):
+        with pytest.raises(InvalidPhotographError, match="which angle the strip of 1200 x 300 shows; send hfov_deg"):
             opened(jpeg(strip, {Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26}))
         view = opened(jpeg(strip), hfov_deg=240.0)
         assert (view.projection, view.projection_source) == ("cylindrical", "assumed")
@@ -189,15 +189,15 @@ class TestStatements:
         ],
     )
     def test_invalid_values_are_refused(self, stated: dict[str, Any], message: str) -> None:
-        with pytest.raises(InvalidPanoramaError, match=message):
+        with pytest.raises(InvalidPhotographError, match=message):
             opened(jpeg(view_of(MAIN), PHONE), **stated)
 
     def test_small_and_large_pictures_are_refused(self) -> None:
-        with pytest.raises(InvalidPanoramaError, match="50 x 40; the minimum is 64 pixels"):
+        with pytest.raises(InvalidPhotographError, match="50 x 40; the minimum is 64 pixels"):
             opened(jpeg(np.zeros((40, 50, 3), np.uint8)), hfov_deg=60.0)
         content = jpeg(np.zeros((200, 300, 3), np.uint8))
-        with pytest.raises(InvalidPanoramaError, match="LALALOC_MAX_PIXELS"):
-            open_view(content, sphere_size=(128, 256), limits=PanoramaLimits(max_pixels=1000))
+        with pytest.raises(InvalidPhotographError, match="LALALOC_MAX_PIXELS"):
+            open_photograph(content, sphere_size=(128, 256), limits=PhotographLimits(max_pixels=1000))
 
     def test_intrinsics_are_used_with_their_distortion(self) -> None:
         camera = Perspective(width=640, height=480, fx=420.0, fy=420.0, cx=330.5, cy=230.5, radial=(-0.2, 0.03, 0.0))
@@ -242,7 +242,7 @@ class TestTilt:
         assert np.abs(view.panorama.pixels.astype(int) - expected).mean() < 4.0
 
 
-def patch_error(view: View, name: str, heading_deg: float = 0.0) -> float:
+def patch_error(view: Photograph, name: str, heading_deg: float = 0.0) -> float:
     """Return the mean difference (grey levels) of the patches from the panorama that the photograph was taken from."""
     size = PatchSize()
     camera = Around(width=size.width, height=2 * size.height, hfov=size.hfov, spherical=True)
@@ -341,7 +341,7 @@ class TestPatches:
 
 def test_unreadable_heic_file_names_the_remedy() -> None:
     with pytest.raises(
-        InvalidPanoramaError, match=r"is a HEIC picture, which .*; save or export it as JPEG, PNG or WEBP"
+        InvalidPhotographError, match=r"is a HEIC picture, which .*; save or export it as JPEG, PNG or WEBP"
     ):
         opened(b"\0\0\0\x18ftypheic" + bytes(100))
 

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise
-from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query, RefinementJob, RefinementResult
-from lalaloc_core.localise.ranking import HEADING_SEPARATION, panorama_heading
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import HEADING_SEPARATION, photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedProfile, Query
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet, random_poses
 from tests.core.questions import perfect_query
 from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
@@ -104,7 +105,7 @@ class TestCandidates:
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
         gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
-        turns = np.array([panorama_heading(query, candidate) for candidate in found.candidates])
+        turns = np.array([photograph_heading(query, candidate) for candidate in found.candidates])
         turned = np.abs(wrap_angle(turns[:, None] - turns[None])) > HEADING_SEPARATION
         assert np.all((gaps >= 1.0) | turned)
         refined = [candidate.cost for candidate in found.candidates if candidate.information is not None]
@@ -114,7 +115,7 @@ class TestCandidates:
         assert found.best[found.stage] == found.candidates[0]
         assert flat.room_index_at(positions).tolist() == [candidate.room_index for candidate in found.candidates]
         for candidate in found.candidates:
-            assert -math.pi <= panorama_heading(query, candidate) <= math.pi
+            assert -math.pi <= photograph_heading(query, candidate) <= math.pi
 
     def test_small_plan_has_fewer_candidates(self, encoders: Encoders) -> None:
         plan = plan_of(rectangle(1.2, 1.2))
@@ -130,7 +131,7 @@ class TestCandidates:
     @given(st.floats(-math.pi, math.pi), st.floats(-10.0, 10.0))
     def test_headings_are_wrapped(self, roll: float, frame_heading: float) -> None:
         query = Query(np.eye(2), np.array([0.0, roll]), 0.0, heading_known=False, camera_height=EXACT)
-        heading = panorama_heading(query, Candidate(0.0, 0.0, 0, frame_heading, 1, 0.0, 0.0))
+        heading = photograph_heading(query, Candidate(0.0, 0.0, 0, frame_heading, 1, 0.0, 0.0))
         assert -math.pi <= heading <= math.pi
         assert abs(wrap_angle(heading - roll - frame_heading)) < 1e-9
 
@@ -359,7 +360,7 @@ class TestHeadings:
         middle = place_m[1] == 0.0
         plan, place_m = plan_of(rectangle(3.2, depth_m)), (1.6, 0.5 * depth_m) if middle else place_m
         found = localised(encoders, optimiser, plan, place_m, known=False, noise=noise)
-        headings = [panorama_heading(found.query, candidate) for candidate in found.candidates[:ways]]
+        headings = [photograph_heading(found.query, candidate) for candidate in found.candidates[:ways]]
         step = TWO_PI / ways
         turns = sorted(round(heading / step) % ways for heading in headings)
         assert turns == list(range(ways)), [math.degrees(heading) for heading in headings]

@@ -12,20 +12,37 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import Bundle, ConfidenceModel
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.confidence import Signals, signals_of
-from lalaloc_core.localise.covariance import PoseUncertainty, marginal_information, pose_uncertainty
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.hints import NO_HINTS, Hints, Near, rooms_named
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import Localisation, Refine, localise
-from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
-from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, probability_map, weighted_places
-from lalaloc_core.localise.retrieval import build_grid, grid_costs
+from lalaloc_core.localise.belief import (
+    GridCosts,
+    PoseUncertainty,
+    Posterior,
+    Signals,
+    Support,
+    area_shares,
+    marginal_information,
+    pose_uncertainty,
+    probability_map,
+    signals_of,
+    weighted_places,
+)
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig, PoseGrid
+from lalaloc_core.localise.query import (
+    NO_HINTS,
+    CameraHeight,
+    Candidate,
+    Hints,
+    Near,
+    PredictedProfile,
+    Query,
+    rooms_named,
+)
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+from lalaloc_core.localise.search.pipeline import Localisation, Refine, localise
+from lalaloc_core.localise.search.retrieval import build_grid, grid_costs
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.questions import perfect_query
 from tests.strategies import plan_of, present, rectangle, seeds
@@ -363,9 +380,9 @@ class TestLocalisation:
 def test_allowed_poses_of_a_large_grid_are_compared(
     plan: FloorPlan, grid: PoseGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 8)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 8)
+    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._ALL_COMPARED", 0)
+    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 8)
+    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MAX_COMPARED", 8)
     query = perfect_query(encoders, plan, (2.1, 5.7))
     hints = Hints(rooms=frozenset({1}), strict=True)
     costs = grid_costs(plan, grid, query, encoders.manifest.evidence, MatchingConfig(), hints)

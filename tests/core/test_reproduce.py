@@ -10,6 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 
+from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.cli import main
 from lalaloc_core.errors import CheckpointError, ConfigError, RunError
 from lalaloc_core.evaluate.reproduce import ablations
@@ -24,7 +25,6 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.run import train_layout
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
 from tests.core.questions import question_at, run_info
 from tests.strategies import plan_document, rectangle
 

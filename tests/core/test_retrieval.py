@@ -11,21 +11,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
+from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
-from lalaloc_core.localise.bundle import Manifest, MatchingWeights
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, coarse_costs, likeliest
-from lalaloc_core.localise.cost_terms import latent_distances, precisions
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled
-from lalaloc_core.localise.ranking import suppress
-from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve
-from lalaloc_core.localise.vogel import resample, vogel_disc
+from lalaloc_core.localise.belief import suppress
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import (
+    LowestCosts,
+    MatchingConfig,
+    MatchingCost,
+    PairLimits,
+    PoseGrid,
+    coarse_costs,
+    layouts_at,
+    likeliest,
+)
+from lalaloc_core.localise.match.coarse_pass import _bounds, _table
+from lalaloc_core.localise.match.cost_terms import latent_distances, precisions
+from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedOpenings, PredictedProfile, Query, rolled
+from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, retrieve
+from lalaloc_core.localise.search.vogel import resample, vogel_disc
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from tests.strategies import plan_of, present, rectangle, seeds
 
@@ -185,9 +192,9 @@ class TestRetrieval:
             unknown_heading_query(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
         )
         exhaustive = best_candidates(grid, query, top_k=3)
-        monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
-        monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 50)
-        monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 50)
+        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._ALL_COMPARED", 0)
+        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 50)
+        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MAX_COMPARED", 50)
         costs = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig())
         assert costs.compared == 50
         assert best_candidates(grid, query, top_k=3)[:2] == exhaustive[:2]
@@ -372,8 +379,8 @@ def test_best_pose_and_posterior_equal_the_exhaustive_search(
 def test_estimated_pairs_keep_their_share_of_the_probability(
     building: Building, grid: PoseGrid, queries: list[Query], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 64)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 64)
+    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 64)
+    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MAX_COMPARED", 64)
     # At this temperature thousands of pairs share the probability.
     unsure = MatchingWeights(temperature=8.0, openings=0.4)
     ratios = []

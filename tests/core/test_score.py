@@ -28,8 +28,7 @@ from lalaloc_core.evaluate.runs.score import (
     score,
     score_run,
 )
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
 from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of, run_info
 from tests.strategies import plan_of, present, rectangle

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
@@ -19,13 +20,12 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.splits import VALIDATION, home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
@@ -277,7 +277,7 @@ class TestSearch:
             if refiner is None:
                 assert error_m < 0.5
                 continue
-            turned = wrap_angle(panorama_heading(picture.query, best) - heading)
+            turned = wrap_angle(photograph_heading(picture.query, best) - heading)
             assert error_m < 0.02
             assert abs(turned) < math.radians(0.5)
             assert picture.posterior.candidate[0] > 0.98

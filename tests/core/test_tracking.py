@@ -17,12 +17,11 @@ import pytest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError, InvalidStateError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import run_steps
-from lalaloc_core.localise.poses import PoseGrid, Query
-from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
+from lalaloc_core.localise.search.pipeline import run_steps
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.ground import Ground

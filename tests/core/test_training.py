@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.learn.export.run import export_run
@@ -39,7 +40,6 @@ from lalaloc_core.learn.training.rotation import sample_rotation
 from lalaloc_core.learn.training.run import train_image
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, WallModes
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder

@@ -14,15 +14,14 @@ import pytest
 import torch
 from torch.nn import functional
 
+from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.learn.export.bundle_export import export_bundle
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
-from lalaloc_core.localise.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import rolled
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight, rolled
 from lalaloc_core.nets.image_encoder import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
 from lalaloc_core.nets.trunk import (
     PRETRAINED_PACKAGE,

@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
@@ -34,9 +35,8 @@ from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import Trunk
 from tests.core.test_training import LineStage, same_weights

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.poses import (
-    PoseGrid,
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, layouts_at
+from lalaloc_core.localise.query import (
+    CameraHeight,
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from lalaloc_core.bundle import Bundle, MatchingWeights
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
@@ -26,17 +27,14 @@ from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_views
 from lalaloc_core.learn.training.view_stage import middle
-from lalaloc_core.localise.bundle import Bundle, MatchingWeights
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.poses import PredictedProfile, Query, RivalWall
-from lalaloc_core.localise.view_encoder import LevelPatch, OnnxViewEncoder
+from lalaloc_core.localise.encode.view_encoder import LevelPatch, OnnxViewEncoder
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query, RivalWall
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import WallModes
 from lalaloc_core.nets.view_encoder import ViewEncoder
 from lalaloc_core.photograph.patches import PatchSize
-from lalaloc_core.photograph.view import View
+from lalaloc_core.photograph.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.test_bundle import exported_bundle
 
@@ -91,7 +89,7 @@ class TestViewScenes:
         spheres = GeneratedScenes(homes=1, seed=0, shots_per_home=1)
         name = spheres.scenes("validation")[0]
 
-        def opened(stated: Stated) -> View:
+        def opened(stated: Stated) -> Photograph:
             (camera,) = ViewScenes(spheres, field_deg=80.0, stated=stated).load(name).cameras
             (photograph,) = camera.photographs.values()
             assert isinstance(photograph, ViewPhotograph)

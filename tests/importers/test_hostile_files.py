@@ -27,15 +27,7 @@ from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
 from lalaloc_core.importers.drawing import walls
 from lalaloc_core.importers.drawing.walls import enclose
 from lalaloc_core.importers.formats import dxf
-from tests.importers.conftest import (
-    EXTERNAL_ENTITY,
-    FLAT,
-    NESTED_ENTITIES,
-    ZIP_BOMB,
-    dxf_file,
-    large_picture,
-    zip_file,
-)
+from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 

@@ -18,7 +18,7 @@ from sqlalchemy import update
 from sqlalchemy.exc import DBAPIError
 from starlette.types import Message, Receive, Scope, Send
 
-from service.cli import main
+from service.cli.entry_point import main
 from service.http.middleware import AuthorisationMiddleware
 from service.security import AccessControl
 from service.security.audit import VARIOUS, AuditTrail

@@ -13,8 +13,8 @@ from time import monotonic
 import httpx
 import pytest
 
+from service.capacity.admission_control import Slots
 from service.errors import OverloadedError, ShareExceededError
-from service.http.admission_control import Slots
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
 

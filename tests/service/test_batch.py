@@ -19,7 +19,7 @@ from tests.service.test_security import bearer, make_key
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    limits = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_panorama_bytes": 500_000}
+    limits = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
     with start_app(tmp_path_factory.mktemp("data"), **limits) as started:
         yield started
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from starlette.requests import Request
 from starlette.types import Message
 
+from service.capacity.bytes_in_flight import BytesInFlight
 from service.errors import BytesInFlightError, UploadTooLargeError
-from service.http.bytes_in_flight import BytesInFlight
 from service.http.request_end import ending_request
 from service.http.uploads import UploadLimits, read_body, read_parts
 from service.uploaded_file import UploadedFile

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.localise.bundle import Bundle
 from tests.painted import painted_room
 from tests.service.conftest import StartApp, localise, upload, wait_for
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cores import CoreShares, _quota_cores, share_cores, usable_cores
+from service.capacity.cores import CoreShares, _quota_cores, share_cores, usable_cores
 
 
 @pytest.mark.parametrize("cores", range(4, 130))
@@ -60,7 +60,7 @@ def test_smallest_cgroup_quota_counts(tmp_path: Path, files: dict[str, str], exp
 
 _ARENAS = """
 import ctypes, os, sys, threading
-from service.cores import limit_arenas
+from service.capacity.cores import limit_arenas
 
 is_limited = limit_arenas(3)
 libc, meet = ctypes.CDLL(None), threading.Barrier(8)

@@ -19,7 +19,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from sqlalchemy import select
 
-from service.query import decoding
+from service.decoding import decoder as decoding
 from service.storage.database import Database
 from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME

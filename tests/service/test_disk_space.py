@@ -15,7 +15,7 @@ import pytest
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
-from service.cli import main
+from service.cli.entry_point import main
 from service.errors import StoreFullError
 from service.storage import database, disk_reserve
 from service.storage.records import DEFAULT_TENANT, Original

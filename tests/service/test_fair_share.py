@@ -16,13 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.floorplan import FloorPlan
+from service.capacity.cpu_accounts import PROBES, CpuAccounts
+from service.capacity.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
+from service.capacity.threads import BoundedReads, IdleCores, Threads
 from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import Original
 from service.storage.store import Store
-from service.tenancy.cpu_accounts import PROBES, CpuAccounts
-from service.tenancy.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
-from service.threads import BoundedReads, IdleCores, Threads
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 WORST = "127.0.0.2"

@@ -19,11 +19,11 @@ import httpx
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.features import MAX_BYTES, FeatureEncoder, read_features
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-from lalaloc_core.photograph import View, open_view
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.localise.encode.features import MAX_BYTES, FeatureEncoder, read_features
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.photograph import Photograph, open_photograph
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp, assert_problem, upload, wait_for
 from tests.service.test_oscp import ANCHOR, NORTH_DEG, oscp_request
@@ -43,9 +43,9 @@ class Device:
         self.bundle = Bundle.open(default_bundle())
         self._encoder = FeatureEncoder(self.bundle, threads=1)
 
-    def view(self, photograph: bytes) -> View:
+    def view(self, photograph: bytes) -> Photograph:
         manifest = self.bundle.manifest
-        return open_view(photograph, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
+        return open_photograph(photograph, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
 
     def features(self, photograph: bytes) -> bytes:
         return self._encoder.features(self.view(photograph))

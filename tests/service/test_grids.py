@@ -18,12 +18,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from lalaloc_core.bundle import Bundle, write_manifest
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Bundle, write_manifest
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.retrieval import build_grid
-from service.bounded_cache import BoundedCache
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.search.retrieval import build_grid
+from service.capacity.bounded_cache import BoundedCache
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairSemaphore
+from service.capacity.threads import BoundedReads
 from service.errors import (
     OverloadedError,
     PlanFailedError,
@@ -44,9 +47,6 @@ from service.storage.plan_lookup import PlanLookup
 from service.storage.records import Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairSemaphore
-from service.threads import BoundedReads
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.hints import Hints, Near
-from lalaloc_core.localise.pipeline import Localisation
-from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import Posterior, Support
-from service.query.stated_camera import hint_warnings
+from lalaloc_core.localise.belief import Posterior, Support
+from lalaloc_core.localise.query import CameraHeight, Candidate, Hints, Near, Query
+from lalaloc_core.localise.search.pipeline import Localisation
+from service.query.stated_pose import hint_warnings
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 from tests.strategies import rectangle
 

@@ -14,7 +14,7 @@ import yaml
 
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
-from service.http.admission_control import EXEMPT
+from service.capacity.admission_control import EXEMPT
 from service.openapi import openapi_text
 from service.runtime import Runtime, get_runtime
 from service.settings import Settings

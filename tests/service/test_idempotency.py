@@ -18,8 +18,9 @@ from sqlalchemy import select
 from starlette.requests import Request
 from starlette.responses import Response
 
-from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
+from service.capacity.threads import BoundedReads
 from service.errors import (
     DecoderNotReadyError,
     PlanFailedError,
@@ -35,7 +36,6 @@ from service.storage.records import Claimed, Original
 from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
-from service.threads import BoundedReads
 from service.uploaded_file import UploadedFile
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 
@@ -281,7 +281,7 @@ def test_failed_but_stored_upload_is_found_by_the_retry(store: Store) -> None:
 
 
 def _poisoned() -> Exception:
-    error = InvalidPanoramaError("twice that took longer")
+    error = InvalidPhotographError("twice that took longer")
     error.__cause__ = JobLostError("poisoned")
     return error
 
@@ -289,7 +289,7 @@ def _poisoned() -> Exception:
 @pytest.mark.parametrize(
     ("refusal", "kept"),
     [
-        (InvalidPanoramaError("no picture"), True),
+        (InvalidPhotographError("no picture"), True),
         (UnknownFloorPlanError("x"), True),
         (_poisoned(), False),
         (PlanFailedError("x", "internal error"), False),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import main
+from service.cli.entry_point import main
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, upload
 
 CREATE = ["keys", "create", "--tenant", "acme", "--name", "camera 7"]

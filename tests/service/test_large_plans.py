@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan, json_text
-from service.conversion import Converter
+from service.plan_files.converter import Converter
 from service.settings import Settings
 from service.stored_plan import LARGE, PackedPlan, PlanDocument
 from service.telemetry import Telemetry

@@ -10,9 +10,9 @@ from typing import Any
 import httpx
 import pytest
 
+from service.capacity.fair_share import max_per_client
 from service.schemas import LimitsAnswer
 from service.settings import Settings
-from service.tenancy.fair_share import max_per_client
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
 
 
@@ -67,7 +67,7 @@ def test_plan_quota_is_enforced(start_app: StartApp, tmp_path: Path) -> None:
 
 def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     many_scans = encode_picture(256, 128, "JPEG", progressive=True)
-    with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_panorama_bytes=100_000) as client:
+    with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_photograph_bytes=100_000) as client:
         plan_id = upload(client)
         # A request without top_k gets no more candidates than allowed.
         allowed = localise(client, plan_id, encode_picture(256, 128, "JPEG"))
@@ -77,7 +77,7 @@ def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, pano
             "max_pixels": localise(client, plan_id, panorama, top_k=3),
             "max_scans": localise(client, plan_id, many_scans, top_k=3),
             "max_top_k": localise(client, plan_id, panorama, top_k=4),
-            "max_panorama_bytes": localise(client, plan_id, bytes(100_001), top_k=3),
+            "max_photograph_bytes": localise(client, plan_id, bytes(100_001), top_k=3),
         }
         for name, response in refusals.items():
             assert 400 <= response.status_code < 500

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from shapely import Point
 
+from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise import pipeline
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.panorama.images import read_panorama
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search import pipeline
+from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.photograph.spheres import read_sphere
 from service.schemas import TimingsAnswer
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
@@ -220,7 +220,7 @@ def test_invalid_panorama_is_rejected_with_its_fault(
 
 
 def test_too_large_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    with start_app(tmp_path, max_panorama_bytes=len(panorama) - 1) as client:
+    with start_app(tmp_path, max_photograph_bytes=len(panorama) - 1) as client:
         plan_id = upload(client)
         assert (
             str(len(panorama) - 1)
@@ -312,8 +312,8 @@ def test_confidence_does_not_depend_on_top_k(
 def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipeline.Localisation:
     """Return the core's retrieval result for a query of the flat."""
     encoders = Encoders(Bundle.open(bundle), threads=1)
-    manifest, limits = encoders.manifest, Settings().panoramas.panorama_limits
-    image = read_panorama(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
+    manifest, limits = encoders.manifest, Settings().photographs.photograph_limits
+    image = read_sphere(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
     query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
     plan = FloorPlan.from_dict(FLAT)
     grid = build_grid(plan, encoders, step_m=Settings().grids.grid_step_m, camera_height_m=1.5)

@@ -19,15 +19,15 @@ import numpy as np
 import psutil
 import pytest
 
-from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceResult
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairSemaphore
 from service.query import lpo_pool
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import warm_up_job
 from tests.service.conftest import end_time_limits, wait_for
 
@@ -88,7 +88,7 @@ def _workers() -> list[int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("by_profile", [False, True])
 def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
-    from lalaloc_core.localise.optimise import PoseRefiner
+    from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 
     job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
     expected = PoseRefiner.from_bundle(bundle).refine(job)

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.cli import main as lalaloc_service
+from service.cli.entry_point import main as lalaloc_service
 from service.settings import SETTING_NAMES
 from service.storage import Store
 from tests.service.conftest import StartApp, localise, upload, wait_for

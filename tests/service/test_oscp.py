@@ -176,7 +176,7 @@ def test_missing_and_invalid_members_are_refused(
 
 
 def test_invalid_and_large_pictures_are_refused(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, max_panorama_bytes=2000) as client:
+    with start_app(tmp_path, max_photograph_bytes=2000) as client:
         plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 0})
         params = {"floorplan_id": plan_id}
         picture = client.post("/geopose", params=params, json=oscp_request(b"no picture"))

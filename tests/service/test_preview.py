@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from lalaloc_core.draw.plan import Marker, plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from service.renditions.mesh import plan_glb
+from service.plan_files.plan_mesh import plan_glb
 from tests.service.conftest import FLAT
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.localise.venue.prototypes import ROW
-from service.query.prototype_file import BlockKey, PrototypeFile
+from service.venues.prototype_file import BlockKey, PrototypeFile
 
 LIMIT = 1000 * ROW.itemsize
 

@@ -15,20 +15,22 @@ import httpx
 import pytest
 from pydantic import BaseModel
 
+from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.draw.plan import Marker, draw_rooms, plan_svg
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from service.conversion import Converter, RenditionCache, rendition_cache
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError
-from service.renditions.layout import plan_layout
-from service.renditions.mesh import plan_glb
+from service.plan_files import rendition_cache
+from service.plan_files.converter import Converter
+from service.plan_files.plan_mesh import plan_glb
+from service.plan_files.rendition_cache import RenditionCache
+from service.plan_files.renditions import plan_layout
 from service.settings import Settings
 from service.storage import Store
 from service.storage.records import Original
 from service.stored_plan import Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairSemaphore
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload
 from tests.strategies import plan_of, spiral

@@ -108,7 +108,7 @@ def test_refusals_do_not_disable_a_replica(start_app: StartApp, postgres: Postgr
 def test_proxy_accepts_the_largest_uploads(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     url = postgres.new_database()
     with start_app(tmp_path / "a", database_url=url) as a, nginx(tmp_path, [a, a]) as proxy:
-        limit = a.get("/limits").json()["max_panorama_bytes"]
+        limit = a.get("/limits").json()["max_photograph_bytes"]
         # The service's own refusal, a problem document, and not the proxy's page.
         answer = proxy.post("/localise", files={"panorama": ("p.jpg", bytes(limit - 1))})
         assert answer.status_code == 422, answer.text

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from service.capacity.cpu_accounts import CpuAccounts
+from service.capacity.fair_share import FairSemaphore
 from service.query import search_steps
 from service.query.lpo_pool import LpoPool
 from service.query.search_steps import StepRunner, completed
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.tenancy.cpu_accounts import CpuAccounts
-from service.tenancy.fair_share import FairSemaphore
 from service.workers.lpo import warm_up_job
 
 Steps = Generator[RefinementJob | None, RefinementResult | None, RefinementResult | None]

@@ -21,7 +21,7 @@ MOTION = {"distance_m": 1.5, "distance_std_m": 0.1, "turn_deg": 30, "turn_std_de
 
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), max_sequence_panoramas=30, max_sequence_bytes=300_000) as started:
+    with start_app(tmp_path_factory.mktemp("data"), max_sequence_photographs=30, max_sequence_bytes=300_000) as started:
         yield started
 
 
@@ -178,7 +178,7 @@ def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id
     problem = assert_problem(ask(client, plan_id, [panorama, bytes(370_000)]), 413, "upload-too-large")
     assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
-    assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (30, 300_000)
+    assert (limits["max_sequence_photographs"], limits["max_sequence_bytes"]) == (30, 300_000)
 
 
 def test_stated_motion_is_parsed() -> None:

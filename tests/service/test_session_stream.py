@@ -114,7 +114,7 @@ def test_refused_photographs_leave_the_connection_open(client: httpx.Client, pla
 def test_photograph_over_the_limit_is_refused_before_it_is_read(
     start_app: StartApp, tmp_path: Path, panorama: bytes
 ) -> None:
-    with start_app(tmp_path, max_panorama_bytes=64 * 1024) as client:
+    with start_app(tmp_path, max_photograph_bytes=64 * 1024) as client:
         session_id = begin(client, upload(client))
         with stream(client, session_id) as connection:
             for kib in (65, 200):

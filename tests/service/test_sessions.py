@@ -13,8 +13,8 @@ from typing import Any
 import httpx
 import pytest
 
-from service.query import venue_plans
 from service.storage.store import Store
+from service.venues import venue_plans
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
 
 

@@ -25,7 +25,7 @@ from sqlalchemy import Connection, delete, event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 from service.errors import (
     DamagedDataError,

@@ -27,7 +27,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from opentelemetry.trace import SpanContext
 
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.search.pipeline import StageClock
 from service.telemetry import LOGGER_NAME, RequestLogFields
 from service.telemetry.logs import JsonFormatter
 from service.telemetry.trace_context import TraceContext, child_of, parse_traceparent

@@ -15,17 +15,9 @@ import pytest
 from sqlalchemy import func, select
 
 from lalaloc_core.floorplan import FloorPlan
-from service.cli import main
+from service.cli.entry_point import main
 from service.errors import StorageQuotaError
-from service.storage.records import (
-    Claimed,
-    ComputedGrid,
-    GridKey,
-    OperatorLimits,
-    Original,
-    StoredAnswer,
-    VenueMember,
-)
+from service.storage.records import Claimed, ComputedGrid, GridKey, OperatorLimits, Original, StoredAnswer, VenueMember
 from service.storage.store import Store
 from service.storage.tables import AUDIT_LOG, IDEMPOTENCY, METADATA, TENANTS
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for

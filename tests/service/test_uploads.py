@@ -102,7 +102,7 @@ def test_large_form_needs_no_temporary_folder(
     [
         ("/floorplans", "application/json", "max_plan_bytes"),
         ("/floorplans", "multipart/form-data; boundary=x", "max_plan_bytes"),
-        ("/localise", "multipart/form-data; boundary=x", "max_panorama_bytes"),
+        ("/localise", "multipart/form-data; boundary=x", "max_photograph_bytes"),
     ],
 )
 def test_body_without_a_length_stops_at_the_limit(

@@ -16,16 +16,16 @@ import pytest
 from sqlalchemy import update
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.render.sampling import PoseSet
-from service.bounded_cache import BoundedCache
-from service.query import venue_plans
-from service.query.plan_indices import Indexed
-from service.query.venue_plans import VenuePlans
+from service.capacity.bounded_cache import BoundedCache
 from service.storage import Store
 from service.storage.records import GridKey, Original, VenueMember
 from service.storage.tables import FLOORPLANS, TENANTS
+from service.venues import venue_plans
+from service.venues.plan_indices import Indexed
+from service.venues.venue_plans import VenuePlans
 from tests.service.conftest import FLAT, StartApp, upload
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan.earth import Anchor
-from service.query import venue_plans
+from service.venues import venue_plans
 from tests.service.conftest import FLAT, assert_problem, upload
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 

@@ -13,10 +13,10 @@ from typing import Any
 import httpx
 import pytest
 
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid
 from service.grids import builder
-from service.query import venue_plans
 from service.storage.stored_grids import StoredGrids
+from service.venues import venue_plans
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 from tests.service.test_localise import HALL
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lalaloc_core.localise.bundle import default_bundle
+from lalaloc_core.bundle import default_bundle
 from tests.core.taken import EXAMPLES, sphere
 from tests.service.conftest import StartApp, upload, wait_for
 

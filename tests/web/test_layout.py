@@ -11,7 +11,7 @@ import pytest
 from lalaloc_core.conventions import OPENING_CLASSES, row_elevations
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.layout import LayoutView, layout_view
+from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import cast_rays
 from tests.service.conftest import upload
 from tests.web.conftest import EXAMPLES, Visit
@@ -55,9 +55,9 @@ def _in_browser(desktop: Visit, flat: FloorPlan, poses: list[Any], function: str
     return page.evaluate(script, [rooms, poses, HEIGHT_M])
 
 
-def _rendered(flat: FloorPlan, poses: list[tuple[int, float, float, float]]) -> LayoutView:
+def _rendered(flat: FloorPlan, poses: list[tuple[int, float, float, float]]) -> RenderedLayout:
     room, x, y, heading = (np.array(values) for values in zip(*poses, strict=True))
-    return layout_view(np.stack([x, y], axis=1), np.radians(heading), room, flat.geometry, COLUMNS, HEIGHT_M)
+    return render_layout(np.stack([x, y], axis=1), np.radians(heading), room, flat.geometry, COLUMNS, HEIGHT_M)
 
 
 def test_view_agrees_with_the_renderer(

@@ -18,10 +18,10 @@ import pytest
 from PIL import ExifTags
 from playwright.sync_api import Browser, Route, expect
 
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.localise.features import FeatureEncoder, read_features
-from lalaloc_core.localise.photograph_encoder import patch_size, sphere_size
-from lalaloc_core.photograph import StatedView, open_view
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.service.conftest import StartApp
@@ -158,8 +158,8 @@ def test_features_replace_the_photograph(browser: Browser, service: httpx.Client
     assert b'name="photo"' not in sent
     bundle = Bundle.open(default_bundle())
     manifest = bundle.manifest
-    view = open_view(
-        content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), stated=StatedView(**stated)
+    view = open_photograph(
+        content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), stated=StatedCamera(**stated)
     )
     expected = read_features(FeatureEncoder(bundle, threads=1).features(view), bundle)
     found = read_features(features, bundle)

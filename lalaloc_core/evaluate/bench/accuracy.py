@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import StageScores, score
 from lalaloc_core.learn.data.views import Stated
-from lalaloc_core.localise.bundle import Bundle
 
 # Limits for minor figures, and for the comparison of matching costs, which repeats its queries six times.
 _MAX_MINOR_HOMES = 100

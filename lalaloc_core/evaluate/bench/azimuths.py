@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
 from lalaloc_core.learn.data.dataset import Camera, Dataset
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.render.layout import layout_view
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.render.layout import render_layout
 
 _MAX_HOMES = 100
 
@@ -63,5 +63,5 @@ def _measure(encoders: Encoders, plan: FloorPlan, camera: Camera, image: UInt8[n
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
     pose = (camera.position_m[None], heading, room, plan.geometry, len(log_m), camera.camera_height_m)
-    view = layout_view(*pose)
+    view = render_layout(*pose)
     return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)

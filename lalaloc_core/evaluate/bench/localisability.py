@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.evaluate.bench.prediction_errors import outcomes_of, predicted_shares
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.localisability import errors_of
+from lalaloc_core.localise.localisability.predicted_localisability import errors_of
 
 # Each spot is localised six times.
 _MAX_HOMES = 65

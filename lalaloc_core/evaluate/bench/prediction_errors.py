@@ -1,4 +1,4 @@
-"""Errors of a model's predictions, measured on generated homes for `localise.localisability`.
+"""Errors of a model's predictions, measured on generated homes for `localise.localisability.predicted_localisability`.
 
 The photographs of a spot are its sphere and three views of 80°. `measure_errors` compares the predictions with the
 plan's layout there, and fits the spread of the drawn errors: the one with which the share of photographs that is
@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.special import ndtri
 
+from lalaloc_core.bundle import Bundle, Manifest, PredictionErrors, write_manifest
+from lalaloc_core.bundle.prediction_errors import LEVELS
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
@@ -23,16 +25,13 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Split
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
-from lalaloc_core.localise.bundle import Bundle, Manifest, write_manifest
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.localisability import Errors, Searches
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.pipeline import Refiner, localise
-from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M
-from lalaloc_core.localise.prediction_errors import LEVELS, PredictionErrors
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import RIGHT_WITHIN_M
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches
+from lalaloc_core.localise.match import layouts_at
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.search.pipeline import Refiner, localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet
 
 _FIELD_DEG, _VIEWS = 80.0, 3

@@ -9,16 +9,16 @@ from types import CodeType
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import StageClock, localise
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import StageClock, localise
+from lalaloc_core.localise.search.retrieval import build_grid
 
 _GRID_STEP_M = 0.5
 _FUNCTIONS = 20

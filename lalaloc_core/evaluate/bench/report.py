@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.accuracy import (
     bench_accuracy,
     bench_copies,
@@ -21,7 +22,6 @@ from lalaloc_core.evaluate.bench.service import bench_service
 from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
 from lalaloc_core.evaluate.bench.turns import bench_turns
 from lalaloc_core.evaluate.bench.uninformative import bench_uninformative
-from lalaloc_core.localise.bundle import Bundle
 
 
 def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:

@@ -20,13 +20,13 @@ import httpx
 import numpy as np
 from PIL import Image
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import without_openings
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.photograph.cameras import Perspective
 
 _REQUESTS = 40

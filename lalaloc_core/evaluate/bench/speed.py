@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.evaluate.methods.method import Method, Question
@@ -29,9 +30,8 @@ from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import TEST, home_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_depth

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
@@ -15,17 +16,16 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.pipeline import Localisation, Refiner, localise
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise
+from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.motion import Motion
 from lalaloc_core.localise.sequence.search import localise_sequence
 from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
-from lalaloc_core.photograph import View
+from lalaloc_core.photograph import Photograph
 
 _FIELD_DEG, _VIEWS = 80.0, 3
 GRID_STEP_M = 0.5
@@ -82,7 +82,7 @@ def _at_spot(
     }
 
 
-def _opened(camera: Camera, encoder: PhotographEncoder) -> View:
+def _opened(camera: Camera, encoder: PhotographEncoder) -> Photograph:
     (photograph,) = camera.photographs.values()
     assert isinstance(photograph, ViewPhotograph)
     return photograph.open(patch_size(encoder.networks.manifest))
@@ -90,7 +90,7 @@ def _opened(camera: Camera, encoder: PhotographEncoder) -> View:
 
 def _answer(found: Localisation, camera: Camera, confidence: float | None) -> _Answer:
     answer = found.candidates[0]
-    turned = abs(float(wrap_angle(panorama_heading(found.query, answer) - camera.heading)))
+    turned = abs(float(wrap_angle(photograph_heading(found.query, answer) - camera.heading)))
     error_m = float(np.linalg.norm(answer.position_m - camera.position_m))
     return _Answer(error_m, turned, np.nan if confidence is None else confidence)
 

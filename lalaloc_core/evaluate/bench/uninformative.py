@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import WALL_CODE, wrap_angle
 from lalaloc_core.evaluate.bench.turns import GRID_STEP_M
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
@@ -18,16 +19,15 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import cut_view
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.information import CONFIDENT
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.photograph import View, open_view
+from lalaloc_core.localise.belief import CONFIDENT
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.localise.match import layouts_at
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.photograph import Photograph, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.stated import StatedView
+from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.render.sampling import PoseSet
 
 _SPHERE_SIZE, _VIEW_SIZE = (512, 1024), (640, 480)
@@ -110,12 +110,12 @@ def landscape(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     return picture.clip(0.0, 255.0).astype(np.uint8)
 
 
-def _opened(picture: UInt8[np.ndarray, "h w 3"], field_deg: float, bundle: Bundle) -> View:
+def _opened(picture: UInt8[np.ndarray, "h w 3"], field_deg: float, bundle: Bundle) -> Photograph:
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "JPEG", quality=90)
-    stated = StatedView(projection="perspective", hfov_deg=field_deg)
+    stated = StatedCamera(projection="perspective", hfov_deg=field_deg)
     manifest = bundle.manifest
-    return open_view(
+    return open_photograph(
         content.getvalue(), sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
     )
 

@@ -11,7 +11,8 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from lalaloc_core.localise.optimise import LpoConfig, PoseOptimiser
+from lalaloc_core.localise.refine import LpoConfig
+from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.render.depth import layout_depth
 
 

@@ -16,10 +16,10 @@ from torch.nn import functional
 from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.evaluate.methods.method import Answer, Question
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
-from lalaloc_core.localise.refinement import refinement_job
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.refine.refinement import refinement_job
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock, localise
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 
 

@@ -20,10 +20,10 @@ from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import read_image
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
-from lalaloc_core.localise.poses import RefinementJob
-from lalaloc_core.localise.vogel import disc_poses
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.refine import RefinementJob
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock
+from lalaloc_core.localise.search.vogel import disc_poses
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.sampling import PoseSet
 

@@ -26,7 +26,7 @@ from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, plan_key
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.search.pipeline import StageClock
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,25 +14,19 @@ import torch
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
 from lalaloc_core.learn.data.views import ViewPhotograph
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import LpoConfig, PoseRefiner
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.pipeline import (
-    LocaliseConfig,
-    Refine,
-    Refiner,
-    StageClock,
-    localise,
-)
-from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
-from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.match import MatchingConfig, PoseGrid
+from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
+from lalaloc_core.localise.refine import LpoConfig
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, Refiner, StageClock, localise
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
@@ -194,7 +188,7 @@ def found_pose(query: Query, candidate: Candidate) -> FoundPose:
         x_m=candidate.x_m,
         y_m=candidate.y_m,
         room_index=candidate.room_index,
-        heading=panorama_heading(query, candidate),
+        heading=photograph_heading(query, candidate),
         distance=candidate.cost,
     )
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Camera, Photograph
+from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 
@@ -32,7 +32,7 @@ class Question:
     grid_step_m: float
     camera: Camera
     kind: QueryKind
-    photograph: Photograph | None
+    photograph: DatasetPhotograph | None
     heading_known: bool = True
 
     @cached_property
@@ -45,7 +45,7 @@ class Question:
         room = np.array([self.camera.room_index])
         return profiles_at(self.plan, self.camera.position_m[None], room, np.zeros(1), columns)[0]
 
-    def require_photograph(self) -> Photograph:
+    def require_photograph(self) -> DatasetPhotograph:
         """Return the photograph of a panorama query.
 
         Raises:
@@ -83,8 +83,8 @@ class Answer:
     Attributes:
         stages: the best pose after each stage, in order; the last is the final pose. Empty without an answer.
         retrieved: index of the retrieved grid pose; None for methods without retrieval.
-        signals: inputs of the confidence model by stage; see `localise.confidence`.
-        information: curvature of the cost at the final pose; see `localise.poses.Candidate`.
+        signals: inputs of the confidence model by stage; see `localise.belief.confidence`.
+        information: curvature of the cost at the final pose; see `localise.query.poses.Candidate`.
         confidence: probability of a position error below 1 m; None without a confidence model.
         heading_confidence: probability of a heading error below 5°; None without a confidence model.
     """

@@ -27,8 +27,8 @@ from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
 from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.cost_terms import latent_distances
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match.cost_terms import latent_distances
 
 PER_GROUP = 3
 BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"

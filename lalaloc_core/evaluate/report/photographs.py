@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from PIL import Image
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import InvalidInputError
@@ -40,8 +41,7 @@ from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.azimuth_metrics import ClassScores, summarise_azimuths
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
 
 _HEIGHT, _WIDTH = 256, 512
 CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}

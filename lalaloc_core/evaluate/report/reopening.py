@@ -9,7 +9,7 @@ from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.runs.factories import require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.render.sampling import pose_grid
 
 _SAME_PLACE_M = 1e-3

@@ -17,24 +17,14 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
-from lalaloc_core.evaluate.report.pictures import (
-    FOUND_COLOUR,
-    PREDICTED_COLOUR,
-    TRUE_COLOUR,
-    layout_lines,
-)
+from lalaloc_core.evaluate.report.pictures import FOUND_COLOUR, PREDICTED_COLOUR, TRUE_COLOUR, layout_lines
 from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
-from lalaloc_core.evaluate.report.sheets import (
-    PER_SHEET,
-    PICTURE_HEIGHT,
-    PICTURE_WIDTH,
-    Thumbnail,
-    draw_sheet,
-)
+from lalaloc_core.evaluate.report.sheets import PER_SHEET, PICTURE_HEIGHT, PICTURE_WIDTH, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.tables import distance, percent
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
@@ -42,11 +32,9 @@ from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, 
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
+from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 
 import torch
 
+from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run import export_run
@@ -22,7 +23,6 @@ from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConf
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
-from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.render.sampling import TripletSampling
 

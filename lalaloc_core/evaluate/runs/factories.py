@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import torch
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.decode import VdrDecode
@@ -25,12 +26,11 @@ from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedSce
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.learn.data.views import ViewScenes
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.optimise import LpoConfig
-from lalaloc_core.localise.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.query import DEFAULT_STD_M
+from lalaloc_core.localise.refine import LpoConfig
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine
 from lalaloc_core.nets import load_decoder
 
 

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.search.retrieval import build_grid
 
 # Five homes and five offices, each with and without openings; the fit of the confidence has other ones.
 _EACH, _HOMES, _OFFICES = 5, (2, 0), 77

@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.errors import BundleError
 from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import CameraHeight
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -63,7 +63,7 @@ class Prediction:
             None for methods without retrieval.
         pose_hit: whether it chose the nearest grid pose (Pose R@1).
         room_rank: rank of the best candidate in the true room, from 1; None without one.
-        signals: inputs of the confidence model by stage; see `localise.confidence`.
+        signals: inputs of the confidence model by stage; see `localise.belief.confidence`.
         information: curvature of the cost at the final pose, by x and y (m) and, if searched, heading (radians).
         confidence: predicted probability of a position error below 1 m.
         heading_confidence: predicted probability of a heading error below 5°.

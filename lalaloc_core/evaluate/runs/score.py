@@ -19,12 +19,7 @@ from scipy.stats import binomtest
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.runs.predictions import (
-    SCORES_FILE,
-    Prediction,
-    RunFolder,
-    without_infinity,
-)
+from lalaloc_core.evaluate.runs.predictions import SCORES_FILE, Prediction, RunFolder, without_infinity
 from lalaloc_core.files import atomic_write
 
 _RESAMPLES = 1000

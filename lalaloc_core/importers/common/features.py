@@ -24,14 +24,7 @@ from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.projection import projection
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.sketch import (
-    Level,
-    OpeningKind,
-    Point,
-    Sketch,
-    SketchedOpening,
-    SketchedRoom,
-)
+from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
 
 _FEATURE_TYPES: Mapping[str, Role] = {

@@ -22,13 +22,7 @@ from lalaloc_core.importers.common.geometry import opening_line, polygons_from_g
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.sketch import (
-    Level,
-    OpeningKind,
-    Sketch,
-    SketchedOpening,
-    SketchedRoom,
-)
+from lalaloc_core.importers.common.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import role_from_name
 
 # Faces up to this height above the lowest point of a space are its floor.

@@ -24,14 +24,7 @@ from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geome
 from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.options import ImportOptions
 from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.common.sketch import (
-    Level,
-    OpeningKind,
-    Point,
-    Sketch,
-    SketchedOpening,
-    SketchedRoom,
-)
+from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.walls import enclose
 

@@ -5,7 +5,7 @@ opens its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data) 
 of real rooms). `assembly.py` builds validated plans for the readers. Generated data sets are in `synthetic/`.
 """
 
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Photograph, Scene, Split, load_scenes
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 
-__all__ = ["Appearance", "Camera", "Dataset", "Photograph", "Scene", "Split", "load_scenes", "open_dataset"]
+__all__ = ["Appearance", "Camera", "Dataset", "DatasetPhotograph", "Scene", "Split", "load_scenes", "open_dataset"]

@@ -39,7 +39,7 @@ class Appearance:
 
 
 @runtime_checkable
-class Photograph(Protocol):
+class DatasetPhotograph(Protocol):
     """Panorama that is read on demand."""
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
@@ -57,7 +57,7 @@ class Photograph(Protocol):
 
 @runtime_checkable
 class Described(Protocol):
-    """Photograph with known facts that make it hard to localise, besides its appearance."""
+    """DatasetPhotograph with known facts that make it hard to localise, besides its appearance."""
 
     @property
     def facts(self) -> frozenset[str]:
@@ -65,7 +65,7 @@ class Described(Protocol):
         ...
 
 
-def photograph_facts(photograph: Photograph | None) -> frozenset[str]:
+def photograph_facts(photograph: DatasetPhotograph | None) -> frozenset[str]:
     """Return the facts of a photograph; empty if they are unknown."""
     return photograph.facts if isinstance(photograph, Described) else frozenset()
 
@@ -86,7 +86,7 @@ class Camera:
     room_index: int
     heading: float
     camera_height_m: float
-    photographs: Mapping[Appearance, Photograph]
+    photographs: Mapping[Appearance, DatasetPhotograph]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,7 +97,7 @@ class Scene:
     plan: FloorPlan
     cameras: tuple[Camera, ...]
 
-    def photograph(self, camera: Camera, appearance: Appearance) -> Photograph:
+    def photograph(self, camera: Camera, appearance: Appearance) -> DatasetPhotograph:
         """Return a photograph of a camera.
 
         Raises:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from lalaloc_core.errors import DatasetError, InvalidPanoramaError
-from lalaloc_core.panorama.images import PanoramaLimits, read_panorama
+from lalaloc_core.errors import DatasetError, InvalidPhotographError
+from lalaloc_core.photograph.spheres import PhotographLimits, read_sphere
 
 _MM_PER_M = 1000.0
 
@@ -39,13 +39,13 @@ class FilePhotograph:
             DatasetError: the file is missing, damaged, not a panorama, or not of the data set's size.
         """
         content = self._read(self.path)
-        limits = PanoramaLimits()
+        limits = PhotographLimits()
         if self.size is not None:
             self._check_size(self.path, content)
-            limits = PanoramaLimits(min_height=self.size[0])
+            limits = PhotographLimits(min_height=self.size[0])
         try:
-            return read_panorama(content, height=height, width=width, limits=limits)
-        except InvalidPanoramaError as error:
+            return read_sphere(content, height=height, width=width, limits=limits)
+        except InvalidPhotographError as error:
             raise self._error(str(error), self.path) from error
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:

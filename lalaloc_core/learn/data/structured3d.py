@@ -22,7 +22,7 @@ import numpy as np
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph, Scene, Split
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split
 from lalaloc_core.learn.data.photographs import FilePhotograph
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 from lalaloc_core.learn.data.structured3d_splits import scene_numbers
@@ -149,8 +149,8 @@ class Structured3D:
             photographs=self._photographs(scene, room, folder),
         )
 
-    def _photographs(self, scene: str, room: str, folder: Path) -> Mapping[Appearance, Photograph]:
-        found: dict[Appearance, Photograph] = {}
+    def _photographs(self, scene: str, room: str, folder: Path) -> Mapping[Appearance, DatasetPhotograph]:
+        found: dict[Appearance, DatasetPhotograph] = {}
         for furniture in FURNITURE:
             level = folder / furniture
             files, depth_path = _names(level), level / "depth.png"

@@ -18,12 +18,12 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Photograph, Scene, Split
-from lalaloc_core.panorama.levelling import camera_axes
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.patches import PatchSize
-from lalaloc_core.photograph.stated import StatedView
-from lalaloc_core.photograph.view import View, open_view
+from lalaloc_core.photograph.photograph import Photograph, open_photograph
+from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.photograph.stated_camera import StatedCamera
 
 # What is stated about photographs: nothing, the field of view, or the tilt as well.
 Stated = Literal["nothing", "field", "tilt"]
@@ -83,7 +83,7 @@ class ViewScenes:
             azimuth = float(wrap_angle(TWO_PI * number / self.per_camera))
             lens_deg = rng.uniform(*FIELDS_DEG)
             pitch, roll = tilt_by_hand(rng)
-            photographs: dict[Appearance, Photograph] = {
+            photographs: dict[Appearance, DatasetPhotograph] = {
                 look: ViewPhotograph(
                     sphere=sphere,
                     azimuth=azimuth,
@@ -111,9 +111,9 @@ def tilt_by_hand(rng: np.random.Generator) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class CachedSphere:
-    """Photograph of which several views are cut."""
+    """DatasetPhotograph of which several views are cut."""
 
-    photograph: Photograph
+    photograph: DatasetPhotograph
 
     @cached_property
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -140,18 +140,18 @@ class ViewPhotograph:
     roll: float
     stated: Stated = "field"
 
-    def open(self, size: PatchSize) -> View:
+    def open(self, size: PatchSize) -> Photograph:
         """Read the photograph as the service reads a file."""
         content = io.BytesIO()
         Image.fromarray(self._pixels()).save(content, "JPEG", quality=_JPEG_QUALITY)
         tilted = self.stated == "tilt"
-        stated = StatedView(
+        stated = StatedCamera(
             projection="perspective",
             hfov_deg=None if self.stated == "nothing" else self.field_deg,
             pitch_deg=math.degrees(self.pitch) if tilted else None,
             roll_deg=math.degrees(self.roll) if tilted else None,
         )
-        return open_view(content.getvalue(), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
+        return open_photograph(content.getvalue(), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return the whole sphere at the given size, turned to the view."""

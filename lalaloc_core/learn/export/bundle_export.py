@@ -20,12 +20,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
-from lalaloc_core.errors import ExportError
-from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
-from lalaloc_core.localise.bundle import (
+from lalaloc_core.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
     HEAD_ONNX,
@@ -41,6 +36,11 @@ from lalaloc_core.localise.bundle import (
     ViewManifest,
     write_manifest,
 )
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.errors import ExportError
+from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder

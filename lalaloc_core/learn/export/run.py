@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.learn.export.bundle_export import (
     add_view_encoder,
@@ -26,7 +27,6 @@ from lalaloc_core.learn.training.warm_start import (
     panorama_count,
     training_totals,
 )
-from lalaloc_core.localise.bundle import IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.nets import ImageEncoder, load_layout_encoder
 from lalaloc_core.nets.view_encoder import ViewEncoder
 

@@ -18,7 +18,7 @@ from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher,
 from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
 from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
 from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
-from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.sweep import profiles_at
 
 # Code of an unknown class; losses ignore it.
@@ -183,7 +183,7 @@ def opening_kinds(
 
     Walls are `UNKNOWN` in a plan that does not claim to show all openings.
     """
-    view = layout_view(
+    view = render_layout(
         position_m[None].astype(np.float32),
         np.array([heading], np.float32),
         np.array([room_index]),

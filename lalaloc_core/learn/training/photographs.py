@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from lalaloc_core.errors import DatasetError, InvalidPanoramaError
+from lalaloc_core.errors import DatasetError, InvalidPhotographError
 from lalaloc_core.learn.synth.augmentation.stretching import stretched
 from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
-from lalaloc_core.panorama.images import read_panorama
+from lalaloc_core.photograph.spheres import read_sphere
 
 # Rooms are stretched along two axes by log-uniform factors between these limits, because half of the available
 # unlabelled photographs show halls.
@@ -71,9 +71,9 @@ def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> 
     for path in paths:
         try:
             content = path.read_bytes()
-            large = read_panorama(content, height=PANORAMA_ROWS, width=2 * PANORAMA_ROWS)
-            images.append(read_panorama(content, height=height, width=width))
-        except (OSError, InvalidPanoramaError) as error:
+            large = read_sphere(content, height=PANORAMA_ROWS, width=2 * PANORAMA_ROWS)
+            images.append(read_sphere(content, height=height, width=width))
+        except (OSError, InvalidPhotographError) as error:
             raise DatasetError(f"cannot be read: {error}", path=path) from error
         readings.append(read_walls_and_openings(large, segment, width))
     openings, log_distance = (

@@ -21,7 +21,7 @@ from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, sample_styles
-from lalaloc_core.localise.view_encoder import MIN_SEEN
+from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
 
 # Size of the spheres from which views of photographs are cut, about as fine as the views.

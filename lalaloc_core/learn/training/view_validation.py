@@ -18,7 +18,7 @@ from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.view_stage import middle, view_window
-from lalaloc_core.localise.view_encoder import MIN_SEEN
+from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder
 from lalaloc_core.render.sweep import profiles_at
 

@@ -12,12 +12,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.configuration import build_config
-from lalaloc_core.errors import BundleError, CheckpointError
-from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
-from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.stages import build_layout_encoder
-from lalaloc_core.localise.bundle import (
+from lalaloc_core.bundle import (
     DECODER_WEIGHTS,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,
@@ -27,6 +22,11 @@ from lalaloc_core.localise.bundle import (
     VIEW_WEIGHTS,
     Bundle,
 )
+from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import BundleError, CheckpointError
+from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.stages import build_layout_encoder
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkEncoderConfig

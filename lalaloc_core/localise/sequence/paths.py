@@ -1,8 +1,8 @@
 """Posterior over paths, and over the places of every picture.
 
-As in `localise.posterior`, refinement finds the depth of a path's minimum. The states around a path are its *basin*.
-The probability of a refined path follows from its negative log likelihood, with all basins as wide as that of the
-likeliest path on the grid; all other paths gain the median.
+As in `localise.belief.posterior`, refinement finds the depth of a path's minimum. The states around a path are its
+*basin*. The probability of a refined path follows from its negative log likelihood, with all basins as wide as that of
+the likeliest path on the grid; all other paths gain the median.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import Posterior, posterior_from_weights
-from lalaloc_core.localise.ranking import HEADING_SEPARATION
+from lalaloc_core.localise.belief import HEADING_SEPARATION, Posterior, posterior_from_weights
+from lalaloc_core.localise.query import Candidate, Query
 from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
 from lalaloc_core.localise.sequence.motion import States, Transition
 from lalaloc_core.render.sampling import PoseSet

@@ -13,11 +13,13 @@ from jaxtyping import Float
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import LocaliseConfig
-from lalaloc_core.localise.poses import Candidate, PoseGrid, RefinementJob, RefinementResult
-from lalaloc_core.localise.ranking import panorama_heading
-from lalaloc_core.localise.refinement import refined_candidates, refinement_job
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import Candidate
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job
+from lalaloc_core.localise.search.pipeline import LocaliseConfig
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
 from lalaloc_core.localise.sequence.paths import Observation, Path
@@ -39,7 +41,7 @@ def are_alike(
     """Return whether two paths have about the same places and headings in every picture."""
     for picture, first, second in zip(pictures, path, other, strict=True):
         apart_m = np.linalg.norm(first.position_m - second.position_m)
-        turned = wrap_angle(panorama_heading(picture.query, first) - panorama_heading(picture.query, second))
+        turned = wrap_angle(photograph_heading(picture.query, first) - photograph_heading(picture.query, second))
         if apart_m >= within_m or abs(turned) > within_angle:
             return False
     return True
@@ -172,5 +174,5 @@ def path_motion_costs(
     """Return half the squared residuals of every motion along some paths."""
     position_m = np.array([[end.position_m for end in path.ends] for path in paths])
     queries = [picture.query for picture in pictures]
-    headings = [[panorama_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]
+    headings = [[photograph_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]
     return motion_costs(motions, position_m, np.array(headings))

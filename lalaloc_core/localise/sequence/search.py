@@ -11,21 +11,25 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import Manifest, MatchingWeights
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.cohort import cost_by_chance
-from lalaloc_core.localise.confidence import Signals, signals_of
-from lalaloc_core.localise.cost_terms import latent_distances
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.matching_cost import MatchingCost
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, run_steps
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import Posterior, area_shares
-from lalaloc_core.localise.ranking import HEADING_SEPARATION, distinct, suppress
-from lalaloc_core.localise.refinement import with_latents
-from lalaloc_core.localise.retrieval import contradicted
+from lalaloc_core.localise.belief import (
+    HEADING_SEPARATION,
+    Posterior,
+    Signals,
+    area_shares,
+    distinct,
+    signals_of,
+    suppress,
+)
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingCost, PoseGrid, cost_by_chance, grid_candidate
+from lalaloc_core.localise.match.cost_terms import latent_distances
+from lalaloc_core.localise.query import CameraHeight, Candidate, Query
+from lalaloc_core.localise.refine.refinement import with_latents
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, run_steps
+from lalaloc_core.localise.search.retrieval import contradicted
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.localise.pipeline import Localisation
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, Posterior
-from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.localise.belief import RIGHT_WITHIN_M, Posterior, photograph_heading
+from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.search import SequenceLocalisation
 
 
@@ -26,7 +25,7 @@ def localised_turn(found: Localisation, turns: Sequence[float]) -> SequenceLocal
 
 def found_turns(found: SequenceLocalisation) -> list[float]:
     """Return the headings (radians) of the photographs of a sequence minus that of the first."""
-    headings = [panorama_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
+    headings = [photograph_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
     return [float(wrap_angle(heading - headings[0])) for heading in headings]
 
 

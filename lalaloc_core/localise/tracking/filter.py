@@ -5,10 +5,11 @@ The belief after a photograph is
     b'(s) ∝ ((1 - c) prediction(s) + c prior(s)) · (L(s) + f),    L(s) = exp(-T (cost(s) - best)),
 
 with the prediction of `Ground.moved`, the probability c of being carried anywhere, and the likelihood L of the
-posterior of a single photograph (`localise.posterior`). Photographs in doorways or close to furniture can fit elsewhere
-better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds of an
-outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief; its
-gain is evidence for a mode. The pose of the best mode is fused with the one that odometry predicts (`pose_fusion.py`).
+posterior of a single photograph (`localise.belief.posterior`). Photographs in doorways or close to furniture can fit
+elsewhere better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds
+of an outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief;
+its gain is evidence for a mode. The pose of the best mode is fused with the one that odometry predicts
+(`pose_fusion.py`).
 """
 
 from __future__ import annotations
@@ -21,17 +22,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.cohort import cost_by_chance
-from lalaloc_core.localise.confidence import confidence_of, signals_of
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.hints import NO_HINTS, Hints
-from lalaloc_core.localise.matching_cost import MatchingCost
-from lalaloc_core.localise.pipeline import LocaliseConfig, SearchStage, StageClock
-from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
-from lalaloc_core.localise.posterior import area_shares
-from lalaloc_core.localise.refinement import refined_candidates, refinement_job, with_latents
-from lalaloc_core.localise.retrieval import grid_costs
-from lalaloc_core.localise.stated_camera import KnownHeading
+from lalaloc_core.localise.belief import area_shares, confidence_of, signals_of
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingCost, cost_by_chance
+from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, KnownHeading, Query
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job, with_latents
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, SearchStage, StageClock
+from lalaloc_core.localise.search.retrieval import grid_costs
 from lalaloc_core.localise.tracking.ground import Ground
 from lalaloc_core.localise.tracking.modes import (
     Compared,

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import Candidate, PoseGrid
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.tracking.motion import Odometry, States, WalkGraph, moved
 from lalaloc_core.localise.tracking.passages import Passages, PlanOnLevel
 from lalaloc_core.localise.tracking.state import StatePlan, TrackedPose, TrackState

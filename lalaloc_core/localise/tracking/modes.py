@@ -8,10 +8,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.pipeline import LocaliseConfig
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import Posterior, posterior_from_weights
-from lalaloc_core.localise.ranking import HEADING_SEPARATION, panorama_heading, suppress
+from lalaloc_core.localise.belief import (
+    HEADING_SEPARATION,
+    Posterior,
+    photograph_heading,
+    posterior_from_weights,
+    suppress,
+)
+from lalaloc_core.localise.match import PoseGrid, grid_candidate
+from lalaloc_core.localise.query import Candidate, Query
+from lalaloc_core.localise.search.pipeline import LocaliseConfig
 
 # Modes that are refined while the belief is spread, and while one mode holds nearly all of it.
 _MODES, _FEW_MODES, _SETTLED = 12, 3, 0.98
@@ -92,7 +98,7 @@ def _of_mode(
 ) -> np.ndarray:
     """Return which states belong to a mode."""
     near = np.linalg.norm(position_m - mode.position_m, axis=1) < radius_m
-    return near & (np.abs(wrap_angle(heading - panorama_heading(query, mode))) <= HEADING_SEPARATION)
+    return near & (np.abs(wrap_angle(heading - photograph_heading(query, mode))) <= HEADING_SEPARATION)
 
 
 def share_alone(
@@ -152,14 +158,14 @@ def ranked_modes(
         mass[index] = compared.weight[own].sum()
         position[own] += end.position_m - start.position_m
         # The refined heading is far more accurate than a sector.
-        heading[own] = panorama_heading(query, end)
+        heading[own] = photograph_heading(query, end)
     order = np.argsort(-mass, kind="stable")
     kept = suppress(
         np.stack([ends[index].position_m for index in order]),
         np.arange(len(order), dtype=float),
         separation_m=config.separation_m,
         limit=top_k,
-        heading=np.array([panorama_heading(query, ends[index]) for index in order]),
+        heading=np.array([photograph_heading(query, ends[index]) for index in order]),
     )
     candidates = [ends[order[index]] for index in kept]
     posterior = posterior_from_weights(

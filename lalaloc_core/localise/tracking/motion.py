@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import PASSAGE_CODE, TWO_PI, WALL_CODE, WINDOW_CODE, wrap_angle
 from lalaloc_core.errors import InvalidMotionError
-from lalaloc_core.localise.layouts import Layouts
+from lalaloc_core.localise.match import Layouts
 from lalaloc_core.render.sampling import PoseSet
 
 MAX_STEP_M = 50.0

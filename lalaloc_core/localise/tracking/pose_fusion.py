@@ -9,10 +9,9 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.covariance import pose_uncertainty
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.ranking import panorama_heading
+from lalaloc_core.localise.belief import photograph_heading, pose_uncertainty
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.query import Candidate, Query
 from lalaloc_core.localise.tracking.motion import Odometry, axes
 from lalaloc_core.localise.tracking.state import COMPONENTS, Component, TrackedPose
 
@@ -28,7 +27,7 @@ Gaussian = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 
 def measured_pose(plan: FloorPlan, encoders: Encoders, query: Query, answer: Candidate) -> Gaussian:
     """Return pose and covariance by the photograph alone."""
-    mean = np.array([answer.x_m, answer.y_m, panorama_heading(query, answer)])
+    mean = np.array([answer.x_m, answer.y_m, photograph_heading(query, answer)])
     covariance = np.diag(np.square(_UNKNOWN_STD))
     model = encoders.manifest.confidence_for(view=query.is_view)
     if answer.information is not None and model is not None:

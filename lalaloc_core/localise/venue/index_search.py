@@ -16,9 +16,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.bundle import MatchingWeights
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.segment import by_family

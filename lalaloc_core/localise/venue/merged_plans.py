@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
-from lalaloc_core.localise.layouts import joined_layouts
-from lalaloc_core.localise.poses import Candidate, PoseGrid
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.match.layouts import joined_layouts
+from lalaloc_core.localise.query import Candidate
 from lalaloc_core.render.sampling import PoseSet
 
 # Gap between the bounding boxes of two plans, larger than any distance at which poses count as one place.

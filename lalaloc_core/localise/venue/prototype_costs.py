@@ -19,9 +19,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, column_azimuths
-from lalaloc_core.localise.bundle import MatchingWeights
-from lalaloc_core.localise.cost_terms import (
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.match.cost_terms import (
     ceiling_costs,
     class_losses,
     mean_log,
@@ -30,8 +31,7 @@ from lalaloc_core.localise.cost_terms import (
     room_type_losses,
     smoothed,
 )
-from lalaloc_core.localise.matching_cost import MatchingConfig
-from lalaloc_core.localise.poses import PredictedCeiling, Query
+from lalaloc_core.localise.query import PredictedCeiling, Query
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
 # Spacing of the tried logs of the camera height; prototypes' distances are too coarse for smaller differences.

@@ -22,8 +22,7 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.poses import PoseGrid
+from lalaloc_core.localise.match import PoseGrid, layouts_at
 from lalaloc_core.render.sampling import PoseSet
 
 AZIMUTHS = 32

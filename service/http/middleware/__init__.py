@@ -9,7 +9,7 @@ authorisation     caller and tenant, or 401 and 403
 admission         slot for the request, or 503
 
 Begin with `telemetry.py`. `service.app` stacks them; their rules are in `service.telemetry`,
-`service.http.admission_control` and `service.security`.
+`service.capacity.admission_control` and `service.security`.
 """
 
 from service.http.middleware.admission import AdmissionMiddleware

@@ -11,15 +11,15 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.capacity.admission_control import EXEMPT, Admission, bounds_itself, is_query, is_read
+from service.capacity.bytes_in_flight import BodyBudget
+from service.capacity.cpu_accounts import PROBES, CpuAccounts
+from service.capacity.fair_share import FairSemaphore
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.http.admission_control import EXEMPT, Admission, bounds_itself, is_query, is_read
-from service.http.bytes_in_flight import BodyBudget
 from service.http.problems import problem_answer
 from service.http.request_end import ending_request
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of
-from service.tenancy.cpu_accounts import PROBES, CpuAccounts
-from service.tenancy.fair_share import FairSemaphore
 
 # Bytes of a query's body that arrive without a rest, and the time (s) that the server takes to receive a byte.
 _FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9

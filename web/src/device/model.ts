@@ -1,4 +1,4 @@
-/** Image encoder of the service's model in onnxruntime-web, as in lalaloc_core/localise/features.py. */
+/** Image encoder of the service's model in onnxruntime-web, as in lalaloc_core/localise/encode/features.py. */
 
 import { sha256 } from "@noble/hashes/sha2";
 import { bytesToHex } from "@noble/hashes/utils";

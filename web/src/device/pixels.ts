@@ -13,7 +13,7 @@ export interface Pixels {
 
 // Pixels that are read from the canvas at once, to bound memory; some browsers have no canvas of more than 16 million.
 const BAND_PIXELS = 2 ** 21;
-// Transparent parts, as in lalaloc_core/panorama/pictures.py.
+// Transparent parts, as in lalaloc_core/photograph/picture_files.py.
 const NEUTRAL = "rgb(128, 128, 128)";
 
 /** Decode a picture, upright. */

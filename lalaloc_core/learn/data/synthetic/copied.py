@@ -15,7 +15,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes
-from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.layout import render_layout
 
 # Gap between two copies (m), not a multiple of the grid step, so that the grid has another offset in each copy.
 _APART_M = 3.17
@@ -85,7 +85,7 @@ def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
 def _visible_kinds(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
     """Return the opening class at each azimuth around a camera."""
     room, heading = np.array([camera.room_index]), np.zeros(1)
-    view = layout_view(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
+    view = render_layout(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
     return view.kind[0]
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Camera, Photograph, Scene
+from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched_images
@@ -46,9 +46,9 @@ def _disturbed(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, eq=False)
 class DisturbedPhotograph:
-    """Photograph with small length errors and the effects of a real camera."""
+    """DatasetPhotograph with small length errors and the effects of a real camera."""
 
-    photograph: Photograph
+    photograph: DatasetPhotograph
     seed: int
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:

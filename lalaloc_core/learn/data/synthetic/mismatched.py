@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph, Scene
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
 
 # One of this many photographs shows no room, one is upside down, and in every second home one is cropped.
@@ -45,7 +45,7 @@ class MismatchedScenes(DerivedScenes):
         return dataclasses.replace(own, cameras=tuple(cameras))
 
 
-def _mismatched(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance, Photograph]:
+def _mismatched(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance, DatasetPhotograph]:
     """Return the photographs of the k-th camera of a home."""
     if k % _EVERY == _EVERY - 3 and home % 2:
         return {look: Cropped(photograph) for look, photograph in camera.photographs.items()}
@@ -59,9 +59,9 @@ def _mismatched(camera: Camera, other: Camera, k: int, home: int) -> dict[Appear
 
 @dataclass(frozen=True, eq=False)
 class UpsideDown:
-    """Photograph of a camera mounted upside down: the panorama rotated by half a turn."""
+    """DatasetPhotograph of a camera mounted upside down: the panorama rotated by half a turn."""
 
-    photograph: Photograph
+    photograph: DatasetPhotograph
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""
@@ -76,7 +76,7 @@ class UpsideDown:
 class Cropped:
     """View of an ordinary camera, stretched to the size of a panorama."""
 
-    photograph: Photograph
+    photograph: DatasetPhotograph
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""

@@ -10,14 +10,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
-from lalaloc_core.learn.synth.furniture.built_in import (
-    Placed,
-    Stretch,
-    closet_shelves,
-    kitchen,
-    sanitary,
-    wardrobes,
-)
+from lalaloc_core.learn.synth.furniture.built_in import Placed, Stretch, closet_shelves, kitchen, sanitary, wardrobes
 from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
 from lalaloc_core.learn.synth.furniture.pieces import Finish, Label, Maker, Piece, box, cylinder
 from lalaloc_core.learn.synth.furniture.pieces_service import counter, island

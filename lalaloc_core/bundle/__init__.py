@@ -1,0 +1,47 @@
+"""Model bundle: manifest, fitted parameters, measured errors, and the files of the networks.
+
+Begin with `bundle.py`, which reads a bundle; `manifest.py` describes it. `fitted_parameters.py` has the parameters of
+the matching cost and the confidence, `prediction_errors.py` the measured errors of the networks.
+"""
+
+from lalaloc_core.bundle.bundle import Bundle, default_bundle, write_manifest
+from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, LogisticModel, MatchingWeights
+from lalaloc_core.bundle.manifest import (
+    BUNDLE_FILES,
+    COHORT,
+    DECODER_WEIGHTS,
+    HEAD_ONNX,
+    IMAGE_ONNX,
+    IMAGE_WEIGHTS,
+    LAYOUT_ONNX,
+    LAYOUT_WEIGHTS,
+    MANIFEST_NAME,
+    VIEW_ONNX,
+    VIEW_WEIGHTS,
+    Manifest,
+    ViewManifest,
+)
+from lalaloc_core.bundle.prediction_errors import PredictionErrors
+
+__all__ = [
+    "BUNDLE_FILES",
+    "COHORT",
+    "DECODER_WEIGHTS",
+    "HEAD_ONNX",
+    "IMAGE_ONNX",
+    "IMAGE_WEIGHTS",
+    "LAYOUT_ONNX",
+    "LAYOUT_WEIGHTS",
+    "MANIFEST_NAME",
+    "VIEW_ONNX",
+    "VIEW_WEIGHTS",
+    "Bundle",
+    "ConfidenceModel",
+    "LogisticModel",
+    "Manifest",
+    "MatchingWeights",
+    "PredictionErrors",
+    "ViewManifest",
+    "default_bundle",
+    "write_manifest",
+]

@@ -1,0 +1,5 @@
+"""Photograph to query: the exported networks on onnxruntime. Never imports torch.
+
+Begin with `photograph_encoder.py`, which chooses the network: `sphere_encoder.py` for full spheres, `view_encoder.py`
+for parts of the horizon. `features.py` has a network's outputs as a file that a device sends instead of the photograph.
+"""

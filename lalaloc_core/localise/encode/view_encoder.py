@@ -1,0 +1,188 @@
+"""Exported encoder of views on onnxruntime: queries from photographs that show a part of the horizon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from lalaloc_core.bundle import VIEW_ONNX, Bundle
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.encode.encoders import log_softmax
+from lalaloc_core.localise.encode.sphere_network import PROFILE_OUTPUTS, SHARE_OUTPUT, STRUCTURE_OUTPUTS, array, session
+from lalaloc_core.localise.query import (
+    CameraHeight,
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    Query,
+    rolled,
+)
+
+# Standard deviation (radians) of errors of levelling that the network was trained with.
+_TRAINED_TILT_SD = math.radians(0.7)
+# Patches that the network reads at once, to bound memory: a query can have a hundred.
+_BATCH = 4
+# Smallest share of an azimuth column that must be seen to count.
+MIN_SEEN = 0.25
+VIEW_OUTPUTS = [*PROFILE_OUTPUTS, SHARE_OUTPUT, "seen", *STRUCTURE_OUTPUTS]
+
+
+class LevelPatch(NamedTuple):
+    """Part of a photograph that was levelled, as the encoder of views expects it.
+
+    Attributes:
+        image: of the size that the manifest's `view` states, RGB and opacity.
+        azimuth: of its centre column relative to the photograph's, radians.
+        tilt_sd: standard deviation of the error of levelling along the centre column, radians.
+    """
+
+    image: UInt8[np.ndarray, "h w 4"]
+    azimuth: float
+    tilt_sd: float = 0.0
+
+
+class OnnxViewEncoder:
+    """Encoder of views of one bundle, ready to run; safe to share between threads."""
+
+    def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
+        """Create the onnxruntime session, with `threads` intra-op threads, 0 for one per core.
+
+        Raises:
+            BundleError: the bundle has no encoder of views, or its file is missing or altered.
+        """
+        self._manifest = bundle.manifest
+        if self._manifest.view is None:
+            raise BundleError(f"model '{self._manifest.name}' has no encoder of views ({VIEW_ONNX}); it needs spheres")
+        self._view = self._manifest.view
+        self._session = session(bundle.read(VIEW_ONNX), threads)
+
+    def query(
+        self,
+        patches: Sequence[LevelPatch],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """Return the query of a photograph that shows a part of the horizon.
+
+        Args:
+            patches: parts of the photograph; where they overlap, the nearer centre counts.
+            heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
+            camera_height: gives the picture its metric scale.
+            heading_tolerance: as in `Encoders.query`.
+        """
+        predicted = self.predicted([patch.image for patch in patches], camera_height.height_m)
+        placed = [(patch.azimuth, patch.tilt_sd) for patch in patches]
+        return self.query_of_outputs(predicted, placed, heading, camera_height, heading_tolerance=heading_tolerance)
+
+    def query_of_outputs(
+        self,
+        predicted: Mapping[str, np.ndarray],
+        placed: Sequence[tuple[float, float]],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """Return the query of a photograph by what the network predicted of its patches.
+
+        Args:
+            predicted: see `predicted`, for the given camera height.
+            placed: azimuth and standard deviation of the tilt of each patch, as in `LevelPatch`.
+            heading: as for `query`, like the other arguments.
+            camera_height: as for `query`.
+            heading_tolerance: as for `query`.
+        """
+        columns = self._manifest.profile_columns
+        outputs = self._on_circle(predicted, placed, camera_height.height_m)
+        column = TWO_PI / columns
+        frame = 0 if heading is None else round(heading / column)
+        frame_heading = 0.0 if heading is None else float(wrap_angle(heading - frame * column))
+        all_shifts = np.arange(columns)
+        max_shift = min(math.ceil(heading_tolerance / column), (columns - 1) // 2)
+        shifts = all_shifts if heading is None else np.arange(-max_shift, max_shift + 1)
+        query = self._hypotheses(outputs, frame + shifts, camera_height)
+        searched = None if heading is None else self._hypotheses(outputs, all_shifts, camera_height)
+        known = heading is not None and heading_tolerance == 0.0
+        return replace(query, frame_heading=frame_heading, heading_known=known, searched=searched)
+
+    def predicted(self, images: Sequence[UInt8[np.ndarray, "h w 4"]], camera_height_m: float) -> dict[str, np.ndarray]:
+        """Run the encoder of views on level patches; return its outputs by patch."""
+        parts: list[list[np.ndarray]] = []
+        for first in range(0, len(images), _BATCH):
+            batch = images[first : first + _BATCH]
+            inputs = {"image": np.stack(batch), "camera_height_m": np.full(len(batch), camera_height_m, np.float32)}
+            parts.append([array(value) for value in self._session.run(VIEW_OUTPUTS, inputs)])
+        columns = zip(*parts, strict=True)
+        return {name: np.concatenate(values) for name, values in zip(VIEW_OUTPUTS, columns, strict=True)}
+
+    def _on_circle(
+        self, outputs: Mapping[str, np.ndarray], placed: Sequence[tuple[float, float]], camera_height_m: float
+    ) -> dict[str, np.ndarray]:
+        """Return the predictions of patches by azimuth column of the full circle."""
+        columns, prior = self._manifest.profile_columns, np.array(self._view.opening_prior)
+        tilt_sd = np.array([sd for _, sd in placed])[:, None, None]
+        widened = _widened(outputs["log_profile"], outputs["log_scale"], tilt_sd, camera_height_m)
+        predicted = {**outputs, "log_scale": widened}
+        modes = predicted["log_profile"].shape[2]
+        circle = {
+            "log_profile": np.zeros((columns, modes), np.float32),
+            "log_scale": np.full((columns, modes), np.inf, np.float32),
+            "log_share": np.full((columns, modes), -math.log(modes), np.float32),
+            "opening_logits": np.tile(np.log(prior).astype(np.float32), (columns, 1)),
+        }
+        width = predicted["seen"].shape[1]
+        offset = np.arange(width) - width // 2
+        distance = np.full(columns, np.inf)
+        for row, (azimuth, _) in enumerate(placed):
+            place = (columns // 2 + round(azimuth / TWO_PI * columns) + offset) % columns
+            nearer = (predicted["seen"][row] >= MIN_SEEN) & (np.abs(offset + 0.5) < distance[place])
+            distance[place[nearer]] = np.abs(offset + 0.5)[nearer]
+            for name, values in circle.items():
+                values[place[nearer]] = predicted[name][row][nearer]
+        for name in STRUCTURE_OUTPUTS[1:]:
+            circle[name] = predicted[name].mean(axis=0)
+        return circle
+
+    def _hypotheses(
+        self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight
+    ) -> Query:
+        """Return a query with one hypothesis for each shift, a number of columns to the right."""
+        openings = rolled(log_softmax(outputs["opening_logits"]), shifts)
+        return Query(
+            np.zeros((len(shifts), self._manifest.latent_size), np.float32),
+            shifts * (TWO_PI / self._manifest.profile_columns),
+            0.0,
+            False,
+            camera_height,
+            profile=PredictedProfile.of_outputs(outputs).moved(shifts),
+            openings=PredictedOpenings(openings, np.array(self._view.opening_prior)),
+            ceiling=PredictedCeiling(float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])),
+            room_type=PredictedRoomType(log_softmax(outputs["room_type_logits"]), np.array(self._view.room_type_prior)),
+            is_view=True,
+        )
+
+
+def _widened(
+    log_m: Float[np.ndarray, "*n"],
+    log_scale: Float[np.ndarray, "*n"],
+    tilt_sd: Float[np.ndarray, "*#n"],
+    camera_height_m: float,
+) -> Float[np.ndarray, "*n"]:
+    """Return the log scales of walls whose floor edges are seen at an uncertain elevation.
+
+    An edge at the elevation -e is at the distance h / tan e, so an error of e changes the log distance by 1 / (sin e
+    cos e) times as much. The variance of a Laplace distribution is twice its squared scale.
+    """
+    slope = camera_height_m * np.exp(-log_m)
+    untrained = np.sqrt(np.maximum(np.square(tilt_sd) - _TRAINED_TILT_SD**2, 0.0))
+    error = untrained * (1.0 + np.square(slope)) / slope
+    return np.log(np.hypot(np.exp(log_scale), error / math.sqrt(2.0)))

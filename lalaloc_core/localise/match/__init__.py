@@ -1,0 +1,31 @@
+"""Comparison of poses with a query.
+
+Begin with `matching_cost.py`, which has the equations; `cost_terms.py` has the formulas of its terms. `pose_grid.py`
+has the poses of a plan, `layouts.py` what the plan shows there, and `binned_layouts.py` the same as `coarse_pass.py`
+compares it. `cohort.py` costs poses of other homes, to tell a good cost from chance.
+"""
+
+from lalaloc_core.localise.match.binned_layouts import BinnedLayouts
+from lalaloc_core.localise.match.coarse_pass import LowestCosts, PairLimits, coarse_costs, likeliest
+from lalaloc_core.localise.match.cohort import Cohort, cohort_of, cost_by_chance, log_cost_to_chance
+from lalaloc_core.localise.match.layouts import Layouts, layouts_at
+from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.match.pose_grid import PoseGrid, grid_candidate
+
+__all__ = [
+    "BinnedLayouts",
+    "Cohort",
+    "Layouts",
+    "LowestCosts",
+    "MatchingConfig",
+    "MatchingCost",
+    "PairLimits",
+    "PoseGrid",
+    "coarse_costs",
+    "cohort_of",
+    "cost_by_chance",
+    "grid_candidate",
+    "layouts_at",
+    "likeliest",
+    "log_cost_to_chance",
+]

@@ -1,0 +1,209 @@
+"""Coarse pass: an estimate of the cost of all pairs of a grid pose and a hypothesis, which selects those to compare.
+
+A few azimuths of every pose are compared, by a table: log distances are binned (`binned_layouts.py`), so the cost of a
+pose at an azimuth is one row of
+
+    table[azimuth, bin] = log(1 + r²) for every δ and hypothesis, over the number of azimuths
+
+and its cost under all δ and hypotheses is the sum of its rows: the product of a sparse matrix, made from the plan, with
+the table, made from the query. This takes a tenth of the time per azimuth, and there are fewer azimuths. Openings have
+rows as well; views through them are left to the full comparison.
+
+In large plans most poses are excluded before that, by a lower bound of their cost over all δ and some neighbouring
+hypotheses. The bounds come from a table of minima in short integers, which stays in the cache. Poses are compared by
+rising bounds until no other can be among the wanted ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import WALL_CODE
+from lalaloc_core.localise.match.binned_layouts import OPENING_ROWS, BinnedLayouts
+from lalaloc_core.localise.match.matching_cost import MatchingCost
+
+# Poses compared at a time by rising bounds, in plans of more than the last number: few at first, as these limit the
+# number of poses; and for the bounds themselves.
+_FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
+# Neighbouring hypotheses that share a bound.
+_NEIGHBOURS = 2
+# Sums of bounds stay below this, close to the largest short integer.
+_MAX_SUM = 30_000
+
+
+class LowestCosts:
+    """Pairs of a pose and a hypothesis with the lowest costs, of pairs that are offered slice by slice."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._bound = np.inf
+        self._cost: list[Float[np.ndarray, "_"]] = []
+        self._place: list[Int[np.ndarray, "_"]] = []
+        self._kept = 0
+
+    @property
+    def bound(self) -> float:
+        """Upper bound of the kept costs; infinite until the limit is reached."""
+        return self._bound
+
+    def offer(self, pose: Int[np.ndarray, "n"], cost: Float[np.ndarray, "n k"]) -> None:
+        """Add the costs of all pairs of some poses, by their numbers; infinite costs are left out."""
+        place = np.flatnonzero(cost < self._bound)
+        row, hypothesis = np.divmod(place, cost.shape[1])
+        self._cost.append(cost.ravel()[place])
+        self._place.append(pose[row] * cost.shape[1] + hypothesis)
+        self._kept += len(place)
+        if self._kept > 2 * self._limit:
+            self._drop()
+
+    def ranked(self) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+        """Return the costs, rising, and the pairs: pose times the number of hypotheses, plus hypothesis."""
+        self._drop()
+        cost, place = self._cost[0], self._place[0]
+        order = np.argsort(cost)
+        rising = cost[order]
+        # Sorting all by both takes three times as long, and few costs are equal.
+        equal, same = np.zeros(len(order), bool), rising[1:] == rising[:-1]
+        equal[1:] |= same
+        equal[:-1] |= same
+        tied = order[equal]
+        order[equal] = tied[np.lexsort((place[tied], rising[equal]))]
+        return rising, place[order]
+
+    def _drop(self) -> None:
+        cost, place = np.concatenate(self._cost), np.concatenate(self._place)
+        if len(cost) > self._limit:
+            kept = np.argpartition(cost, self._limit)[: self._limit]
+            cost, place = cost[kept], place[kept]
+            self._bound = float(cost.max())
+        self._cost, self._place, self._kept = [cost], [place], len(cost)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairLimits:
+    """Limits of the number of pairs of a pose and a hypothesis.
+
+    There are at least `at_least` pairs if so many exist; those beyond cost at most `window` more than the best.
+    """
+
+    at_most: int
+    at_least: int
+    window: float = 0.0
+
+
+def likeliest(
+    binned: BinnedLayouts,
+    matching_cost: MatchingCost,
+    room_index: Int[np.ndarray, "n"],
+    limits: PairLimits,
+    hint_cost: Float[np.ndarray, "n"] | None = None,
+) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    """Return the coarse costs, rising, and the pairs (pose times number of hypotheses, plus hypothesis) of the best.
+
+    The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow. `hint_cost` is added to
+    the costs of every pose; infinite excludes it.
+    """
+    table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
+    shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
+    bound = room_costs.min(axis=0)[room_index]
+    if len(binned) > _LAST_CHUNK:
+        bound = bound + _bounds(binned, table.reshape(len(table), *shape[1:]))
+    bound = bound if hint_cost is None else bound + hint_cost
+    possible = np.flatnonzero(np.isfinite(bound))
+    # Short integers sort fastest.
+    order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
+    least_after = np.minimum.accumulate(bound[order][::-1])[::-1]
+    best, least = LowestCosts(limits.at_most), LowestCosts(limits.at_least)
+    lowest, first, count = np.inf, 0, _FIRST_CHUNK
+    while first < len(order) and least_after[first] <= min(best.bound, max(lowest + limits.window, least.bound)):
+        pose = order[first : first + count]
+        cost = _at_best_offset(binned.rows[pose] @ table, room_costs[:, room_index[pose]], shape)
+        cost = cost if hint_cost is None else cost + hint_cost[pose, None]
+        best.offer(pose, cost)
+        least.offer(pose, cost)
+        lowest = min(lowest, float(cost.min()))
+        first, count = first + count, min(2 * count, _LAST_CHUNK)
+    return best.ranked()
+
+
+def coarse_costs(
+    binned: BinnedLayouts, matching_cost: MatchingCost, room_index: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n k"]:
+    """Return the coarse costs of all poses under all hypotheses, each at its best δ."""
+    table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
+    shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
+    costs, first = [], 0
+    for rows in binned.parts:
+        last = first + len(rows.indptr) - 1
+        costs.append(_at_best_offset(rows @ table, room_costs[:, room_index[first:last]], shape))
+        first = last
+    return np.concatenate(costs)
+
+
+def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Return short integers in nearly the same order."""
+    low, span = float(bound.min(initial=np.inf)), float(np.ptp(bound)) if len(bound) else 0.0
+    return ((bound - low) * (_MAX_SUM / max(span, 1e-9))).astype(np.int16)
+
+
+def _bounds(binned: BinnedLayouts, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
+    """Return a lower bound of the cost of every pose's walls and openings over all δ and hypotheses."""
+    azimuths = len(binned.columns)
+    least = np.minimum.reduceat(table.min(axis=1), np.arange(0, table.shape[2], _NEIGHBOURS), axis=1)
+    walls, openings = np.split(least, [azimuths * len(binned.bins)])
+    # Every azimuth has one row of walls, and at most one of openings.
+    most = azimuths * float(np.abs(walls).max() + np.abs(openings).max(initial=0.0))
+    scale = _MAX_SUM / max(most, 1e-6)
+    short = np.floor(least * scale).astype(np.int16)
+    bound = np.empty(len(binned), np.float32)
+    for first in range(0, len(binned), _BOUNDED_CHUNK):
+        part = slice(first, first + _BOUNDED_CHUNK)
+        bound[part] = (binned.rows[part] @ short).min(axis=1)
+    # The costs themselves are rounded to single precision.
+    return bound / scale - 1e-5
+
+
+def _at_best_offset(
+    costs: Float[np.ndarray, "n c"], room_costs: Float[np.ndarray, "j n"], shape: tuple[int, int, int]
+) -> Float[np.ndarray, "n k"]:
+    """Return the cost of poses under every hypothesis, each at its best δ."""
+    costs = costs.reshape(shape)
+    costs += room_costs.T[:, :, None]
+    return costs.min(axis=1)
+
+
+def _table(binned: BinnedLayouts, matching_cost: MatchingCost) -> Float[np.ndarray, "r c"]:
+    """Return the cost of each row under every δ and hypothesis, δ by δ."""
+    modes, loss = matching_cost.predicted_modes(binned.columns), matching_cost.opening_costs(binned.columns)
+    azimuths, bins = len(binned.columns), len(binned.bins)
+    offsets = matching_cost.offsets.astype(np.float32)
+    shape = (len(offsets), matching_cost.hypotheses)
+    # Hypotheses are one prediction, turned, so there are few different ones at an azimuth.
+    different, which = _different(modes.reshape(-1, modes.shape[2]))
+    apart = binned.bins[:, None, None] - offsets[:, None]
+    likelihood = sum(
+        odds / (1.0 + np.square((apart - centre) * precision))
+        for centre, precision, odds in different.reshape(len(different), -1, 3).transpose(1, 2, 0)
+    )
+    wall_costs = -np.log(np.minimum(likelihood, 1.0)) / azimuths
+    table = np.zeros((azimuths * (bins + OPENING_ROWS), *shape), np.float32)
+    walls = table[: azimuths * bins].reshape(azimuths, bins, *shape)
+    openings = table[azimuths * bins :].reshape(azimuths, OPENING_ROWS, *shape)
+    for azimuth, pair in enumerate(which.reshape(modes.shape[:2]).T):
+        walls[azimuth] = wall_costs[:, :, pair]
+    if loss is not None:
+        loss = loss.transpose(1, 2, 0)[:, :, None] / azimuths
+        walls += loss[:, WALL_CODE, None]
+        openings[:] = loss[:, 1:] - loss[:, :1]
+    return table.reshape(len(table), -1)
+
+
+def _different(rows: Float[np.ndarray, "n v"]) -> tuple[Float[np.ndarray, "d v"], Int[np.ndarray, "n"]]:
+    """Return the different rows, and which of them each row is; as `np.unique`, which compares column by column."""
+    rows = np.ascontiguousarray(rows)
+    whole = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return rows[first], which

@@ -1,0 +1,141 @@
+"""Formulas of the matching cost's terms (`matching_cost.py` has the equations), for grid poses and prototypes alike."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, WALL_CODE
+from lalaloc_core.localise.query import PredictedCeiling, PredictedRoomType
+
+# Smallest trusted scale of a predicted log distance: a centimetre at ten metres.
+_MIN_SCALE = 1e-3
+# Smallest trusted scale of a predicted log ceiling height, as plans round their ceilings.
+_MIN_CEILING_SCALE = 0.04
+_MIN_CLEARANCE_M = 0.05
+# `log` is slow, so multiply this many factors, each at most the maximum, before taking it.
+_FACTORS, _MAX_FACTOR = 4, 1e9
+
+
+class WallMode(NamedTuple):
+    """Mode of the predicted walls: centres, precisions and odds, each (k, w) or broadcast to that."""
+
+    centre: Float[np.ndarray, "k w"]
+    precision: Float[np.ndarray, "k w"]
+    odds: Float[np.ndarray, "#k #w"]
+
+    @classmethod
+    def of(
+        cls,
+        log_m: Float[np.ndarray, "k w"],
+        log_scale: Float[np.ndarray, "k w"],
+        odds: Float[np.ndarray, "#k #w"],
+        reach_m: float,
+        tail: float,
+        stride: int,
+    ) -> WallMode:
+        """Return a mode for poses within a reach (m), at the columns that are multiples of `stride`."""
+        values = log_m, precisions(log_m, log_scale, reach_m, tail), odds
+        return cls(*(np.ascontiguousarray(value[:, ::stride], np.float32) for value in values))
+
+    def likelihood(self, log_m: np.ndarray, place: Any) -> np.ndarray:
+        """Return the likelihoods of log distances at places: an index into (k, w)."""
+        centre, precision = self.centre[place], self.precision[place]
+        return np.broadcast_to(self.odds, self.centre.shape)[place] / (1.0 + np.square((log_m - centre) * precision))
+
+    def likelihood_at(self, log_m: Float[np.ndarray, "n"], place: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the likelihoods of log distances at flat places."""
+        return self.odds.take(place) / (1.0 + np.square((log_m - self.centre.take(place)) * self.precision.take(place)))
+
+
+def precisions(
+    log_m: Float[np.ndarray, "k w"], log_scale: Float[np.ndarray, "k w"], reach_m: float, tail: float
+) -> Float[np.ndarray, "k w"]:
+    """Return 1 / (κ s) for every hypothesis and azimuth, the factor of differences of log distance."""
+    scale = np.maximum(np.exp(log_scale), _MIN_SCALE)
+    return 1.0 / (tail * np.hypot(scale, reach_m * np.exp(-log_m)))
+
+
+def median_distance_m(centre: Float[np.ndarray, "w"], precision: Float[np.ndarray, "w"]) -> float:
+    """Return the median distance (m) of the walls that are seen, by log distances; infinite if none is."""
+    seen = centre[precision > 0]
+    return float(np.exp(np.median(seen))) if len(seen) else np.inf
+
+
+def ceiling_costs(
+    predicted: PredictedCeiling,
+    clearance_m: Float[np.ndarray, "*#n"],
+    offset: Float[np.ndarray, "*#n"],
+    tail: float,
+) -> Float[np.ndarray, "*n"]:
+    """Return the cost of ceilings at some heights (m) above the camera, each at a δ."""
+    difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)
+    scale = tail * np.hypot(np.exp(predicted.log_scale), _MIN_CEILING_SCALE)
+    return np.log1p(np.square(difference / scale))
+
+
+def room_type_losses(predicted: PredictedRoomType, floor: float) -> Float[np.ndarray, "t"]:
+    """Return the cost of every room type; the unknown type costs as much as an uninformative prediction."""
+    ratio = floor + (1.0 - floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
+    loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))
+    return np.maximum(loss, 0.0)
+
+
+def class_losses(
+    probability: Float[np.ndarray, "*n c"],
+    prior: Float[np.ndarray, "c"],
+    claimed: Collection[int],
+    floor: float,
+    appearance: Sequence[Sequence[float]] | None = None,
+) -> Float[np.ndarray, "*n c"]:
+    """Return `-log q` of every opening class that a plan can show (`matching_cost.py` has the equation).
+
+    `probability` and `prior` are those of the classes seen; `claimed` are the codes of the classes that the plan shows
+    completely. All others are drawn as wall, each as often as it occurs. `floor` is ε, and `appearance` is a.
+    """
+    classes = len(OPENING_CLASSES)
+    drawn_as_wall = np.array([code == WALL_CODE or code not in claimed for code in range(classes)])
+    kind = np.where(drawn_as_wall[:, None], prior * drawn_as_wall / prior[drawn_as_wall].sum(), np.eye(classes))
+    seen = kind if appearance is None else kind @ np.asarray(appearance)
+    return -np.log(floor + (1.0 - floor) * (probability / prior) @ seen.T)
+
+
+def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
+    """Return the Euclidean distance of each target to each latent, both of unit length."""
+    return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))
+
+
+def mean_log(
+    factor: Float[np.ndarray, "n w"], *, factors: int = _FACTORS, max_factor: float = _MAX_FACTOR
+) -> Float[np.ndarray, "n"]:
+    """Return the mean logarithm of each row.
+
+    Values of `factor`, from 1 upwards, are overwritten. So many `factors` are multiplied before the logarithm if they
+    divide the number of columns; values above `max_factor` count as that, so that products stay finite.
+    """
+    columns = factor.shape[1]
+    if columns % factors:
+        return np.log(factor).mean(axis=1)
+    np.minimum(factor, max_factor, out=factor)
+    width = columns // factors
+    product = factor[:, :width].copy()
+    for begin in range(width, columns, width):
+        product *= factor[:, begin : begin + width]
+    return np.log(product).sum(axis=1) / columns
+
+
+def smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np.ndarray, "k w c"]:
+    """Return probabilities by azimuth, blurred around the horizon by a Gaussian of `spread` radians."""
+    columns = probability.shape[1]
+    deviation = spread / TWO_PI * columns
+    if deviation < 0.3:
+        return probability
+    offset = (np.arange(columns) + columns // 2) % columns - columns // 2
+    kernel = np.exp(-0.5 * np.square(offset / deviation))
+    kernel = (kernel / kernel.sum())[(np.arange(columns)[:, None] - np.arange(columns)[None]) % columns]
+    # One matrix product for all hypotheses.
+    blurred = kernel @ probability.transpose(1, 0, 2).reshape(columns, -1)
+    return blurred.reshape(columns, len(probability), -1).transpose(1, 0, 2)

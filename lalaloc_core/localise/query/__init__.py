@@ -1,0 +1,53 @@
+"""Query: an encoded photograph, and what is stated about its camera.
+
+Begin with `query.py`. `predictions.py` has what the networks predict of a photograph; `camera_height.py` and
+`stated_pose.py` have the height and heading that the caller, the metadata or the plan state; `hints.py` has priors of
+the place.
+"""
+
+from lalaloc_core.localise.query.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M, CameraHeight
+from lalaloc_core.localise.query.hints import (
+    NO_HINTS,
+    RADIUS_RANGE_M,
+    HintName,
+    Hints,
+    Near,
+    NearInEach,
+    log_factor,
+    rooms_named,
+)
+from lalaloc_core.localise.query.predictions import (
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    RivalWall,
+    rolled,
+)
+from lalaloc_core.localise.query.query import Candidate, Query
+from lalaloc_core.localise.query.stated_pose import KnownHeading, known_heading, stated_height
+
+__all__ = [
+    "DEFAULT_STD_M",
+    "NO_HINTS",
+    "RADIUS_RANGE_M",
+    "UNKNOWN_RANGE_M",
+    "CameraHeight",
+    "Candidate",
+    "HintName",
+    "Hints",
+    "KnownHeading",
+    "Near",
+    "NearInEach",
+    "PredictedCeiling",
+    "PredictedOpenings",
+    "PredictedProfile",
+    "PredictedRoomType",
+    "Query",
+    "RivalWall",
+    "known_heading",
+    "log_factor",
+    "rolled",
+    "rooms_named",
+    "stated_height",
+]

@@ -1,0 +1,423 @@
+"""Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
+
+The same code answers over HTTP and in evaluation; only the refiner, which runs pose refinement, differs. A search is
+therefore a generator: it yields refinement jobs, which the caller runs in this process (`run_steps`) or in another one
+(`next_step`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
+
+from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.belief import (
+    Confidence,
+    Posterior,
+    Signals,
+    WeightedPlaces,
+    area_shares,
+    confidence_of,
+    distinct,
+    ranked,
+    signals_of,
+    weighted_places,
+)
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig, PoseGrid, cost_by_chance
+from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints, Query
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job, with_latents
+from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, missed_hints, retrieve
+from lalaloc_core.localise.search.vogel import resample
+
+JobT = TypeVar("JobT")
+ResultT = TypeVar("ResultT")
+FoundT = TypeVar("FoundT")
+SearchStage = Literal["retrieval", "vdr", "lpo"]
+Refine = Literal["none", "vdr", "lpo"]
+# Runs pose refinement; None if it has no result (in time).
+Refiner = Callable[[RefinementJob], RefinementResult | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocaliseConfig:
+    """Settings of the search; the defaults are the paper's for those that the paper states (section 5).
+
+    Attributes:
+        vdr_samples: poses of a Vogel disc.
+        vdr_radius_steps: radius of the disc, in units of the grid's step.
+        vdr_candidates: number of candidates that are re-sampled; 0 omits VDR.
+        lpo_candidates: number of candidates refined by their latents; the paper refines the first alone.
+        profile_candidates: number of candidates refined by their wall profiles, which is faster.
+        profile_candidates_turned: the same if the heading is searched, as rooms look alike from several sides.
+        alike_margin: candidates that cost less than this more than the best are refined as well, up to
+            `max_candidates`, as places that look alike must all be refined to share the probability.
+        separation_m: smallest distance (m) between candidates at about one heading.
+        every_stage: run and record every stage. Otherwise, if wall profiles are compared, refinement begins with the
+            grid's candidates, and VDR runs only if LPO has no result.
+        by_probability: rank candidates by probability instead of cost, as for places of several plans.
+    """
+
+    vdr_samples: int = 200
+    vdr_radius_steps: float = 2.0
+    vdr_candidates: int = 1
+    lpo_candidates: int = 5
+    profile_candidates: int = 10
+    profile_candidates_turned: int = 20
+    alike_margin: float = 0.2
+    max_candidates: int = 64
+    separation_m: float = 1.0
+    every_stage: bool = False
+    by_probability: bool = False
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+
+    def min_starts(self, query: Query) -> int:
+        """Return the minimum number of candidates of a query that are refined."""
+        if not self.matching.compares_profiles(query):
+            return self.lpo_candidates
+        return self.profile_candidates if query.heading_known else self.profile_candidates_turned
+
+    def starts(self, query: Query, modes: list[Candidate]) -> int:
+        """Return the number of modes of a query's posterior, sorted by cost, that are refined."""
+        minimum = self.min_starts(query)
+        if not self.matching.compares_profiles(query):
+            return minimum
+        alike = sum(mode.total_cost < modes[0].total_cost + self.alike_margin for mode in modes)
+        return max(minimum, min(alike, self.max_candidates))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localisation:
+    """Distinct candidates, best first, and the evidence for them.
+
+    Attributes:
+        query: the query, with an unknown heading if the picture contradicts the given one.
+        posterior: probability of all places of the grid and of the candidates, given that the picture is of the plan.
+        signals: signals of the best candidate's confidence after each stage that ran, in order.
+        heading_contradicted: whether a heading was given that the picture contradicts.
+        hints_missed: hints that do not hold at the answer; of strict hints, those that the picture contradicts.
+        best: the best candidate after each stage that ran, in order.
+        linked_fit: highest probability that a photograph which measured motions link to this one is of the plan.
+    """
+
+    query: Query
+    candidates: list[Candidate]
+    posterior: Posterior
+    stage: SearchStage
+    signals: dict[SearchStage, Signals]
+    heading_contradicted: bool = False
+    hints_missed: tuple[HintName, ...] = ()
+    best: dict[SearchStage, Candidate] = field(default_factory=dict)
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    linked_fit: float = 0.0
+
+    @property
+    def camera_height_m(self) -> float:
+        """Camera height that fits the answer best."""
+        return self.query.camera_height.height_m * math.exp(self.candidates[0].height_offset)
+
+    def confidence(self, model: ConfidenceModel | None, share: float = 1.0) -> Confidence | None:
+        """Return the answer's confidence; None without a model, or if the model was not fitted on the last stage.
+
+        `share` is the probability that the place is among those that were searched.
+        """
+        return confidence_of(
+            model,
+            self.stage,
+            self.signals[self.stage],
+            self.posterior,
+            heading_known=self.query.heading_known,
+            share=share,
+            linked_fit=self.linked_fit,
+        )
+
+
+Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
+
+
+def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | None) -> JobT | FoundT:
+    """Continue a search; return its next job or its result.
+
+    `result` is the last job's; None at first, and if there is no result (in time).
+    """
+    try:
+        return steps.send(result)
+    except StopIteration as done:
+        return done.value
+
+
+def run_steps(
+    steps: Generator[JobT | None, ResultT | None, FoundT], refiner: Callable[[JobT], ResultT | None] | None
+) -> FoundT:
+    """Run a whole search in this process, without its pauses (None).
+
+    `refiner` runs a job; it returns None if it has no result (in time). Searches without jobs need none.
+    """
+    result: ResultT | None = None
+    while True:
+        try:
+            job = steps.send(result)
+        except StopIteration as done:
+            return done.value
+        if job is None:
+            result = None
+            continue
+        assert refiner is not None
+        result = refiner(job)
+
+
+class StageClock:
+    """Wall-clock milliseconds per named stage."""
+
+    def __init__(self) -> None:
+        self.timings_ms: dict[str, float] = {}
+        self._begun_s: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block under `name`."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._begun_s[name] = begin
+            self.timings_ms[name] = (time.perf_counter() - begin) * 1e3
+
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Return the begin (by `time.perf_counter`) and the duration of each finished stage, in seconds."""
+        return {name: (self._begun_s[name], spent_ms / 1e3) for name, spent_ms in dict(self.timings_ms).items()}
+
+
+def localise(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    encoders: Encoders,
+    query: Query,
+    *,
+    refine: Refine = "lpo",
+    top_k: int = 5,
+    refiner: Refiner | None = None,
+    config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
+    hints: Hints = NO_HINTS,
+) -> Localisation:
+    """Localise an encoded panorama in a plan.
+
+    The grid is the plan's, made for the query's camera height. `refine` is the last stage: "lpo" without a `refiner`,
+    or with one that returns None, ends at "vdr". `clock` times the stages. With strict hints, a known heading is not
+    doubted.
+
+    Raises:
+        InvalidHintError: the hints do not fit the plan, or strict hints exclude all of it.
+    """
+    if refiner is None and refine == "lpo":
+        refine = "vdr"
+    steps = localise_steps(
+        plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
+    )
+    return run_steps(steps, refiner)
+
+
+def localise_steps(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    encoders: Encoders,
+    query: Query,
+    *,
+    refine: Refine = "lpo",
+    top_k: int = 5,
+    config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
+    hints: Hints = NO_HINTS,
+) -> Steps:
+    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `next_step`."""
+    config, clock = config or LocaliseConfig(), clock or StageClock()
+    hints.check(plan)
+    search = _Search(plan, grid, encoders, query, config=config, clock=clock, hints=hints, top_k=top_k)
+    resampling = refine != "none" and config.vdr_candidates > 0
+    if refine != "lpo":
+        return search.localisation(search.without_lpo(resampling=resampling))
+    # If walls are compared, refinement begins with the grid's candidates, and VDR runs on demand.
+    before_lpo = None
+    if config.every_stage or not search.by_walls:
+        before_lpo = search.without_lpo(resampling=resampling)
+    starts = search.modes if search.by_walls or before_lpo is None else before_lpo
+    with clock.stage("lpo"):
+        result = yield search.lpo_job(starts)
+        after_lpo = None if result is None else search.after_lpo(starts, result)
+    if after_lpo is not None:
+        return search.localisation(after_lpo)
+    return search.localisation(search.without_lpo(resampling=resampling) if before_lpo is None else before_lpo)
+
+
+class _Search:
+    """One query in one plan: its candidates and the results of its stages.
+
+    Attributes:
+        query: the query, with an unknown heading if the picture contradicts the given one.
+        by_walls: whether poses are compared by their wall profiles.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        grid: PoseGrid,
+        encoders: Encoders,
+        query: Query,
+        *,
+        config: LocaliseConfig,
+        clock: StageClock,
+        hints: Hints,
+        top_k: int,
+    ) -> None:
+        """Retrieve the modes."""
+        self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
+        self._weights = encoders.manifest.evidence_for(view=query.is_view)
+        self._clock, self._hints, self._top_k = clock, hints, top_k
+        weights, matching = self._weights, config.matching
+        with clock.stage("retrieve"):
+            given = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
+            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=given)
+            self.query = query = query.searched if self._doubted and query.searched is not None else query
+            if given is None or self._doubted:
+                given = grid_costs(plan, grid, query, weights, matching, hints)
+            self._costs = costs = given
+            # Refined candidates can meet and become one; spare ones then take their places.
+            minimum = config.min_starts(query)
+            self.modes = retrieve(
+                costs,
+                grid,
+                query,
+                top_k=max(top_k, minimum) + minimum,
+                separation_m=config.separation_m,
+                margin=config.alike_margin,
+                limit=config.max_candidates + top_k,
+            )
+            self._lpo_count = config.starts(query, self.modes)
+            self._grid_cost = float(costs.cost.min())
+            reach_m = matching.grid_reach * grid.step_m
+            self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, matching)
+        self.by_walls = matching.compares_profiles(query)
+        self._prior = area_shares(grid.poses, plan.areas_m2)
+        # The mode that each candidate of `without_lpo` comes from.
+        self._modes_before_lpo = self.modes
+        # The modes that LPO refined and their candidates after it, in the same order; empty until then.
+        self._lpo_modes, self._lpo_candidates = list[Candidate](), list[Candidate]()
+        # Probable places after the stages so far; None until they are needed.
+        self._places: WeightedPlaces | None = None
+        self._best = dict[SearchStage, Candidate]()
+        self._signals = dict[SearchStage, Signals]()
+        self._stage: SearchStage = "retrieval"
+
+    def without_lpo(self, *, resampling: bool) -> list[Candidate]:
+        """Return the candidates after retrieval and, with `resampling`, after VDR; record both stages."""
+        config, camera_height_m = self._config, self._grid.camera_height_m
+        first = with_latents(self._plan, self._encoders, self.query, self.modes[:1], camera_height_m)
+        candidates = first + self.modes[1:]
+        self._record("retrieval", first[0], self._posterior(first))
+        if not resampling:
+            return candidates
+        count = config.vdr_candidates
+        with self._clock.stage("vdr"):
+            resampled = [
+                resample(
+                    self._plan,
+                    self._encoders,
+                    self.query,
+                    candidate,
+                    camera_height_m=camera_height_m,
+                    samples=config.vdr_samples,
+                    radius_m=config.vdr_radius_steps * self._grid.step_m,
+                    matching=config.matching,
+                    hints=self._hints,
+                )
+                for candidate in candidates[:count]
+            ]
+        order = ranked(resampled, self.query)
+        self._modes_before_lpo = [self.modes[index] for index in order] + self.modes[count:]
+        resampled = [resampled[index] for index in order]
+        self._record("vdr", resampled[0], self._posterior(resampled[:1]))
+        return resampled + candidates[count:]
+
+    def lpo_job(self, candidates: list[Candidate]) -> RefinementJob:
+        """Return the refinement job of the first candidates."""
+        matching = self._config.matching
+        starts = candidates[: self._lpo_count]
+        return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, self._weights, matching)
+
+    def after_lpo(self, candidates: list[Candidate], result: RefinementResult) -> list[Candidate]:
+        """Return the candidates of `lpo_job` after LPO: the refined ones, best first, then the others."""
+        starts, others = candidates[: self._lpo_count], candidates[self._lpo_count :]
+        # By walls, LPO starts at the modes themselves; otherwise at the candidates of `without_lpo`.
+        modes = self.modes if self.by_walls else self._modes_before_lpo
+        self._lpo_modes = modes[: self._lpo_count]
+        self._lpo_candidates = refined_candidates(
+            self._plan, self._encoders, self.query, starts, result, self._config.matching, self._hints
+        )
+        self._places, self._stage = None, "lpo"
+        return [self._lpo_candidates[index] for index in ranked(self._lpo_candidates, self.query)] + others
+
+    def localisation(self, candidates: list[Candidate]) -> Localisation:
+        """Return the distinct candidates of the last stage, best first, with everything that was recorded."""
+        config, hints, camera_height_m = self._config, self._hints, self._grid.camera_height_m
+        wanted = max(self._top_k, self._lpo_count) if config.by_probability else self._top_k
+        answers = distinct(candidates, self.query, config.separation_m, wanted)
+        found = self._posterior(answers)
+        if config.by_probability:
+            answers, found = _by_probability(answers, found, self._top_k, self._posterior)
+        if self.by_walls:
+            answers = with_latents(self._plan, self._encoders, self.query, answers, camera_height_m)
+        if self._stage == "lpo" or config.by_probability:
+            self._record(self._stage, answers[0], found)
+        missed = hints.missed(answers[0].position_m, answers[0].room_index)
+        if hints.strict:
+            missed = missed_hints(self._plan, self._costs, self._weights, hints)
+        return Localisation(
+            query=self.query,
+            candidates=answers,
+            posterior=found,
+            stage=self._stage,
+            signals=self._signals,
+            heading_contradicted=self._doubted,
+            hints_missed=missed,
+            best=self._best,
+            timings_ms=self._clock.timings_ms,
+        )
+
+    def _posterior(self, candidates: list[Candidate]) -> Posterior:
+        """Return the posterior after the stages so far, with the probabilities of some candidates."""
+        if self._places is None:
+            self._places = weighted_places(
+                self._costs,
+                self._prior,
+                self.query,
+                starts=self._lpo_modes,
+                ends=self._lpo_candidates,
+                temperature=self._weights.temperature,
+                separation_m=self._config.separation_m,
+            )
+        return self._places.posterior(candidates)
+
+    def _record(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
+        self._stage, self._best[stage] = stage, candidate
+        self._signals[stage] = signals_of(self.query, candidate, found, self._grid_cost, self._by_chance)
+
+
+def _by_probability(
+    answers: list[Candidate], found: Posterior, top_k: int, posterior: Callable[[list[Candidate]], Posterior]
+) -> tuple[list[Candidate], Posterior]:
+    """Return the `top_k` most probable candidates, most probable first, and their posterior."""
+    shares = found.candidate
+    # Probabilities that differ by rounding alone are equal, and keep the order by cost.
+    order = sorted(range(len(answers)), key=lambda index: -float(f"{shares[index]:.9g}"))[:top_k]
+    ordered = [answers[index] for index in order]
+    # The probabilities of place and heading are the first candidate's.
+    first = posterior(ordered[:1])
+    shares = tuple(shares[index] for index in order)
+    return ordered, replace(found, position=first.position, candidate=shares, heading=first.heading)

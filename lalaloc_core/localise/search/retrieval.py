@@ -1,0 +1,252 @@
+"""Retrieval: the poses of the plan's grid that fit a query best (paper, section 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.bundle import MatchingWeights
+from lalaloc_core.errors import InvalidHintError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PairLimits, PoseGrid, grid_candidate, likeliest
+from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
+from lalaloc_core.localise.match.cost_terms import latent_distances
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query
+from lalaloc_core.render.sampling import PoseSet, pose_grid
+
+# Limits of the number of pairs of a pose and a hypothesis that are compared in full.
+_MIN_COMPARED, _MAX_COMPARED = 1024, 4096
+# Up to this number of pairs, as in a single room, all are compared in full.
+_ALL_COMPARED = 2560
+# Maximum number of pairs whose cost the coarse pass estimates.
+_ESTIMATED = 65_536
+# Largest gain of refinement plus error of the coarse pass, in units of the cost.
+_MARGIN = 0.35
+# The last pairs compared in full, which calibrate the coarse pass for the other pairs.
+_CALIBRATING = 256
+# Best pairs that are searched for distinct candidates at first.
+_FIRST_RANKED = 1024
+
+
+def build_grid(
+    plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float, latents: bool = True
+) -> PoseGrid:
+    """Return the plan's pose grid with every layout rendered and, with `latents`, encoded, which is slow."""
+    poses = pose_grid(plan, step_m)
+    if not latents:
+        return PoseGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
+    embedded, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
+    return PoseGrid(poses, embedded, profile_m, step_m, camera_height_m)
+
+
+def grid_costs(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    query: Query,
+    weights: MatchingWeights,
+    config: MatchingConfig,
+    hints: Hints = NO_HINTS,
+) -> GridCosts:
+    """Return the costs of the best and all probable pairs of a grid pose and a hypothesis.
+
+    The coarse pass (`coarse_pass.py`) compares all pairs; its best are compared in full.
+
+    Raises:
+        InvalidHintError: strict hints exclude every pose of the grid.
+        InvalidInputError: latents are compared, and the grid has none.
+    """
+    hint_cost = _hint_cost(plan, grid, weights, hints)
+    if not config.compares_profiles(query):
+        distance = latent_distances(grid.known_latents, query.latents)
+        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), hint_cost)
+    matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
+    relaxed = _hint_cost(plan, grid, weights, hints.relaxed) if hints.strict else None
+    chosen = _choose(plan, grid, matching_cost, weights.temperature, hint_cost, relaxed)
+    pose, hypothesis = np.divmod(chosen.pair, len(query.roll))
+    cost, offset = matching_cost.pairs(grid.layouts(plan), pose[: chosen.compared], hypothesis[: chosen.compared])
+    if config.latent_weight:
+        latents, targets = grid.known_latents[pose[: len(cost)]], query.latents[hypothesis[: len(cost)]]
+        cost += config.latent_weight * np.linalg.norm(latents - targets, axis=1)
+    estimate = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
+    return GridCosts(
+        poses=grid.poses,
+        pose=pose,
+        hypothesis=hypothesis,
+        cost=np.append(cost, estimate),
+        offset=np.append(offset, np.zeros(len(estimate))),
+        hint_cost=None if hint_cost is None else hint_cost[pose],
+        compared=chosen.compared,
+    )
+
+
+class _Chosen(NamedTuple):
+    """Pairs that the coarse pass leaves.
+
+    Attributes:
+        pair: pose times the number of hypotheses, plus hypothesis: the pairs to compare in full, then the others.
+        compared: number of pairs to compare in full.
+        coarse: coarse costs of the first of these.
+        estimate: coarse costs of the others.
+    """
+
+    pair: Int[np.ndarray, "m"]
+    compared: int
+    coarse: Float[np.ndarray, "c"]
+    estimate: Float[np.ndarray, "e"]
+
+    def error(self, cost: Float[np.ndarray, "c"], temperature: float) -> float:
+        """Return the correction of the estimates that makes their total probability right.
+
+        The last pairs compared in full are the most similar to the estimated ones.
+        """
+        if not len(self.estimate):
+            return 0.0
+        last = slice(max(len(self.coarse) - _CALIBRATING, 0), len(self.coarse))
+        weight = -temperature * (cost[: len(self.coarse)][last] - self.coarse[last]).astype(np.float64)
+        return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
+
+
+def _choose(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    matching_cost: MatchingCost,
+    temperature: float,
+    hint_cost: Float[np.ndarray, "n"] | None,
+    relaxed: Float[np.ndarray, "n"] | None,
+) -> _Chosen:
+    """Choose the pairs to compare in full and to estimate.
+
+    `hint_cost` is the cost of the hints at every pose, and `relaxed` the same if strict hints were not; the best pairs
+    by that are compared as well.
+    """
+    pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
+    if pairs <= _ALL_COMPARED:
+        return _Chosen(np.arange(pairs), pairs, nothing, nothing)
+    window = _MARGIN + NEGLIGIBLE / temperature
+    azimuths = VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS
+    binned, room_index = grid.binned(plan, azimuths), grid.poses.room_index
+    limits = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
+    total, pair = likeliest(binned, matching_cost, room_index, limits, hint_cost)
+    probable = int(np.searchsorted(total, total[0] + window))
+    compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
+    cost = total if hint_cost is None else total - hint_cost[pair // matching_cost.hypotheses]
+    first, others = pair[:compared], pair[compared:probable]
+    if relaxed is not None:
+        limits = PairLimits(at_most=_MIN_COMPARED, at_least=_MIN_COMPARED)
+        excluded = likeliest(binned, matching_cost, room_index, limits, relaxed)[1]
+        first = np.append(first, np.setdiff1d(excluded, pair[:probable]))
+    return _Chosen(np.append(first, others), len(first), cost[:compared], cost[compared:probable])
+
+
+def missed_hints(plan: FloorPlan, costs: GridCosts, weights: MatchingWeights, hints: Hints) -> tuple[HintName, ...]:
+    """Return the hints that would not hold at the best place if they were not strict."""
+    relaxed = _penalties(plan, costs.poses, weights, hints.relaxed)[costs.pose]
+    pose = costs.pose[int((costs.cost + relaxed)[: costs.compared].argmin())]
+    return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
+
+
+def _penalties(plan: FloorPlan, poses: PoseSet, weights: MatchingWeights, hints: Hints) -> Float[np.ndarray, "n"]:
+    """Return the cost of the hints at poses."""
+    return hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
+
+
+def _hint_cost(
+    plan: FloorPlan, grid: PoseGrid, weights: MatchingWeights, hints: Hints
+) -> Float[np.ndarray, "n"] | None:
+    if hints.are_none:
+        return None
+    cost = _penalties(plan, grid.poses, weights, hints)
+    if np.isfinite(cost).any():
+        return cost
+    raise InvalidHintError(
+        "strict",
+        f"none of the {len(cost)} grid poses, {grid.step_m:g} m apart, meets all hints: widen the hints or omit strict",
+    )
+
+
+def retrieve(
+    costs: GridCosts,
+    grid: PoseGrid,
+    query: Query,
+    *,
+    top_k: int,
+    separation_m: float,
+    margin: float = 0.0,
+    limit: int = 0,
+) -> list[Candidate]:
+    """Return the `top_k` best grid poses, best first, no two closer than `separation_m` at about one heading.
+
+    Up to `limit` candidates are returned if they cost less than `margin` more than the best.
+    """
+    total = costs.total[: costs.compared]
+    ranked, ranks = np.argsort(total, kind="stable"), max(_FIRST_RANKED, top_k)
+    ranked = ranked[: np.isfinite(total).sum()]
+    limit, ceiling = max(limit, top_k), float(total.min()) + margin
+    while True:
+        pair = ranked[:ranks]
+        kept = suppress(
+            grid.poses.position_m[costs.pose[pair]],
+            total[pair],
+            separation_m=separation_m,
+            limit=top_k,
+            heading=query.roll[costs.hypothesis[pair]],
+            ceiling=ceiling,
+            limit_below=limit,
+        )
+        if len(kept) >= top_k or ranks >= len(ranked):
+            break
+        # On a fine grid the best pairs can all be of a few places.
+        ranks *= 4
+    return [_candidate(costs, query, grid, int(pair[index])) for index in kept]
+
+
+def _candidate(costs: GridCosts, query: Query, grid: PoseGrid, pair: int) -> Candidate:
+    return grid_candidate(
+        grid,
+        int(costs.pose[pair]),
+        query,
+        int(costs.hypothesis[pair]),
+        cost=float(costs.cost[pair]),
+        height_offset=float(costs.offset[pair]),
+        hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[pair]),
+    )
+
+
+def contradicted(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    query: Query,
+    weights: MatchingWeights,
+    config: MatchingConfig,
+    *,
+    given: GridCosts | None = None,
+) -> bool:
+    """Return whether the picture fits another heading so much better that the given one must be wrong.
+
+    `given` are the costs of the grid at the given heading, without hints, if they are known already.
+
+    A given heading is wrong with the probability `heading_doubt`; then every heading that is searched is as likely. It
+    is kept where its best place fits as well as right headings do, and where the search fits better by no more than
+    beside right headings (`MatchingWeights.usual_cost`, `usual_gain`).
+    """
+    searched = query.searched
+    if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
+        return False
+    doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
+    given = grid_costs(plan, grid, query, weights, config) if given is None else given
+    best = int(given.cost[: given.compared].argmin())
+    # Costs are non-negative, so no heading is better by more than the given one's cost.
+    if given.cost[best] <= max(doubt, weights.usual_cost):
+        return False
+    # One camera height, the best at the given heading, is accurate enough to compare headings.
+    offset = float(given.offset[best])
+    height_m = query.camera_height.height_m * float(np.exp(offset))
+    exact = replace(searched.scaled(offset), camera_height=CameraHeight(height_m, 0.0))
+    any_heading = grid_costs(plan, grid, exact, weights, config)
+    gain = given.cost[best] - any_heading.cost[: any_heading.compared].min()
+    return bool(gain > max(doubt, weights.usual_gain * given.cost[best]))

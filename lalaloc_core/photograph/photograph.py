@@ -1,0 +1,287 @@
+"""Reader for photographs of any kind: from encoded bytes and statements to what the encoders expect."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.cameras import Around, Camera, Perspective
+from lalaloc_core.photograph.exif import read_exif_lens
+from lalaloc_core.photograph.levelling import MAX_ESTIMATED_SD, estimate_attitude, estimate_calibration
+from lalaloc_core.photograph.lines import find_segments, lines_of
+from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
+from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
+from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture, orientation_of, scaled, turned
+from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
+from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.photograph.spheres import Sphere, open_sphere
+from lalaloc_core.photograph.spheres import warm_up as warm_up_spheres
+from lalaloc_core.photograph.stated_camera import StatedCamera
+
+# Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
+_LONG_SIDE = 480
+_JPEG_FACTORS = (8, 4, 2, 1)
+# Standard deviation of a stated pitch or roll.
+_GIVEN_SD = math.radians(0.5)
+# Seen azimuths: samples of the left and right border, and the largest elevation that counts.
+_SAMPLES, _MAX_ELEVATION = 33, math.radians(45.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assumed:
+    """Angle with its standard deviation (radians) and its origin."""
+
+    value: float
+    sd: float
+    source: Source
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographFeatures:
+    """Outputs of an image encoder, which replace the pixels of a photograph.
+
+    Attributes:
+        outputs: arrays by name, for a camera height of 1 m; see `localise.encode.features`.
+        azimuths: azimuth (radians) of each patch relative to the photograph's centre; empty for a full sphere.
+    """
+
+    outputs: Mapping[str, np.ndarray]
+    azimuths: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photograph:
+    """A photograph as the encoders expect it, and what was assumed about it.
+
+    Attributes:
+        projection: the projection.
+        projection_source: its origin.
+        hfov: horizontal field of view.
+        pitch: elevation of the centre of the picture.
+        roll: clockwise rotation of the camera about its optical axis.
+        azimuths: first and last azimuth (radians) that the photograph shows, relative to its centre, clockwise.
+        patches: level patches that cover the photograph; empty for a full sphere.
+        panorama: the level sphere; None for other photographs.
+        encoded: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
+        camera: camera of the full upright picture; None for a full sphere.
+        axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
+        compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
+        warnings: metadata that were ignored, and estimates to be checked.
+    """
+
+    projection: Projection
+    projection_source: Source
+    hfov: Assumed
+    pitch: Assumed
+    roll: Assumed
+    azimuths: tuple[float, float]
+    patches: tuple[Patch, ...] = ()
+    panorama: Sphere | None = None
+    camera: Camera | None = None
+    axes: Float[np.ndarray, "3 3"] | None = None
+    encoded: PhotographFeatures | None = None
+    compass_heading: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def is_sphere(self) -> bool:
+        """True if the photograph is a full sphere."""
+        return self.panorama is not None or (self.encoded is not None and not self.encoded.azimuths)
+
+    def tilt_sd(self, azimuth: float) -> float:
+        """Return the standard deviation (radians) of elevations along an azimuth, from those of pitch and roll."""
+        return math.hypot(self.pitch.sd * math.cos(azimuth), self.roll.sd * math.sin(azimuth))
+
+    def project(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return where the upright picture shows level rays (right, forward, up), and whether it does.
+
+        Places are shares (x, y) of its width and height. For photographs with a camera, which full spheres have not.
+        """
+        assert self.camera is not None
+        assert self.axes is not None
+        pixels, seen = self.camera.pixels(rays @ self.axes.T)
+        return pixels / (self.camera.width, self.camera.height), seen
+
+
+def open_picture(
+    content: bytes, *, max_size: tuple[int, int], limits: PhotographLimits | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the upright picture of a photograph, no wider and higher than `max_size` (pixels), to be shown.
+
+    Raises:
+        InvalidPhotographError: the file is not readable or too large.
+    """
+    with opened_picture(content, limits or PhotographLimits()) as image:
+        orientation = orientation_of(image)
+        width, height = turned(image.size, orientation)
+        share = min(max_size[0] / width, max_size[1] / height)
+        size = max(1, round(share * width)), max(1, round(share * height))
+        return np.asarray(scaled(image, orientation, size))
+
+
+def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
+    """Read small pictures, so that codecs and detectors are loaded before the first request."""
+    warm_up_spheres(height=sphere_size[0], width=sphere_size[1])
+    buffer = io.BytesIO()
+    Image.new("RGB", (256, 192)).save(buffer, "JPEG")
+    stated = StatedCamera(projection="perspective", hfov_deg=70.0)
+    open_photograph(buffer.getvalue(), sphere_size=sphere_size, stated=stated, patch_size=patch_size)
+
+
+def open_photograph(
+    content: bytes,
+    *,
+    sphere_size: tuple[int, int],
+    stated: StatedCamera | None = None,
+    patch_size: PatchSize | None = None,
+    limits: PhotographLimits | None = None,
+) -> Photograph:
+    """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
+
+    Args:
+        content: the file.
+        sphere_size: height and width (pixels) that a full sphere is scaled to.
+        stated: the caller's statements; None for none.
+        patch_size: size of the patches of other photographs.
+        limits: limits of the file.
+
+    Raises:
+        InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the
+            picture shows.
+    """
+    stated, limits = stated or StatedCamera(), limits or PhotographLimits()
+    size = patch_size or PatchSize()
+    stated.check()
+
+    @cache
+    def panorama(height: int = sphere_size[0], width: int = sphere_size[1]) -> Sphere:
+        pitch, roll = (None if angle is None else math.radians(angle) for angle in (stated.pitch_deg, stated.roll_deg))
+        return open_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
+
+    is_fine = sphere_size[0] >= COARSEST[0]
+    with opened_picture(content, limits) as image:
+        orientation = orientation_of(image)
+        width, height = turned(image.size, orientation)
+        if min(width, height) < limits.min_height:
+            raise InvalidPhotographError(
+                f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
+            )
+        sphere = read_photo_sphere(image.info.get("xmp"), width=width, height=height)
+        lens = find_lens(
+            width,
+            height,
+            stated=stated,
+            sphere=sphere,
+            exif=read_exif_lens(image.getexif(), width=width, height=height),
+            looks_spherical=lambda: is_sphere((panorama() if is_fine else panorama(*COARSEST)).pixels),
+        )
+        if lens.is_sphere:
+            return _sphere_view(panorama(), lens, stated, sphere)
+        picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
+    return _view(picture, (width, height), lens, stated, size)
+
+
+def _sphere_view(panorama: Sphere, lens: Lens, stated: StatedCamera, sphere: PhotoSphere) -> Photograph:
+    def tilt(stated_deg: float | None, metadata: float) -> Assumed:
+        if stated_deg is not None:
+            return Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
+        return Assumed(value=metadata, sd=_GIVEN_SD, source="gpano" if metadata else "assumed")
+
+    half = math.pi * (1.0 if sphere.part is None else sphere.part.width)
+    return Photograph(
+        projection=lens.projection,
+        projection_source=lens.projection_source,
+        hfov=Assumed(value=2.0 * half, sd=0.0, source=lens.projection_source),
+        pitch=tilt(stated.pitch_deg, sphere.pitch),
+        roll=tilt(stated.roll_deg, sphere.roll),
+        azimuths=(-half, half),
+        panorama=panorama,
+        compass_heading=panorama.compass_heading,
+        warnings=lens.warnings,
+    )
+
+
+def _view(
+    picture: UInt8[np.ndarray, "h w 3"], full_size: tuple[int, int], lens: Lens, stated: StatedCamera, size: PatchSize
+) -> Photograph:
+    rows, columns = picture.shape[:2]
+    needs_lines = lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
+    segments = find_segments(picture) if needs_lines else np.zeros((0, 4))
+    warnings = lens.warnings
+    if lens.camera is None:
+        found = estimate_calibration(segments, width=columns, height=rows)
+        attitude, focal_sd = found.attitude, found.focal_sd
+        camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
+        origin = "was estimated from straight lines" if len(segments) else "is only usual"
+        warnings = (
+            *warnings,
+            f"the field of view of {math.degrees(found.hfov):.0f}° ± "
+            f"{math.degrees(2.0 * _hfov_sd(camera, focal_sd)):.0f}° {origin}; "
+            "send hfov_deg or the camera's original file",
+        )
+        small = camera.scaled(columns, rows)
+    else:
+        camera, focal_sd = lens.camera, lens.focal_sd
+        small = camera.scaled(columns, rows)
+        attitude = estimate_attitude(lines_of(segments, small))
+    pitch = _tilt(stated.pitch_deg, attitude.pitch, attitude.pitch_sd)
+    roll = _tilt(stated.roll_deg, attitude.roll, attitude.roll_sd)
+    tilt = pitch.value
+    if isinstance(camera, Around) and lens.projection == "cylindrical" and pitch.source == "given":
+        # A strip's pitch is the same all around, so its camera is not rotated.
+        camera, tilt = replace(camera, elevation=pitch.value), 0.0
+        small = camera.scaled(columns, rows)
+    return Photograph(
+        projection=lens.projection,
+        projection_source=lens.projection_source,
+        hfov=Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source),
+        pitch=pitch,
+        roll=roll,
+        azimuths=_seen_azimuths(small, tilt, roll.value),
+        patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
+        camera=camera,
+        axes=camera_axes(pitch=tilt, roll=roll.value),
+        warnings=warnings,
+    )
+
+
+def _tilt(stated_deg: float | None, angle: float, sd: float) -> Assumed:
+    if stated_deg is not None:
+        return Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
+    return Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
+
+
+def _decoded_size(width: int, height: int, lens: Lens, size: PatchSize) -> tuple[int, int]:
+    """Return a size at which a JPEG decodes fast, fine enough for lines and patches if the picture is."""
+    most = max(width, height) / _LONG_SIDE
+    if lens.camera is not None:
+        most = min(most, lens.camera.resolution / (FINER * size.resolution))
+    eighth = next((factor for factor in _JPEG_FACTORS if most >= factor), 1)
+    factor = eighth * max(1, int(most / eighth))
+    return -(-width // factor), -(-height // factor)
+
+
+def _hfov_sd(camera: Camera, focal_sd: float) -> float:
+    """Return the standard deviation of the field of view; only that of perspective cameras is not linear."""
+    return focal_sd * (math.sin(camera.hfov) if isinstance(camera, Perspective) else camera.hfov)
+
+
+def _seen_azimuths(camera: Camera, pitch: float, roll: float) -> tuple[float, float]:
+    """Return the azimuths of the picture's leftmost and rightmost ray that a patch can show."""
+    half = 0.5 * camera.hfov
+    if half > 0.5 * math.pi:
+        return -half, half
+    y = np.linspace(0.0, camera.height, _SAMPLES)
+    border = np.concatenate([np.stack([np.full_like(y, x), y], axis=-1) for x in (0.0, float(camera.width))])
+    rays = camera.rays(border) @ camera_axes(pitch=pitch, roll=roll)
+    usable = np.abs(rays[:, 2]) < math.sin(_MAX_ELEVATION)
+    azimuth = np.arctan2(rays[:, 0], rays[:, 1])[usable]
+    return (float(azimuth.min()), float(azimuth.max())) if len(azimuth) else (-half, half)

@@ -1,0 +1,144 @@
+"""Reader for panoramas: from encoded bytes to the pixels that the image encoder expects.
+
+Three kinds of metadata are used: the EXIF orientation, the visible part of the sphere, and the camera's pitch and roll
+(`photo_sphere`).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
+from lalaloc_core.photograph.picture_files import (
+    FORMATS,
+    NEUTRAL,
+    PhotographLimits,
+    opened_picture,
+    orientation_of,
+    scaled,
+    turned,
+)
+from lalaloc_core.photograph.sphere_levelling import level
+
+# Oversampling of pictures that are placed or levelled, relative to the encoder's input.
+_FINER = 2
+# Rounding error, in pixels.
+_EDGE = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sphere:
+    """The full sphere, level, as the image encoder expects it.
+
+    `compass_heading` is the azimuth of the centre column, radians clockwise from true north; None if not in the
+    metadata.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    compass_heading: float | None = None
+
+
+def read_sphere(
+    content: bytes, *, height: int, width: int, limits: PhotographLimits | None = None
+) -> UInt8[np.ndarray, "{height} {width} 3"]:
+    """Return the pixels of `open_sphere`; see there for errors."""
+    return open_sphere(content, height=height, width=width, limits=limits).pixels
+
+
+def open_sphere(
+    content: bytes,
+    *,
+    height: int,
+    width: int,
+    limits: PhotographLimits | None = None,
+    pitch: float | None = None,
+    roll: float | None = None,
+) -> Sphere:
+    """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`.
+
+    Args:
+        content: the file.
+        height: rows of the result.
+        width: columns of the result.
+        limits: limits of the file.
+        pitch: elevation of the centre (radians), instead of the metadata's.
+        roll: clockwise rotation of the camera (radians), instead of the metadata's.
+
+    Raises:
+        InvalidPhotographError: empty, unsupported format, damaged, too large, too many segments or scans, or neither
+        the
+            full sphere nor a part of it that the metadata describe.
+    """
+    limits = limits or PhotographLimits()
+    with opened_picture(content, limits) as image:
+        orientation = orientation_of(image)
+        upright = turned(image.size, orientation)
+        sphere = read_photo_sphere(image.info.get("xmp"), width=upright[0], height=upright[1])
+        _check_shape(*upright, sphere, limits)
+        sphere = replace(
+            sphere, pitch=sphere.pitch if pitch is None else pitch, roll=sphere.roll if roll is None else roll
+        )
+        finer = 1 if sphere.part is None and sphere.level else _FINER
+        canvas_size = (width * finer, height * finer)
+        picture = scaled(image, orientation, _shown_size(sphere.part, canvas_size))
+        canvas = picture if sphere.part is None else _placed(picture, sphere.part, canvas_size)
+        if not sphere.level:
+            canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll))
+        pixels = np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
+    return Sphere(pixels=pixels, compass_heading=sphere.compass_heading)
+
+
+def warm_up(*, height: int, width: int) -> None:
+    """Read a small picture of every format, so that codecs are loaded before the first request."""
+    picture = Image.new("RGB", (256, 128), NEUTRAL)
+    for picture_format in FORMATS:
+        buffer = io.BytesIO()
+        picture.save(buffer, picture_format)
+        open_sphere(buffer.getvalue(), height=height, width=width)
+
+
+def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PhotographLimits) -> None:
+    if sphere.refusal is not None:
+        raise InvalidPhotographError(f"the photograph's photo sphere metadata rule it out: {sphere.refusal}")
+    full_height = height if sphere.part is None else round(height / sphere.part.height)
+    if full_height < limits.min_height:
+        raise InvalidPhotographError(f"the photograph is {full_height} pixels high; the minimum is {limits.min_height}")
+    if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
+        fault = "" if sphere.fault is None else f"; its photo sphere metadata are invalid: {sphere.fault}"
+        raise InvalidPhotographError(
+            f"the photograph is {width} x {height}; a full 360° panorama is twice as wide as high, within "
+            f"{limits.aspect_tolerance:.0%}{fault}"
+        )
+
+
+def _shown_size(part: SpherePart | None, canvas_size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size to scale a picture of a part of the sphere to, at least as fine as the canvas."""
+    width, height = canvas_size
+    return (width, height) if part is None else (math.ceil(width * part.width), math.ceil(height * part.height))
+
+
+def _placed(picture: Image.Image, part: SpherePart, size: tuple[int, int]) -> Image.Image:
+    """Place a picture of a part on the neutral full sphere; pixels that it covers partly stay neutral."""
+    width, height = size
+    edges_x = (part.left * width, (part.left + part.width) * width)
+    edges_y = (part.top * height, (part.top + part.height) * height)
+    left, right = math.ceil(edges_x[0] - _EDGE), math.floor(edges_x[1] + _EDGE)
+    top, bottom = math.ceil(edges_y[0] - _EDGE), math.floor(edges_y[1] + _EDGE)
+    scale_x = picture.width / (edges_x[1] - edges_x[0])
+    scale_y = picture.height / (edges_y[1] - edges_y[0])
+    box = (
+        max(0.0, (left - edges_x[0]) * scale_x),
+        max(0.0, (top - edges_y[0]) * scale_y),
+        min(float(picture.width), (right - edges_x[0]) * scale_x),
+        min(float(picture.height), (bottom - edges_y[0]) * scale_y),
+    )
+    canvas = Image.new("RGB", size, NEUTRAL)
+    canvas.paste(picture.resize((right - left, bottom - top), Image.Resampling.BILINEAR, box=box), (left, top))
+    return canvas

@@ -1,0 +1,210 @@
+"""Statements of a caller about a photograph: projection, lens and tilt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal, get_args
+
+import numpy as np
+
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
+
+Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
+PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
+AUTO = "auto"
+# Horizontal fields of view, degrees.
+HFOV_RANGE_DEG = {
+    AUTO: (10.0, 360.0),
+    "equirectangular": (10.0, 360.0),
+    "perspective": (10.0, 150.0),
+    "cylindrical": (10.0, 360.0),
+    "fisheye": (10.0, 300.0),
+}
+MAX_PITCH_DEG, MAX_ROLL_DEG = 60.0, 180.0
+_MAX_FOCAL_RATIO = 2.0
+_MAX_COEFFICIENT = 100.0
+# OpenCV counts pixels from the centre of the first one.
+_HALF_PIXEL = 0.5
+# Largest error (pixels) of distorting again what was undistorted.
+_ROUND_TRIP = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """Camera matrix and distortion as OpenCV's calibration prints them, for the upright picture at its full size.
+
+    Attributes:
+        fx, fy: focal lengths, pixels.
+        cx, cy: optical centre, pixels from the centre of the top left pixel; None for the picture's centre.
+        k1, k2, k3: radial distortion, of the fisheye model for projection "fisheye".
+        k4: radial distortion of the fisheye model.
+        p1, p2: tangential distortion, not of the fisheye model.
+    """
+
+    fx: float
+    fy: float
+    cx: float | None = None
+    cy: float | None = None
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedCamera:
+    """Caller's statements about one photograph; None for unknown values. Degrees, as in requests.
+
+    Attributes:
+        projection: one of `PROJECTIONS`, or "auto".
+        hfov_deg: horizontal field of view of the upright picture.
+        intrinsics: camera matrix and distortion, instead of `hfov_deg`.
+        pitch_deg: elevation of the picture's centre above the horizon; of its whole middle row, if it is cylindrical.
+        roll_deg: clockwise rotation of the camera about its optical axis.
+    """
+
+    projection: str = AUTO
+    hfov_deg: float | None = None
+    intrinsics: Intrinsics | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+
+    def check(self) -> None:
+        """Check all values that do not depend on the picture.
+
+        Raises:
+            InvalidPhotographError: a value is unknown, not finite or out of range, or two values exclude each other.
+        """
+        if self.projection not in HFOV_RANGE_DEG:
+            raise InvalidPhotographError(
+                f"projection is '{str(self.projection)[:50]}'; it must be one of {', '.join(HFOV_RANGE_DEG)}"
+            )
+        _check_range("hfov_deg", self.hfov_deg, *HFOV_RANGE_DEG[self.projection])
+        _check_range("pitch_deg", self.pitch_deg, -MAX_PITCH_DEG, MAX_PITCH_DEG)
+        _check_range("roll_deg", self.roll_deg, -MAX_ROLL_DEG, MAX_ROLL_DEG)
+        if self.intrinsics is None:
+            return
+        if self.hfov_deg is not None:
+            raise InvalidPhotographError("hfov_deg and intrinsics exclude each other; send one of them")
+        if self.projection not in (AUTO, "perspective", "fisheye"):
+            raise InvalidPhotographError(
+                f"intrinsics do not apply to the projection '{self.projection}'; send hfov_deg"
+            )
+        self._check_intrinsics(self.intrinsics)
+
+    def _check_intrinsics(self, intrinsics: Intrinsics) -> None:
+        for name in (field.name for field in fields(intrinsics)):
+            value = getattr(intrinsics, name)
+            if value is not None and not math.isfinite(value):
+                raise InvalidPhotographError(f"intrinsics: {name} is {value}; it must be finite")
+        for name in ("fx", "fy"):
+            if getattr(intrinsics, name) <= 0.0:
+                raise InvalidPhotographError(
+                    f"intrinsics: {name} is {getattr(intrinsics, name):g}; it must be positive"
+                )
+        if not 1.0 / _MAX_FOCAL_RATIO <= intrinsics.fx / intrinsics.fy <= _MAX_FOCAL_RATIO:
+            raise InvalidPhotographError(
+                f"intrinsics: fx is {intrinsics.fx:g} and fy {intrinsics.fy:g}; they must agree within a factor of "
+                f"{_MAX_FOCAL_RATIO:g}"
+            )
+        for name in ("k1", "k2", "k3", "k4", "p1", "p2"):
+            _check_range(f"intrinsics: {name}", getattr(intrinsics, name), -_MAX_COEFFICIENT, _MAX_COEFFICIENT)
+        unused = ("p1", "p2") if self.projection == "fisheye" else ("k4",)
+        for name in unused:
+            if getattr(intrinsics, name) != 0.0:
+                raise InvalidPhotographError(
+                    f"intrinsics: {name} does not belong to the projection "
+                    f"'{'fisheye' if self.projection == 'fisheye' else 'perspective'}'; leave it out"
+                )
+
+
+def camera_of_hfov(projection: Projection, width: int, height: int, hfov: float) -> Camera:
+    """Return the camera of a projection with a horizontal field of view (radians)."""
+    if projection == "perspective":
+        return Perspective.of_hfov(width, height, hfov)
+    if projection == "fisheye":
+        return Fisheye.of_hfov(width, height, hfov)
+    return Around(width=width, height=height, hfov=hfov, spherical=projection == "equirectangular")
+
+
+def camera_of_intrinsics(
+    projection: Literal["perspective", "fisheye"], width: int, height: int, intrinsics: Intrinsics
+) -> Camera:
+    """Return the camera of checked intrinsics.
+
+    Raises:
+        InvalidPhotographError: the optical centre is outside of the picture, the field of view is out of range, or the
+            distortion folds the picture.
+    """
+    centre: list[float] = []
+    for name, value, side in (("cx", intrinsics.cx, width), ("cy", intrinsics.cy, height)):
+        position = 0.5 * side if value is None else value + _HALF_PIXEL
+        if not 0.0 <= position <= side:
+            raise InvalidPhotographError(
+                f"intrinsics: {name} is {value:g}, outside of the upright picture of {width} x {height}"
+            )
+        centre.append(position)
+    k1, k2, k3 = intrinsics.k1, intrinsics.k2, intrinsics.k3
+    if projection == "fisheye":
+        camera = Fisheye(
+            width=width,
+            height=height,
+            fx=intrinsics.fx,
+            fy=intrinsics.fy,
+            cx=centre[0],
+            cy=centre[1],
+            radial=(k1, k2, k3, intrinsics.k4),
+        )
+    else:
+        camera = Perspective(
+            width=width,
+            height=height,
+            fx=intrinsics.fx,
+            fy=intrinsics.fy,
+            cx=centre[0],
+            cy=centre[1],
+            radial=(k1, k2, k3),
+            tangential=(intrinsics.p1, intrinsics.p2),
+        )
+    low, high = HFOV_RANGE_DEG[projection]
+    hfov_deg = math.degrees(camera.hfov)
+    if not low <= hfov_deg <= high:
+        raise InvalidPhotographError(
+            f"intrinsics: fx is {intrinsics.fx:g} for a picture {width} pixels wide, a field of view of "
+            f"{hfov_deg:.3g}°; it must be between {low:g}° and {high:g}°"
+        )
+    if projection == "perspective":
+        _check_distortion(camera)
+    return camera
+
+
+def intrinsics_of(camera: Perspective | Fisheye) -> Intrinsics:
+    """Return the intrinsics of a camera, from which `camera_of_intrinsics` makes it again."""
+    matrix = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - _HALF_PIXEL, "cy": camera.cy - _HALF_PIXEL}
+    if isinstance(camera, Fisheye):
+        k1, k2, k3, k4 = camera.radial
+        return Intrinsics(**matrix, k1=k1, k2=k2, k3=k3, k4=k4)
+    (k1, k2, k3), (p1, p2) = camera.radial, camera.tangential
+    return Intrinsics(**matrix, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+
+
+def _check_distortion(camera: Camera) -> None:
+    """Refuse a distortion that maps no ray to some border."""
+    across, down = np.meshgrid(np.linspace(0.0, camera.width, 9), np.linspace(0.0, camera.height, 9))
+    pixels = np.stack([across, down], axis=-1)
+    # Rounding can place points of the border outside of it.
+    again, _ = camera.pixels(camera.rays(pixels))
+    if not np.abs(again - pixels).max() < _ROUND_TRIP:
+        raise InvalidPhotographError(
+            "intrinsics: the distortion is not invertible within the picture; check k1, k2, k3, p1 and p2"
+        )
+
+
+def _check_range(name: str, value: float | None, low: float, high: float) -> None:
+    # NaN is in no range.
+    if value is not None and not low <= value <= high:
+        raise InvalidPhotographError(f"{name} is {value:g}; it must be between {low:g} and {high:g}")

@@ -1,0 +1,98 @@
+"""Cache with a limit in bytes and least-recently-used eviction."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from cachetools import Cache, LRUCache
+
+from service.capacity.single_flight import SingleFlight
+
+K = TypeVar("K")
+V = TypeVar("V")
+M = TypeVar("M")
+
+# Share of a cache that values may fill before anybody asks for them.
+_UNREAD_SHARE = 1.0 / 32.0
+
+
+class _CountingLruCache(LRUCache[K, V]):
+    """LRU cache that counts evictions."""
+
+    evictions = 0
+
+    def popitem(self) -> tuple[K, V]:
+        self.evictions += 1
+        return super().popitem()
+
+
+class BoundedCache(Generic[K, V]):
+    """Thread-safe `cachetools.LRUCache` that ignores values larger than the whole cache.
+
+    Args:
+        limit_bytes: size of the cache.
+        size: function that returns the bytes of a value.
+    """
+
+    def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:
+        self._values: _CountingLruCache[K, V] = _CountingLruCache(limit_bytes, size)
+        self._lock = threading.Lock()
+        self._making = SingleFlight[K, Any]()
+
+    @property
+    def bytes(self) -> int:
+        """Total size of the values in bytes."""
+        return int(self._values.currsize)
+
+    def get(self, key: K) -> V | None:
+        """Return a value and mark it as used."""
+        with self._lock:
+            return self._values.get(key)
+
+    def put(self, key: K, value: V) -> int:
+        """Store a value, unless it is larger than the whole cache; return the number of evictions."""
+        with self._lock:
+            self._values.pop(key, None)
+            before = self._values.evictions
+            if self._values.getsizeof(value) <= self._values.maxsize:
+                self._values[key] = value
+            return self._values.evictions - before
+
+    def put_unread(self, key: K, value: V) -> None:
+        """Store a value that nobody asked for, in a share of the cache: thousands do not displace those in use."""
+        if self.bytes < _UNREAD_SHARE * self._values.maxsize:
+            self.put(key, value)
+
+    def get_or_make(self, key: K, make: Callable[[], M]) -> V | M:
+        """Return a value; if it is missing, make and store it, once for all threads that ask meanwhile.
+
+        `make` may return None, which is not stored.
+        """
+
+        def made() -> Any:
+            # Another thread may have made it since.
+            value: Any = self.get(key)
+            if value is None and (value := make()) is not None:
+                self.put(key, value)
+            return value
+
+        value = self.get(key)
+        return self._making.run(key, made) if value is None else value
+
+    def drop(self, unwanted: Callable[[K, V], bool]) -> None:
+        """Remove the values that `unwanted` selects."""
+        with self._lock:
+            for key, value in self._items():
+                if unwanted(key, value):
+                    del self._values[key]
+
+    def items(self) -> list[tuple[K, V]]:
+        """Return keys and values without marking them as used."""
+        with self._lock:
+            return self._items()
+
+    def _items(self) -> list[tuple[K, V]]:
+        # Bypasses the subclass, which would mark each value as used.
+        return [(key, Cache.__getitem__(self._values, key)) for key in self._values]

@@ -1,0 +1,223 @@
+"""Fair sharing of scarce resources between clients, which are tenants or, without API keys, client addresses.
+
+There are two rules and no settings:
+
+* A client gets one more unit only while it holds fewer than three times the units that then stay free. A client alone
+  gets three quarters of the total; n greedy clients get 3 / (3n + 1) each, and the remainder stays free for new clients
+  (dynamic thresholds: Choudhury and Hahne, IEEE/ACM Transactions on Networking 6(2), 1998).
+* Among waiting clients, the one that used the least CPU time lately is served first (`CpuAccounts`); equals take turns.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import Counter, OrderedDict, deque
+from collections.abc import AsyncIterator, Callable, Iterator, Set
+from concurrent.futures import Future
+from contextlib import asynccontextmanager, contextmanager
+from typing import Generic, TypeVar
+
+from service.capacity.cpu_accounts import CpuAccounts
+
+T = TypeVar("T")
+
+# Largest ratio of the units of a client to the units that stay free.
+_MAX_RATIO = 3
+
+
+def with_headroom(count: int) -> int:
+    """Return the limit at which a client that is alone gets `count` units."""
+    return count + -(-count // _MAX_RATIO)
+
+
+def max_per_client(limit: int) -> int:
+    """Return the number of units, at least one, that a client alone can hold of `limit`."""
+    return max(limit * _MAX_RATIO // (_MAX_RATIO + 1), 1)
+
+
+class Shares:
+    """Units held per client. Not thread-safe: for one event loop, or under the owner's lock.
+
+    Args:
+        limit: total number of units.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.in_use = 0
+        self._held: Counter[str] = Counter()
+
+    def held_by(self, client: str) -> int:
+        """Return the number of units that a client holds."""
+        return self._held[client]
+
+    def clients(self) -> Set[str]:
+        """Return the clients that hold units."""
+        return self._held.keys()
+
+    def may_take(self, client: str) -> bool:
+        """Return True if a client can take one more unit."""
+        held, left = self._held[client], self.limit - self.in_use - 1
+        return left >= 0 and (held == 0 or held < _MAX_RATIO * left)
+
+    def take(self, client: str) -> None:
+        """Count one more unit for a client, without a check."""
+        self.in_use += 1
+        self._held[client] += 1
+
+    def give_back(self, client: str) -> None:
+        """Count one unit less for a client."""
+        self.in_use -= 1
+        self._held[client] -= 1
+        if not self._held[client]:
+            # Without this the counter would grow with every new client.
+            del self._held[client]
+
+
+class FairQueue(Generic[T]):
+    """Queue that serves the client with the least recent CPU time, oldest item first. Not thread-safe.
+
+    Args:
+        accounts: CPU time of the clients.
+    """
+
+    def __init__(self, accounts: CpuAccounts) -> None:
+        self._accounts = accounts
+        self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def clients(self) -> Set[str]:
+        """Return the clients with items."""
+        return self._waiting.keys()
+
+    def append(self, client: str, item: T) -> None:
+        """Append an item of a client."""
+        self._waiting.setdefault(client, deque()).append(item)
+        self._length += 1
+
+    def append_first(self, client: str, item: T) -> None:
+        """Put an item before all others of its client, and the client before its equals."""
+        self._waiting.setdefault(client, deque()).appendleft(item)
+        self._waiting.move_to_end(client, last=False)
+        self._length += 1
+
+    def take(self, may_take: Callable[[str], bool] = lambda _client: True) -> tuple[str, T] | None:
+        """Remove and return the next item of the clients that `may_take` accepts; None if there is none."""
+        # The first of equals, and the last served is moved to the end.
+        client = min(filter(may_take, self._waiting), key=self._accounts.rank, default=None)
+        if client is None:
+            return None
+        item = self._waiting[client].popleft()
+        self._length -= 1
+        self._waiting.move_to_end(client)
+        if not self._waiting[client]:
+            del self._waiting[client]
+        return client, item
+
+    def drop(self, unwanted: Callable[[T], bool]) -> list[T]:
+        """Remove and return the items that `unwanted` selects."""
+        dropped: list[T] = []
+        for client, items in list(self._waiting.items()):
+            gone = [item for item in items if unwanted(item)]
+            if len(gone) == len(items):
+                del self._waiting[client]
+            elif gone:
+                self._waiting[client] = deque(item for item in items if item not in gone)
+            dropped += gone
+        self._length -= len(dropped)
+        return dropped
+
+
+class FairSemaphore:
+    """Semaphore that is shared fairly between clients. Thread-safe.
+
+    Args:
+        limit: number of permits.
+        accounts: CPU time of the clients.
+        cores: while other clients use CPU time, a client holds fewer permits than this, one less for each of them, so
+            that its computations leave a core to theirs; it can always hold one. None: it holds no fewer.
+    """
+
+    def __init__(self, limit: int, accounts: CpuAccounts, *, cores: int | None = None) -> None:
+        self._accounts = accounts
+        self._cores = cores
+        self._lock = threading.Lock()
+        self._shares = Shares(limit)
+        self._waiting: FairQueue[Future[None]] = FairQueue(accounts)
+
+    @property
+    def in_use(self) -> int:
+        """Number of permits that are held."""
+        return self._shares.in_use
+
+    async def acquire(self, client: str) -> None:
+        """Wait for a permit; the caller must release it."""
+        permit = self._queued(client)
+        try:
+            await asyncio.wrap_future(permit)
+        except asyncio.CancelledError:
+            if not permit.cancel():
+                # The permit was granted as the wait was cancelled.
+                self.release(client)
+            raise
+
+    @asynccontextmanager
+    async def held(self, client: str) -> AsyncIterator[None]:
+        """Wait for a permit and hold it during the block."""
+        await self.acquire(client)
+        try:
+            yield
+        finally:
+            self.release(client)
+
+    @contextmanager
+    def hold(self, client: str) -> Iterator[None]:
+        """Wait for a permit and hold it during the block, as `held` does, on a thread."""
+        self._queued(client).result()
+        try:
+            yield
+        finally:
+            self.release(client)
+
+    def release(self, client: str) -> None:
+        """Release a permit."""
+        with self._lock:
+            self._shares.give_back(client)
+        self._grant()
+
+    def _queued(self, client: str) -> Future[None]:
+        permit = Future[None]()
+        with self._lock:
+            self._waiting.append(client, permit)
+        self._grant()
+        return permit
+
+    def _grant(self) -> None:
+        while True:
+            with self._lock:
+                found = self._waiting.take(self._allowed())
+                if found is None:
+                    return
+                client, permit = found
+                if not permit.set_running_or_notify_cancel():
+                    continue
+                self._shares.take(client)
+            permit.set_result(None)
+
+    def _allowed(self) -> Callable[[str], bool]:
+        """Return the test of the clients that can take a permit now."""
+        if self._cores is None:
+            return self._shares.may_take
+        active = len(self._accounts.active() | self._shares.clients() | self._waiting.clients())
+        if active < 2:
+            return self._shares.may_take
+        most = max(self._cores - active + 1, self._cores // active, 1)
+
+        def may_take(client: str) -> bool:
+            return self._shares.held_by(client) < most and self._shares.may_take(client)
+
+        return may_take

@@ -1,0 +1,155 @@
+"""Separate threads for each kind of blocking work."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import ContextVar, copy_context
+from typing import Any, ParamSpec, TypeVar
+
+from service.capacity.cpu_accounts import PROBES, CpuAccounts
+from service.capacity.fair_share import FairSemaphore
+from service.errors import StoreUnavailableError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# Client of the call that a thread computes.
+_CLIENT: ContextVar[str] = ContextVar("client", default=PROBES)
+
+
+class Threads:
+    """Threads for blocking calls of one event loop, shared fairly between clients; admission control bounds the queue.
+
+    Args:
+        name: prefix of thread names.
+        count: number of threads.
+        accounts: CPU time of the clients; calls are charged to theirs.
+        permits: permits to compute, of which each call holds one; None: calls need none.
+        cores: limits the threads of a client beside other clients, see `FairSemaphore`.
+        rests: the calls count for `CpuAccounts.rest_s`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        count: int,
+        accounts: CpuAccounts | None = None,
+        permits: FairSemaphore | None = None,
+        cores: int | None = None,
+        *,
+        rests: bool = False,
+    ) -> None:
+        self._rests = rests
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
+        self._accounts = accounts or CpuAccounts()
+        self._semaphore = FairSemaphore(count, self._accounts, cores=cores)
+        self._permits = permits
+
+    async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run a call for a client and return its result; a call that has begun is never cancelled."""
+        await self._semaphore.acquire(client)
+        taken = [self._semaphore]
+        try:
+            if self._permits is not None:
+                await self._permits.acquire(client)
+                taken.append(self._permits)
+            future = self.submit(self._charged, client, work, *args, **kwargs)
+        except BaseException:
+            for semaphore in taken:
+                semaphore.release(client)
+            raise
+        # Released when the thread is done, even if the caller was cancelled.
+        for semaphore in taken:
+            future.add_done_callback(lambda _future, semaphore=semaphore: semaphore.release(client))
+        return await asyncio.wrap_future(future)
+
+    def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        _CLIENT.set(client)
+        with self._accounts.charged(client, rests=self._rests):
+            return work(*args, **kwargs)
+
+    def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Start a call in the caller's context, so that its log lines have the request's ids."""
+        return self._executor.submit(copy_context().run, work, *args, **kwargs)
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish running calls and drop the rest."""
+        self._executor.shutdown(wait=wait, cancel_futures=True)
+
+
+class IdleCores(Executor):
+    """Threads that take over parts of the calls of `Threads` while cores are idle; charged to the calls' clients.
+
+    Args:
+        cores: number of cores.
+        accounts: CPU time of the clients.
+        permits: permits to compute; as many cores are busy as are held.
+    """
+
+    def __init__(self, cores: int, accounts: CpuAccounts, permits: FairSemaphore) -> None:
+        self._executor = ThreadPoolExecutor(max(cores // 2, 1), thread_name_prefix="idle-core")
+        self._cores, self._accounts, self._permits = cores, accounts, permits
+
+    def if_any(self) -> IdleCores | None:
+        """Return these threads if a core is idle."""
+        return self if self._permits.in_use < self._cores else None
+
+    def submit(self, work: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Start a part of the call that the current thread computes."""
+        return self._executor.submit(self._charged, _CLIENT.get(), work, *args, **kwargs)
+
+    def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._accounts.charged(client):
+            return work(*args, **kwargs)
+
+    def close(self) -> None:
+        """Finish what is running."""
+        self._executor.shutdown()
+
+
+class BoundedReads:
+    """Reads of the store with a timeout, which also applies while the store hangs; shared fairly between tenants.
+
+    Args:
+        threads: number of threads.
+        max_pending: limit of running and waiting reads; bounds the threads and requests that a hanging store blocks.
+        wait_s: timeout of a read.
+    """
+
+    def __init__(self, *, threads: int, max_pending: int, wait_s: float) -> None:
+        self._threads = Threads("lalaloc-reads", threads)
+        self._max_pending = max_pending
+        self._wait_s = wait_s
+        self._begun: set[asyncio.Future[Any]] = set()
+
+    async def run(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run a read for a tenant and return its result; one that has begun is never cancelled.
+
+        Raises:
+            StoreUnavailableError: timeout, or too many reads are pending.
+        """
+        if len(self._begun) >= self._max_pending:
+            raise StoreUnavailableError()
+        begun = asyncio.ensure_future(self._threads.run(tenant, work, *args, **kwargs))
+        self._begun.add(begun)
+        # The callback also retrieves errors after the timeout.
+        begun.add_done_callback(self._end)
+        done, _ = await asyncio.wait({begun}, timeout=self._wait_s)
+        if not done:
+            raise StoreUnavailableError()
+        return begun.result()
+
+    async def process(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run work on what was read, which does not touch the store and has no timeout."""
+        return await self._threads.run(tenant, work, *args, **kwargs)
+
+    def close(self) -> None:
+        """Drop waiting reads and abandon hanging ones."""
+        self._threads.close(wait=False)
+
+    def _end(self, done: asyncio.Future[Any]) -> None:
+        self._begun.discard(done)
+        if not done.cancelled():
+            done.exception()

@@ -1,0 +1,259 @@
+"""Command line of the service: `serve`, `keys`, `tenants`, `audit`, `compact`, `backup` and `restore`.
+
+Keys, tenants and the audit log are in the database of the settings, so these commands also work while the service runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime, timedelta
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import ConfigError, LaLaLocError
+from service.capacity.cores import limit_arenas, usable_cores
+from service.cli.audit_commands import add_audit_commands
+from service.cli.backup_commands import add_backup_commands
+from service.cli.command_parts import audit, configured_store, duration, tenant_name, text_table
+from service.cli.tenant_commands import add_tenant_commands
+from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
+from service.security import Permission, check_address
+from service.security.keys import hash_of, key_text, new_secret
+from service.settings import Settings
+from service.storage import open_store
+from service.storage.records import ApiKey
+from service.telemetry.tracing import otlp_exporter
+
+# Connections that the kernel accepts while the service is busy.
+_BACKLOG = 1024
+_MAX_NAME = 200
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return the exit status: 0, or 1 after an error; a usage error exits with 2."""
+    parsed = build_parser().parse_args(arguments)
+    try:
+        return parsed.run(parsed)
+    except LaLaLocError as error:
+        print(f"lalaloc-service: {error}", file=sys.stderr)
+        return 1
+
+
+def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `serve`."""
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)")
+
+
+def serve(arguments: argparse.Namespace) -> int:
+    """Bind, print the address, and serve until stopped.
+
+    Raises:
+        ConfigError: an invalid setting, or a public address without keys.
+    """
+    settings = Settings.load()
+    limit_arenas(usable_cores())
+    with _listener(arguments.host, arguments.port) as listener:
+        host, port = listener.getsockname()[:2]
+        check_address(host, settings)
+        _check_parts(settings)
+        # The socket is bound, so clients can connect now; they are answered after the start.
+        print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+        # Imported late, because it takes a second that help and keys do not need.
+        from service.app import create_app
+        from service.http.server import Server, server_config
+
+        app = create_app(settings)
+        Server(server_config(app, settings), app, settings).run(sockets=[listener])
+    return 0
+
+
+def _check_parts(settings: Settings) -> None:
+    """Check model, database and exporter before the start, so that errors are one line and not a log.
+
+    Raises:
+        BundleError: no usable model.
+        ConfigError, StoreUnavailableError: no usable database or exporter.
+    """
+    if settings.otlp_endpoint is not None:
+        otlp_exporter(settings.otlp_endpoint).shutdown()
+    Bundle.open(settings.bundle).check()
+    open_store(settings).close()
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"cannot listen on {host} port {port}: {error}") from error
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(prog="lalaloc-service", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    serving = commands.add_parser("serve", help="run the service")
+    add_serve_arguments(serving)
+    serving.set_defaults(run=serve)
+    keys = commands.add_parser("keys", help="create, list, rotate and revoke API keys").add_subparsers(required=True)
+
+    create = keys.add_parser("create", help="create a key and print it; it cannot be shown again")
+    create.add_argument(
+        "--tenant", required=True, type=tenant_name, help="tenant whose floor plans the key gives access to"
+    )
+    create.add_argument("--name", required=True, type=_name, help="name of the key, for your own records")
+    create.add_argument(
+        "--scope",
+        dest="scopes",
+        action="append",
+        required=True,
+        choices=[str(permission) for permission in Permission],
+        help="scope of the key; repeat the option for several",
+    )
+    create.add_argument(
+        "--rate-per-minute",
+        type=_rate,
+        help="rate limit in requests per minute; 0: no limit (default: LALALOC_RATE_PER_MINUTE)",
+    )
+    create.add_argument(
+        "--expires-in", type=_lifetime, metavar="DURATION", help="lifetime of the key, such as 90d (default: no end)"
+    )
+    create.set_defaults(run=_create)
+
+    rotate = keys.add_parser("rotate", help="replace a key and print its successor; it cannot be shown again")
+    rotate.add_argument("id", help="id of the key: the part between the underscores")
+    rotate.add_argument(
+        "--overlap",
+        type=_overlap,
+        default="7d",
+        metavar="DURATION",
+        help="time for which the old key stays valid beside the new one (default: %(default)s)",
+    )
+    rotate.set_defaults(run=_rotate)
+
+    listing = keys.add_parser("list", help="list all keys, including revoked and expired ones, without secrets")
+    listing.add_argument("--tenant", type=tenant_name, help="list only the keys of this tenant")
+    listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    listing.set_defaults(run=_list)
+
+    revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within LALALOC_KEY_CACHE_S")
+    revoke.add_argument("id", help="id of the key: the part between the underscores")
+    revoke.set_defaults(run=_revoke)
+    add_tenant_commands(commands)
+    add_audit_commands(commands)
+    add_backup_commands(commands)
+    return parser
+
+
+def _create(arguments: argparse.Namespace) -> int:
+    secret = new_secret()
+    with configured_store() as store:
+        key = store.keys.create(
+            arguments.tenant,
+            arguments.name,
+            hash_of(secret),
+            arguments.scopes,
+            rate_per_minute=arguments.rate_per_minute,
+            lifetime=arguments.expires_in,
+        )
+        audit(store, key.tenant, "keys create", key.id, name=key.name, scopes=sorted(key.scopes), end=key.expires_at)
+    _print_new(key, secret)
+    return 0
+
+
+def _rotate(arguments: argparse.Namespace) -> int:
+    secret = new_secret()
+    with configured_store() as store:
+        key = store.keys.rotate(arguments.id, hash_of(secret), overlap=arguments.overlap)
+        if key is None:
+            print(f"lalaloc-service: no valid key '{arguments.id[:64]}'; see `keys list`", file=sys.stderr)
+            return 1
+        audit(store, key.tenant, "keys rotate", arguments.id, successor=key.id, end=key.expires_at)
+        replaced = store.keys.get(arguments.id)
+    if replaced is not None:
+        print(f"key {replaced.id} expires at {_moment(replaced.expires_at)}", file=sys.stderr)
+    _print_new(key, secret)
+    return 0
+
+
+def _print_new(key: ApiKey, secret: str) -> None:
+    # Only the key goes to standard output, so that it can be piped.
+    print(f"key {key.id} of tenant '{key.tenant}'; it is shown only once:", file=sys.stderr)
+    print(key_text(key.id, secret))
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    with configured_store() as store:
+        keys = store.keys.list_keys(arguments.tenant)
+    if arguments.json:
+        print(json.dumps([asdict(key) | {"scopes": sorted(key.scopes)} for key in keys], default=str, indent=2))
+    else:
+        print(_table(keys))
+    return 0
+
+
+def _revoke(arguments: argparse.Namespace) -> int:
+    with configured_store() as store:
+        key = store.keys.revoke(arguments.id)
+        if key is None:
+            print(f"lalaloc-service: no active key '{arguments.id[:64]}'", file=sys.stderr)
+            return 1
+        audit(store, key.tenant, "keys revoke", key.id, name=key.name)
+    print(f"revoked {arguments.id}")
+    return 0
+
+
+def _table(keys: Sequence[ApiKey]) -> str:
+    head = ("ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST USED", "EXPIRES", "REVOKED")
+    rows = [
+        (
+            key.id,
+            key.tenant,
+            key.name,
+            ",".join(sorted(key.scopes)),
+            "-" if key.rate_per_minute is None else str(key.rate_per_minute),
+            _moment(key.created_at),
+            _moment(key.last_used_at),
+            _moment(key.expires_at),
+            _moment(key.revoked_at),
+        )
+        for key in keys
+    ]
+    return text_table(head, rows)
+
+
+def _moment(moment: datetime | None) -> str:
+    return "-" if moment is None else moment.isoformat(timespec="seconds")
+
+
+def _name(given: str) -> str:
+    if not 0 < len(given) <= _MAX_NAME or not given.isprintable():
+        raise argparse.ArgumentTypeError(f"1 to {_MAX_NAME} printable characters")
+    return given
+
+
+def _rate(given: str) -> int:
+    if not given.isascii() or not given.isdigit() or int(given) > MAX_RATE:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {MAX_RATE}")
+    return int(given)
+
+
+def _lifetime(given: str) -> timedelta:
+    if not 1 <= (lifetime := duration(given)).total_seconds() <= MAX_LIFETIME_S:
+        raise argparse.ArgumentTypeError(f"1s to {MAX_LIFETIME_S // 86400}d")
+    return lifetime
+
+
+def _overlap(given: str) -> timedelta:
+    if (overlap := duration(given)).total_seconds() > MAX_OVERLAP_S:
+        raise argparse.ArgumentTypeError(f"0s to {MAX_OVERLAP_S // 86400}d")
+    return overlap
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""Program of a decoding worker process, which opens uploaded photographs.
+
+It turns an uploaded file into a `Photograph`, a picture to be shown, or a `DecodeRefusal`. It also rasterises drawings,
+which keeps the interpreter busy for as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import cv2
+import numpy as np
+
+from lalaloc_core.draw.canvas import rasterise
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.photograph import open_picture, warm_up
+from lalaloc_core.photograph.picture_files import PhotographLimits
+from service.uploaded_file import UploadedFile
+from service.workers.process import limit_memory, serve_jobs
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecodeSizes:
+    """Sizes of decoded photographs: height and width (pixels) of full spheres, and the patches of others."""
+
+    sphere: tuple[int, int]
+    patch: PatchSize
+
+
+@dataclass(frozen=True)
+class DecodeJob:
+    """Uploaded photograph to read for the encoders; the worker gets it as bytes."""
+
+    content: bytes | UploadedFile
+    stated: StatedCamera
+
+
+@dataclass(frozen=True)
+class ShowJob:
+    """Uploaded photograph to decode as a picture to be shown, a full sphere levelled; sizes are width and height."""
+
+    content: bytes | UploadedFile
+    stated: StatedCamera
+    is_sphere: bool
+    max_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class RasteriseJob:
+    """Drawing to turn into a PNG file."""
+
+    svg: str
+
+
+@dataclass(frozen=True)
+class DecodeRefusal:
+    """Reason why a picture is not a usable photograph."""
+
+    reason: str
+
+
+Job = DecodeJob | ShowJob | RasteriseJob
+Result = Photograph | np.ndarray | DecodeRefusal | bytes
+
+
+def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
+    """Run decoding and rasterising jobs until the pipe closes.
+
+    Args:
+        connection: the worker's end of the pipe.
+        sizes: sizes of decoded photographs.
+        limits: limits of photographs.
+        memory_bytes: memory limit of decoding, besides what the process uses before its first picture.
+    """
+    serve_jobs(connection, lambda: _load(sizes, limits, memory_bytes))
+
+
+def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Callable[[Job], Result]:
+    # A worker stands for one core.
+    cv2.setNumThreads(1)
+    warm_up(sphere_size=sizes.sphere, patch_size=sizes.patch)
+    limit_memory(memory_bytes)
+
+    def work(job: Job) -> Result:
+        if isinstance(job, RasteriseJob):
+            return rasterise(job.svg)
+        assert isinstance(job.content, bytes)
+        try:
+            if isinstance(job, DecodeJob):
+                return open_photograph(
+                    job.content, sphere_size=sizes.sphere, stated=job.stated, patch_size=sizes.patch, limits=limits
+                )
+            return _shown(job, job.content, limits)
+        except InvalidPhotographError as error:
+            return DecodeRefusal(str(error))
+
+    return work
+
+
+def _shown(job: ShowJob, content: bytes, limits: PhotographLimits) -> np.ndarray:
+    if not job.is_sphere:
+        return open_picture(content, max_size=job.max_size, limits=limits)
+    width, height = job.max_size
+    view = open_photograph(content, sphere_size=(height, width), stated=job.stated, limits=limits)
+    assert view.panorama is not None
+    return view.panorama.pixels

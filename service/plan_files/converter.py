@@ -1,0 +1,255 @@
+"""Pool of worker processes that import and export plan files, limited in memory and time.
+
+Large libraries, some of them in C++, read drawings, models and scans. A file that kills its worker is tried once more;
+a file that takes too long is not. The workers start with the first file that is not in the native format.
+
+Localisability is predicted and drawn by a worker of its own, started with the first prediction. It is not niced, as its
+jobs hold permits to compute like queries.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from concurrent.futures import Future, wait
+from typing import NoReturn
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import ImportOptions
+from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
+from service.plan_files.convert_worker import (
+    ConversionJob,
+    ConversionRefusal,
+    ConversionResult,
+    Imported,
+    ImportJob,
+    ParseJob,
+    run_converter,
+)
+from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
+from service.settings import Settings
+from service.stored_plan import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob
+from service.telemetry import Telemetry
+
+_Pool = WorkerPool[ConversionJob, ConversionResult]
+
+# Largest number of waiting files.
+_QUEUE = 16
+# A worker that spends longer than `max_import_s` plus this margin on a file is replaced.
+_STALL_MARGIN_S = 10.0
+# Beside busy cores, a worker gets a tenth of the time of a query.
+_NICE = 10
+# Time (s) that a stored plan waits for a worker that parses it.
+_PARSE_S = 10.0
+# Time limit (s) of a prediction, which takes seconds on an idle core.
+_PREDICTION_S = 300.0
+
+
+class Converter:
+    """Pool of conversion workers with a bounded queue. Thread-safe."""
+
+    def __init__(self, settings: Settings, telemetry: Telemetry) -> None:
+        self._settings = settings
+        self._telemetry = telemetry
+        self._pool: _Pool | None = None
+        self._predicting: _Pool | None = None
+        self._lock = threading.Lock()
+        self._closed = False
+        telemetry.gauge(
+            "lalaloc_import_queue_depth", "Plan files waiting for a worker.", lambda: self._count("waiting")
+        )
+        telemetry.gauge(
+            "lalaloc_import_workers_resident_bytes",
+            "Memory of all import workers.",
+            lambda: self._count("resident_bytes"),
+        )
+
+    @property
+    def state(self) -> PoolState:
+        """Number of workers wanted and ready; no worker is ready before the first file."""
+        pool = self._pool
+        if pool is None:
+            return PoolState(workers=self._settings.imports.workers, ready=0, warmed_up=False, fault=None)
+        return pool.state
+
+    def read(
+        self,
+        content: bytes,
+        options: ImportOptions,
+        client: str,
+        *,
+        every_level: bool = False,
+        building: str | None = None,
+    ) -> tuple[Imported, ...]:
+        """Import a plan file. Blocks for up to twice `max_import_s`.
+
+        Args:
+            content: the file.
+            options: options of the import.
+            client: client of the upload.
+            every_level: return the plans of all levels, lowest first.
+            building: name for plans that have none, and for those of several levels, see `import_plans`.
+
+        Raises:
+            InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.
+            SeveralLevelsError: the file has several storeys, without `level` or `every_level`.
+            MissingExtraError: a library of its format is not installed.
+            OverloadedError: the queue is full.
+            DeadlineExceededError: the import did not finish in time.
+            ConverterNotReadyError: no worker is running.
+            StoppingError: the service is shutting down.
+        """
+        limit_s = self._settings.plans.import_deadline_s
+        try:
+            job = ImportJob(content, options, self._settings.grids.grid_step_m, every_level, building)
+            future = self._running_pool().submit(job, limit_s, client)
+            done, _ = wait([future], limit_s)
+            if not done:
+                future.cancel()
+                raise JobLostError("deadline")
+            result = future.result()
+        except JobLostError as error:
+            self._raise_lost(error)
+        if isinstance(result, ConversionRefusal):
+            raise result.error()
+        assert isinstance(result, tuple)
+        return result
+
+    def parse(self, document: PlanDocument) -> FloorPlan | None:
+        """Return a stored plan, None if it is damaged. A worker parses a large one, unless none is free. Blocks."""
+        if len(document.document) <= LARGE:
+            return document.plan()
+        try:
+            future = self._running_pool().submit(ParseJob(document), _PARSE_S)
+            done, _ = wait([future], _PARSE_S)
+            if not done:
+                future.cancel()
+                raise JobLostError("deadline")
+            result = future.result()
+        except JobLostError:
+            return document.plan()
+        return result.plan() if isinstance(result, PackedPlan) else None
+
+    def begin_rendition(self, job: RenditionJob, client: str) -> Future[ConversionResult]:
+        """Queue a file that is made from a stored plan. Blocks while the plan is copied.
+
+        Raises:
+            OverloadedError, ConverterNotReadyError, StoppingError: see `read`.
+        """
+        try:
+            if job.kind in PREDICTIONS:
+                return self._running_pool(predicts=True).submit(job, _PREDICTION_S, client)
+            return self._running_pool().submit(job, self._settings.plans.import_deadline_s, client)
+        except JobLostError as error:
+            self._raise_lost(error)
+
+    async def prediction(self, begun: Future[ConversionResult]) -> Rendition:
+        """Wait for a prediction, or a map of it, of `begin_rendition`.
+
+        Raises:
+            DamagedDataError: the stored plan is damaged.
+            DeadlineExceededError: the prediction did not finish.
+            ConverterNotReadyError, StoppingError: see `read`.
+        """
+        try:
+            result = await asyncio.wrap_future(begun)
+        except JobLostError as error:
+            if error.reason not in ("not-ready", "closing"):
+                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
+            self._raise_lost(error)
+        return _made(result)
+
+    async def rendition(self, begun: Future[ConversionResult]) -> Rendition:
+        """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
+
+        Raises:
+            InvalidFloorPlanError: the plan lacks something that the format requires.
+            DamagedDataError: the stored plan is damaged.
+            MissingExtraError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `read`.
+        """
+        try:
+            async with asyncio.timeout(self._settings.plans.import_deadline_s):
+                result = await asyncio.wrap_future(begun)
+        except TimeoutError:
+            self._raise_lost(JobLostError("deadline"))
+        except JobLostError as error:
+            self._raise_lost(error)
+        return _made(result)
+
+    def close(self) -> None:
+        """Stop all workers and wait for them."""
+        with self._lock:
+            self._closed = True
+        for pool in (self._pool, self._predicting):
+            if pool is not None:
+                pool.close()
+
+    def _running_pool(self, *, predicts: bool = False) -> _Pool:
+        """Return the pool of imports or predictions; the first call starts it."""
+        with self._lock:
+            if self._closed:
+                raise JobLostError("closing")
+            settings = self._settings
+            if predicts:
+                if self._predicting is None:
+                    self._predicting = self._started("prediction", workers=1, stall_s=_PREDICTION_S)
+                return self._predicting
+            if self._pool is None:
+                stall_s = settings.plans.max_import_s + _STALL_MARGIN_S
+                self._pool = self._started("import", workers=settings.imports.workers, stall_s=stall_s, nice=_NICE)
+            return self._pool
+
+    def _started(self, name: str, *, workers: int, stall_s: float, nice: int = 0) -> _Pool:
+        settings = self._settings
+        arguments = (settings.plans.import_limits, settings.imports.memory_bytes)
+        pool: _Pool = WorkerPool(
+            WorkerSpec(name, run_converter, arguments, stall_s=stall_s, nice=nice),
+            workers=workers,
+            queue_limit=_QUEUE,
+            keep_spare=name == "import",
+            accounts=self._telemetry.cpu_accounts,
+            on_restart=lambda _reason: self._telemetry.note_restart(name),
+        )
+        pool.start()
+        return pool
+
+    def _count(self, name: str) -> float:
+        return sum(getattr(pool, name) for pool in (self._pool, self._predicting) if pool is not None)
+
+    def _raise_lost(self, error: JobLostError) -> NoReturn:
+        settings = self._settings
+        match error.reason:
+            case "poisoned":
+                raise InvalidFloorPlanError(
+                    "the file could not be read: it ended two worker processes, possibly for lack of memory; the "
+                    f"limit is {settings.imports.memory_bytes} bytes (import_memory_bytes); export a smaller part, or "
+                    "another format"
+                ) from error
+            case "stalled":
+                raise InvalidFloorPlanError(
+                    f"reading the file took longer than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s "
+                    f"(max_import_s is {settings.plans.max_import_s:g}); export a single storey, or fewer layers"
+                ) from error
+            case "fault":
+                raise InvalidFloorPlanError(
+                    "the file is damaged or has an unsupported structure; save it again, or in another format"
+                ) from error
+            case "queue-full":
+                raise OverloadedError(_QUEUE) from error
+            case "not-ready":
+                raise ConverterNotReadyError from error
+            case "closing":
+                raise StoppingError from error
+            case "deadline" | "died":
+                raise DeadlineExceededError(
+                    settings.plans.import_deadline_s, "the plan file was not read or written"
+                ) from error
+
+
+def _made(result: ConversionResult) -> Rendition:
+    """Return the file; raise the error of a refusal."""
+    if isinstance(result, ConversionRefusal):
+        raise result.error()
+    assert isinstance(result, Rendition)
+    return result

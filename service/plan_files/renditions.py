@@ -1,0 +1,95 @@
+"""Files made from a stored plan: description, layout, drawing, mesh, exports, localisability. Pure functions."""
+
+from __future__ import annotations
+
+import json
+from typing import cast
+
+from lalaloc_core.conditions import CONDITIONS
+from lalaloc_core.draw.plan import bounds_with, draw_rooms
+from lalaloc_core.floorplan import FloorPlan, OpeningFace
+from lalaloc_core.importers import ExportFormat, export_plan
+from service.errors import DamagedDataError
+from service.plan_files.plan_description import describe
+from service.plan_files.plan_mesh import plan_glb
+from service.schemas import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
+from service.stored_plan import Rendition, RenditionJob
+
+
+def make_rendition(job: RenditionJob) -> Rendition:
+    """Make a file from a stored plan.
+
+    Raises:
+        DamagedDataError: the stored document is damaged.
+        InvalidFloorPlanError: the plan lacks something that an export requires.
+        InvalidInputError: localisability of a model without measured errors.
+        MissingExtraError: a library of an export is not installed.
+    """
+    stored = job.stored
+    plan = stored.document.plan()
+    if plan is None:
+        raise DamagedDataError(
+            f"the document of floor plan '{stored.id}' at revision '{stored.revision_id}' is damaged"
+        )
+    if job.kind == "description":
+        return describe(plan, stored, job.step_m)
+    if job.kind == "preview":
+        no_room = no_room_of(stored.report)
+        return Rendition(draw_rooms(plan, no_room).encode(), bounds_with(plan.bounds_m, no_room))
+    return Rendition(_content(plan, job), plan.bounds_m)
+
+
+def no_room_of(report: str | None) -> list[list[list[float]]]:
+    """Return the areas that became no room from an import report; none from those of earlier versions."""
+    return [] if report is None else json.loads(report).get("no_room", [])
+
+
+def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
+    match job.kind:
+        case "localisability":
+            # Imported late: the search needs libraries that other files do not.
+            from service.plan_files.localisability_rendition import plan_localisability
+
+            return plan_localisability(plan, job)
+        case "layout":
+            return plan_layout(plan, job.stored.id, job.stored.revision_id)
+        case "drawing":
+            return draw_rooms(plan).encode()
+        case "mesh":
+            return plan_glb(plan)
+        case kind if kind in CONDITIONS:
+            # Imported late for the same reason.
+            from service.plan_files.localisability_rendition import localisability_map
+
+            return localisability_map(plan, job.report, kind)
+        case kind:
+            return export_plan(plan, cast(ExportFormat, kind))
+
+
+def plan_layout(plan: FloorPlan, plan_id: str, revision_id: str) -> bytes:
+    """Return the `LayoutAnswer` of a plan as JSON, in time linear in its walls and openings."""
+    rooms = [
+        RoomLayoutAnswer(
+            id=room.id,
+            name=room.name,
+            ceiling_height_m=room.ceiling_height_m,
+            polygon=room.polygon_m.tolist(),
+            holes=[hole.tolist() for hole in room.holes_m],
+            walls_m=room.walls_m.tolist(),
+            openings=[_opening(plan, face) for face in faces],
+        )
+        for room, faces in zip(plan.rooms, plan.room_faces, strict=True)
+    ]
+    return LayoutAnswer(floorplan_id=plan_id, revision=revision_id, rooms=rooms).model_dump_json().encode()
+
+
+def _opening(plan: FloorPlan, face: OpeningFace) -> OpeningFaceAnswer:
+    opening = plan.openings[face.opening]
+    return OpeningFaceAnswer(
+        kind=opening.kind,
+        wall=face.wall,
+        start=face.start,
+        end=face.end,
+        sill_m=opening.sill_m,
+        head_m=opening.head_m,
+    )

@@ -1,0 +1,8 @@
+"""Settings of the service, read once from environment variables that start with `LALALOC_`.
+
+Begin with `settings.py`; `setting_groups.py` defines them in groups, of the types in `setting_types.py`.
+"""
+
+from service.settings.settings import PREFIX, SETTING_NAMES, Settings, settings_table, work_factor
+
+__all__ = ["PREFIX", "SETTING_NAMES", "Settings", "settings_table", "work_factor"]
