@@ -52,7 +52,7 @@ from lalaloc_core.localise.venue.prototypes import (
     unpacked_openings,
 )
 from scripts.make_prototype_cells import grid_without_latents
-from service.query.venue_localiser import VENUE_CONFIG
+from service.query.single_query import VENUE_CONFIG
 from service.settings import Settings
 from service.venues.prototype_file import BlockKey, PrototypeFile
 from service.venues.venue_plans import MAX_SEARCHED, most_poses

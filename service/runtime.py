@@ -25,17 +25,7 @@ from service.grids import GridProvider, Sweeper
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
-from service.query import (
-    Grounds,
-    Localiser,
-    LocaliserBackend,
-    LpoPool,
-    OptimiserBackend,
-    SessionTracker,
-    TrackerBackend,
-    VenueLocaliser,
-    VenueLocaliserBackend,
-)
+from service.query import Executor, Grounds, Localiser, LocaliserBackend, LpoPool, OptimiserBackend
 from service.schemas import ModelAnswer
 from service.security import AccessControl, AuditTrail
 from service.settings import Settings
@@ -100,8 +90,6 @@ class Runtime:
     decoder: Decoder
     converter: Converter
     localiser: LocaliserBackend
-    venue_localiser: VenueLocaliserBackend
-    tracker: TrackerBackend
     admission: Admission
     access_control: AccessControl
     audit_trail: AuditTrail
@@ -120,10 +108,6 @@ class Runtime:
         return not self.admission.draining and self.optimiser.state.warmed_up and self.decoder.state.warmed_up
 
 
-# Localisers of plans and of venues, and the tracker.
-Localisers = tuple[LocaliserBackend, VenueLocaliserBackend, TrackerBackend]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Backends:
     """Builders of the components that can run in other processes.
@@ -131,13 +115,13 @@ class Backends:
     Attributes:
         optimiser: builds the pool of LPO workers; the last argument tells whether poses are refined by latents.
         encoder: loads the networks and warms them up.
-        localisers: builds the localisers; None: this process computes answers.
+        localiser: builds the localiser; None: this process computes answers.
         indices: builds the source of the indices of venues; None: they are in this process.
     """
 
     optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore, bool], OptimiserBackend]
     encoder: Callable[[Bundle, Settings], PhotographEncoder]
-    localisers: Callable[[ModelAnswer, Settings, Telemetry], Localisers] | None = None
+    localiser: Callable[[ModelAnswer, Settings, Telemetry], LocaliserBackend] | None = None
     indices: Callable[[Settings], IndexSource] | None = None
 
 
@@ -191,7 +175,7 @@ def start_runtime(
     # A file can take its worker longer than the service may take to stop.
     components.admission.at_stop(converter.close)
     store.plans.parse_with(converter.parse)
-    grids, localiser = components.grids, _closing(cleanup, components.localiser())
+    grids = components.grids
     sweep_s, keep_answers_s = settings.grids.sweep_s, settings.storage.keep_answers_s
     sweeper = Sweeper(store, grids, telemetry, sweep_s=sweep_s, keep_answers_s=keep_answers_s)
     _closing(cleanup, sweeper).start()
@@ -199,13 +183,10 @@ def start_runtime(
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
     plans, plan_indices = components.venue_plans(), _closing(cleanup, components.plan_indices())
     indices: IndexSource = plan_indices if backends.indices is None else backends.indices(settings)
-    search = VenueSearch(plans=plans, indices=indices, encoder=components.encoder, queries=components.admission.queries)
-    venue_localiser = components.venue_localiser(localiser, plans, search)
-    if backends.localisers is None:
-        tracker = components.tracker(localiser, Grounds(localiser, plans, search))
-        localisers: Localisers = localiser, venue_localiser, tracker
-    else:
-        localisers = backends.localisers(localiser.model, settings, telemetry)
+    own = _closing(cleanup, components.localiser(plans, indices))
+    localiser: LocaliserBackend = own
+    if backends.localiser is not None:
+        localiser = backends.localiser(own.model, settings, telemetry)
     renditions = RenditionCache(
         store.plans,
         converter,
@@ -231,9 +212,7 @@ def start_runtime(
         optimiser=components.optimiser,
         decoder=components.decoder,
         converter=converter,
-        localiser=localisers[0],
-        venue_localiser=localisers[1],
-        tracker=localisers[2],
+        localiser=localiser,
         admission=components.admission,
         access_control=access_control,
         audit_trail=audit_trail,
@@ -302,31 +281,28 @@ class _QueryComponents:
             idle_cores=idle_cores,
         )
 
-    def localiser(self) -> Localiser:
-        """Build the localiser of plans."""
-        return Localiser(
-            settings=self.settings,
-            bundle=self.bundle,
-            encoder=self.encoder,
-            grids=self.grids,
-            optimiser=self.optimiser,
-            decoder=self.decoder,
-            queries=self.admission.queries,
-            reads=self.reads,
-            telemetry=self.telemetry,
-            permits=self.permits,
+    def localiser(self, plans: VenuePlans, indices: IndexSource) -> Localiser:
+        """Build the localiser."""
+        queries, executor = (
+            self.admission.queries,
+            Executor(self.settings, self.optimiser, self.telemetry, self.permits),
         )
-
-    def tracker(self, localiser: Localiser, grounds: Grounds) -> SessionTracker:
-        """Build the tracker of sessions."""
-        return SessionTracker(
-            settings=self.settings,
+        return Localiser(
             bundle=self.bundle,
             encoder=self.encoder,
-            localiser=localiser,
             decoder=self.decoder,
-            queries=self.admission.queries,
-            grounds=grounds,
+            executor=executor,
+            grounds=Grounds(
+                encoder=self.encoder,
+                grids=self.grids,
+                queries=queries,
+                reads=self.reads,
+                executor=executor,
+                plans=plans,
+                search=VenueSearch(plans=plans, indices=indices, encoder=self.encoder, queries=queries),
+            ),
+            queries=queries,
+            compass_tolerance_deg=self.settings.photographs.compass_tolerance_deg,
         )
 
     def venue_plans(self) -> VenuePlans:
@@ -349,19 +325,6 @@ class _QueryComponents:
             path=self.settings.data_dir / "prototypes.bin",
             file_bytes=self.settings.storage.venue_file_bytes,
             limit_bytes=self.settings.storage.venue_cache_bytes,
-        )
-
-    def venue_localiser(self, localiser: Localiser, plans: VenuePlans, search: VenueSearch) -> VenueLocaliser:
-        """Build the localiser of venues."""
-        return VenueLocaliser(
-            settings=self.settings,
-            bundle=self.bundle,
-            encoder=self.encoder,
-            plans=plans,
-            search=search,
-            localiser=localiser,
-            decoder=self.decoder,
-            queries=self.admission.queries,
         )
 
 

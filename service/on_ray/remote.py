@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any, TypeVar
 
@@ -20,8 +21,17 @@ from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
 from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
-from service.query import PhotographQuery, PictureRequest, QueryContext, SequenceQuery, TrackOutcome, TrackQuery
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
+from service.query import (
+    Nearby,
+    PhotographQuery,
+    PictureRequest,
+    QueryContext,
+    SequenceQuery,
+    TrackOutcome,
+    TrackQuery,
+    Where,
+)
+from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
@@ -31,7 +41,16 @@ _ATTEMPTS = 2
 # Extra time for the answer of the remote service, whose own timeout error is more specific.
 _ON_THE_WAY_S = 1.0
 
-T = TypeVar("T")
+AnswerT = TypeVar("AnswerT", LocaliseAnswer, SequenceAnswer)
+
+
+@dataclass(frozen=True)
+class StoredPlace:
+    """Name of a stored plan or venue, whose record each replica has in its own cache."""
+
+    is_venue: bool
+    tenant: str
+    id: str
 
 
 class RemotePhotographEncoder(PhotographEncoder):
@@ -119,32 +138,53 @@ class RemoteOptimiser:
         self._telemetry.lpo_missed.labels(reason).inc()
 
 
-class _SearchCaller:
-    """Client of the search replicas; sends queries about the same plan or venue to the same replica."""
+class RemoteLocaliser:
+    """Remote `Localiser`; queries about the same plan or venue go to the same search replica."""
 
-    def __init__(self, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
+    def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
+        self.model = model
         self._search = search
         self._settings = settings
         self._telemetry = telemetry
 
-    async def _call(self, method: str, resource_id: str, context: QueryContext, *arguments: Any) -> Any:
-        """Call a method of a search replica.
+    async def localise(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
+        """See `Localiser.localise`, for the errors as well."""
+        return self._observed(await self._call("localise", where, query.context, query))
 
-        Args:
-            method: name of the method.
-            resource_id: id of the plan or venue, which selects the replica.
-            context: context of the query.
-            *arguments: arguments of the method.
+    async def localise_and_draw(
+        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
+    ) -> tuple[LocaliseAnswer, bytes]:
+        """See `Localiser.localise_and_draw`."""
+        found, drawn = await self._call("localise_and_draw", record, query.context, query, request)
+        return self._observed(found), drawn
+
+    async def localise_sequence(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
+        """See `Localiser.localise_sequence`."""
+        return self._observed(await self._call("localise_sequence", where, query.context, query))
+
+    async def track(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
+        """See `Localiser.track`."""
+        return await self._call("track", where, query.context, query)
+
+    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None:
+        """See `Localiser.check`."""
+        context = QueryContext.starting(where.tenant, self._settings.requests.request_deadline_s)
+        await self._call("check", where, context, form)
+
+    async def _call(self, method: str, where: Where, context: QueryContext, *arguments: Any) -> Any:
+        """Call a method of the `Localiser` of a search replica.
 
         Raises:
             LaLaLocError: raised by the replica.
             OverloadedError: the replica's queue is full.
             DeadlineExceededError: no answer in time, or two replicas died.
         """
+        about = (
+            where if isinstance(where, Nearby) else StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
+        )
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
-                call = getattr(self._search.options(session_id=resource_id), method)
-                response = call.remote(*arguments)
+                response = self._search.options(session_id=where.id).call.remote(method, about, *arguments)
                 try:
                     async with asyncio.timeout(max(context.left_s + _ON_THE_WAY_S, 0.0)):
                         outcome: Success[Any] | Failure = await response
@@ -160,85 +200,7 @@ class _SearchCaller:
                 return outcome.value
         raise DeadlineExceededError(self._settings.requests.request_deadline_s)
 
-    def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
-        """Count an answer in the metrics of this process, which are scraped."""
-        for name, spent_ms in answer.timings_ms.model_dump(exclude_none=True).items():
-            self._telemetry.stage_seconds.labels(name).observe(spent_ms / 1e3)
-        self._telemetry.answers.labels(answer.stage).inc()
-
-
-class RemoteLocaliser(_SearchCaller):
-    """Remote `Localiser`."""
-
-    def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
-        super().__init__(search, settings, telemetry)
-        self._model = model
-
-    @property
-    def model(self) -> ModelAnswer:
-        """See `Localiser.model`."""
-        return self._model
-
-    async def localise(self, record: PlanRecord, query: PhotographQuery) -> LocaliseAnswer:
-        """See `Localiser.localise`, for the errors as well."""
-        found = await self._call("localise", record.id, query.context, record.tenant, record.id, query)
-        self._observe(found)
-        return found
-
-    async def localise_and_draw(
-        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
-    ) -> tuple[LocaliseAnswer, bytes]:
-        """See `Localiser.localise_and_draw`."""
-        found, drawn = await self._call(
-            "localise_and_draw", record.id, query.context, record.tenant, record.id, query, request
-        )
-        self._observe(found)
-        return found, drawn
-
-    async def localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
-        """See `Localiser.localise_sequence`."""
-        found = await self._call("localise_sequence", record.id, query.context, record.tenant, record.id, query)
-        self._observe(found)
-        return found
-
-
-class RemoteVenueLocaliser(_SearchCaller):
-    """Remote `VenueLocaliser`."""
-
-    async def localise(self, venue: VenueRecord, query: PhotographQuery) -> LocaliseAnswer:
-        """See `VenueLocaliser.localise`."""
-        found = await self._call("localise_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
-        self._observe(found)
-        return found
-
-    async def localise_sequence(self, venue: VenueRecord, query: SequenceQuery) -> SequenceAnswer:
-        """See `VenueLocaliser.localise_sequence`."""
-        found = await self._call("localise_sequence_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
-        self._observe(found)
-        return found
-
-    async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
-    ) -> LocaliseAnswer:
-        """See `VenueLocaliser.localise_near`."""
-        found = await self._call("localise_near", str(place), query.context, tenant, place, within_m, query)
-        self._observe(found)
-        return found
-
-    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
-        """See `VenueLocaliser.check_hints`."""
-        context = QueryContext.starting(venue.tenant, self._settings.requests.request_deadline_s)
-        await self._call("check_hints", venue.id, context, venue.tenant, venue.id, form)
-
-
-class RemoteTracker(_SearchCaller):
-    """Remote `SessionTracker`."""
-
-    async def check(self, place: PlanRecord | VenueRecord, document: SessionDocument) -> None:
-        """See `SessionTracker.check`."""
-        context = QueryContext.starting(place.tenant, self._settings.requests.request_deadline_s)
-        await self._call("check_session", place.id, context, place.tenant, document)
-
-    async def track(self, place: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
-        """See `SessionTracker.track`."""
-        return await self._call("track", place.id, query.context, place.tenant, query)
+    def _observed(self, answer: AnswerT) -> AnswerT:
+        """Count an answer in the metrics of this process, which are scraped; return it."""
+        self._telemetry.observe_answer(answer.timings_ms.model_dump(exclude_none=True), answer.stage)
+        return answer

@@ -25,18 +25,10 @@ from service.app import create_app
 from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlanError, UnknownVenueError
 from service.on_ray.index_shards import RemoteIndices, Stage
 from service.on_ray.outcome import Success, returning_failures
-from service.on_ray.remote import (
-    RemoteLocaliser,
-    RemoteOptimiser,
-    RemotePhotographEncoder,
-    RemoteTracker,
-    RemoteVenueLocaliser,
-)
-from service.query import PhotographQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery
-from service.runtime import Backends, Localisers, start_runtime, warm_encoder
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
+from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, StoredPlace
+from service.query import Nearby, Where
+from service.runtime import Backends, start_runtime, warm_encoder
 from service.settings import Settings
-from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
 from service.venues.plan_list import PlanList
 from service.workers.lpo import load_refiner
@@ -165,76 +157,27 @@ class SearchReplica(_ServiceReplica):
     """Search of plans and venues."""
 
     @returning_failures
-    async def localise(self, tenant: str, plan_id: str, query: PhotographQuery) -> LocaliseAnswer:
-        """See `Localiser.localise`."""
-        return await self._runtime.localiser.localise(await self._plan(tenant, plan_id), query)
-
-    @returning_failures
-    async def localise_and_draw(
-        self, tenant: str, plan_id: str, query: PhotographQuery, request: PictureRequest
-    ) -> tuple[LocaliseAnswer, bytes]:
-        """See `Localiser.localise_and_draw`."""
-        return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, request)
-
-    @returning_failures
-    async def localise_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:
-        """See `Localiser.localise_sequence`."""
-        return await self._runtime.localiser.localise_sequence(await self._plan(tenant, plan_id), query)
-
-    @returning_failures
-    async def localise_in_venue(self, tenant: str, venue_id: str, query: PhotographQuery) -> LocaliseAnswer:
-        """See `VenueLocaliser.localise`."""
-        return await self._runtime.venue_localiser.localise(await self._venue(tenant, venue_id), query)
-
-    @returning_failures
-    async def localise_sequence_in_venue(self, tenant: str, venue_id: str, query: SequenceQuery) -> SequenceAnswer:
-        """See `VenueLocaliser.localise_sequence`."""
-        return await self._runtime.venue_localiser.localise_sequence(await self._venue(tenant, venue_id), query)
-
-    @returning_failures
-    async def localise_near(
-        self, tenant: str, place: EarthPoint, within_m: float, query: PhotographQuery
-    ) -> LocaliseAnswer:
-        """See `VenueLocaliser.localise_near`."""
-        return await self._runtime.venue_localiser.localise_near(tenant, place, within_m, query)
-
-    @returning_failures
-    async def check_hints(self, tenant: str, venue_id: str, form: LocaliseForm) -> None:
-        """See `VenueLocaliser.check_hints`."""
-        await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
-
-    @returning_failures
-    async def check_session(self, tenant: str, document: SessionDocument) -> None:
-        """See `SessionTracker.check`."""
-        await self._runtime.tracker.check(await self._place(tenant, document), document)
-
-    @returning_failures
-    async def track(self, tenant: str, query: TrackQuery) -> TrackOutcome:
-        """See `SessionTracker.track`."""
-        return await self._runtime.tracker.track(await self._place(tenant, query.document), query)
+    async def call(self, method: str, about: StoredPlace | Nearby, *arguments: Any) -> Any:
+        """Return the result of a method of `Localiser`."""
+        return await getattr(self._runtime.localiser, method)(await self._where(about), *arguments)
 
     async def revisions(self) -> frozenset[str]:
         """Return the revisions of plans whose pose grids are in memory."""
         return frozenset(self._runtime.grids.revisions())
 
-    async def _plan(self, tenant: str, plan_id: str) -> PlanRecord:
-        """Return a plan from this replica's own cache."""
-        record = await self._runtime.plan_lookup.find(tenant, plan_id, self._runtime.reads)
+    async def _where(self, about: StoredPlace | Nearby) -> Where:
+        if isinstance(about, Nearby):
+            return about
+        runtime, tenant = self._runtime, about.tenant
+        if about.is_venue:
+            venue = await runtime.reads.run(tenant, runtime.store.venues.get, tenant, about.id)
+            if venue is None:
+                raise UnknownVenueError(about.id)
+            return venue
+        record = await runtime.plan_lookup.find(tenant, about.id, runtime.reads)
         if record is None:
             # The plan was deleted meanwhile.
-            raise UnknownFloorPlanError(plan_id)
-        return record
-
-    async def _place(self, tenant: str, document: SessionDocument) -> PlanRecord | VenueRecord:
-        if document.venue_id is not None:
-            return await self._venue(tenant, document.venue_id)
-        assert document.floorplan_id is not None
-        return await self._plan(tenant, document.floorplan_id)
-
-    async def _venue(self, tenant: str, venue_id: str) -> VenueRecord:
-        record = await self._runtime.reads.run(tenant, self._runtime.store.venues.get, tenant, venue_id)
-        if record is None:
-            raise UnknownVenueError(venue_id)
+            raise UnknownFloorPlanError(about.id)
         return record
 
 
@@ -248,17 +191,10 @@ class IngressReplica:
         self._search = search
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
-        def localisers(model: ModelAnswer, settings: Settings, telemetry: Telemetry) -> Localisers:
-            return (
-                RemoteLocaliser(model, self._search, settings, telemetry),
-                RemoteVenueLocaliser(self._search, settings, telemetry),
-                RemoteTracker(self._search, settings, telemetry),
-            )
-
         backends = Backends(
             optimiser=lambda _bundle, _settings, telemetry, *_: RemoteOptimiser(self._lpo, telemetry),
             encoder=warm_encoder,
-            localisers=localisers,
+            localiser=lambda model, settings, telemetry: RemoteLocaliser(model, self._search, settings, telemetry),
         )
         return without_request_id(create_app(self._settings, backends))
 

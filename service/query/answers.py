@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.belief import Confidence, Posterior, photograph_heading, pose_uncertainty, probability_map
-from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import Candidate, KnownHeading, Query
+from lalaloc_core.localise.belief import Posterior, photograph_heading, pose_uncertainty, probability_map
+from lalaloc_core.localise.query import KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.search import SequenceLocalisation
 from service.query.geopose import geopose_at
-from service.query.stated_pose import heading_warnings
+from service.query.ground import Ground, Place
+from service.query.spots import Spot, view_answer
 from service.schemas import (
     CandidateAnswer,
     LocaliseAnswer,
@@ -28,77 +25,43 @@ from service.schemas import (
     SequencePoseAnswer,
     TimingsAnswer,
 )
-from service.schemas.photographs import ViewAnswer
-from service.storage.records import PlanRecord
 
 # Smaller probabilities are rounded to 0 in the answer.
 _MIN_PROBABILITY = 5e-7
 
 
-@dataclass(frozen=True)
-class Place:
-    """A candidate and the plan that it lies in.
-
-    Attributes:
-        plan_id: id of the plan.
-        revision_id: id of the plan's revision.
-        plan: the plan.
-        candidate: the candidate in the plan's frame.
-        anchor: place of the plan on Earth; None where unknown.
-        level: level of the plan in its venue; None outside of venues.
-    """
-
-    plan_id: str
-    revision_id: str
-    plan: FloorPlan
-    candidate: Candidate
-    anchor: Anchor | None
-    level: float | None = None
-
-
-# Maps a candidate of the search to its place.
-Locate = Callable[[Candidate], Place]
-
-
-def locate_in(record: PlanRecord) -> Locate:
-    """Return a function that maps the candidates of a search in one plan to their places."""
-    return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate, record.plan.anchor)
-
-
 def compose_answer(
     found: Localisation,
-    *,
-    locate: Locate,
+    ground: Ground,
+    spot: Spot,
     known: KnownHeading,
+    *,
     timings_ms: dict[str, float],
     bundle: Bundle,
     warnings: Sequence[str] = (),
-    share: float = 1.0,
-    view: Callable[[Localisation, Confidence | None], ViewAnswer],
 ) -> LocaliseAnswer:
     """Compose the answer to a query about one photograph.
 
     Args:
         found: result of the search.
-        locate: maps each candidate to its place.
+        ground: the searched places.
+        spot: the photograph.
         known: the heading that was known before the search.
         timings_ms: durations (ms) by stage.
         bundle: the model.
         warnings: warnings besides the one about the heading.
-        share: probability that the camera is in one of the searched plans.
-        view: composes the part about the photograph, given the result and its confidence.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view)
     final, uncertainty = found.best[found.stage], None
     if model is not None and final.information is not None:
-        placed = locate(final)
+        placed = ground.place(final)
         uncertainty = pose_uncertainty(final.information, placed.plan.rooms[placed.candidate.room_index], model)
-    confidence = found.confidence(model, share)
+    confidence = found.confidence(model, ground.share(found))
     candidates = [
-        _candidate(locate(candidate), found.query, None if confidence is None else confidence.candidates[index])
+        _candidate(ground.place(candidate), found.query, None if confidence is None else confidence.candidates[index])
         for index, candidate in enumerate(found.candidates)
     ]
-    best, place = candidates[0], locate(found.candidates[0])
+    best, place = candidates[0], ground.place(found.candidates[0])
     return LocaliseAnswer(
         floorplan_id=place.plan_id,
         floorplan_revision=place.revision_id,
@@ -111,7 +74,7 @@ def compose_answer(
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
         probability_elsewhere=None if confidence is None else confidence.elsewhere,
-        warnings=[*heading_warnings(found, known), *warnings],
+        warnings=[*_heading_warnings(found, known), *warnings],
         covariance_m2=None if uncertainty is None else uncertainty.position_m2.tolist(),
         heading_std_deg=None
         if uncertainty is None or uncertainty.heading_std is None
@@ -122,10 +85,20 @@ def compose_answer(
         camera_height_m=found.camera_height_m,
         candidates=candidates,
         geopose=best.geopose,
-        view=view(found, confidence),
+        view=view_answer(spot, ground, found, confidence),
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=ModelAnswer.of(bundle),
     )
+
+
+def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
+    """Return a warning if the known heading was not followed."""
+    if not found.heading_contradicted:
+        return []
+    assert known.heading is not None
+    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
+    degrees = heading_to_degrees(known.heading)
+    return [f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"]
 
 
 def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
@@ -147,13 +120,13 @@ def _candidate(place: Place, query: Query, probability: float | None) -> Candida
     )
 
 
-def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:
+def posterior_answer(ground: Ground, posterior: Posterior) -> PosteriorAnswer:
     """Return the positions of the pose grid whose rounded probability is above zero."""
-    places = probability_map(plan, grid.poses, posterior)
+    places = probability_map(ground.plan, ground.grid.poses, posterior)
     kept = places.probability >= _MIN_PROBABILITY
     position_m = places.position_m[kept]
     return PosteriorAnswer(
-        step_m=grid.step_m,
+        step_m=ground.grid.step_m,
         x_m=position_m[:, 0].tolist(),
         y_m=position_m[:, 1].tolist(),
         probability=places.probability[kept].tolist(),

@@ -1,190 +1,281 @@
-"""Grounds of sessions: a plan, or the plans of a venue that a photograph is compared with."""
+"""Grounds of queries: the plan or the venue that a query is about, waited for and loaded."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from time import monotonic
 
 import numpy as np
-from jaxtyping import Float
-from sqlalchemy import Row
 
+from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
-from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.ground import Ground, LeftOut
-from lalaloc_core.localise.tracking.motion import WalkGraph
-from lalaloc_core.localise.tracking.passages import PlanOnLevel
-from service.capacity.bounded_cache import BoundedCache
-from service.errors import SessionOutdatedError, VenueUnsearchableError
-from service.query.answers import Place
-from service.query.localiser import Localiser
-from service.query.queries import TrackQuery
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Query
+from lalaloc_core.localise.venue.merged_plans import GAP_M
+from service.capacity.admission_control import Slots
+from service.capacity.query_context import QueryContext
+from service.capacity.threads import BoundedReads
+from service.errors import NoPlanNearbyError, PlanFailedError, PlanNotReadyError, VenueUnsearchableError
+from service.grids import GridProvider, check_height_m, grid_height_m
+from service.query.executor import Executor
+from service.query.ground import Ground
+from service.query.queries import Nearby, Where
 from service.query.stated_pose import stated_height, stated_hints
 from service.schemas import SessionDocument
+from service.schemas.query_fields import CameraFields, HintFields
 from service.storage.records import PlanRecord, VenueRecord
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
-from service.venues.venue_plans import VenuePlans
-from service.venues.venue_search import SearchedPlans, VenueSearch
+from service.venues.venue_plans import VenuePlans, venue_height
+from service.venues.venue_search import Favour, VenueSearch
 
-# Poses of a plan whose belief is computed for every photograph; a belief has a weight for each pose and heading.
-MAX_POSES = 65_536
-# Memory of the links of pose grids.
-_GRAPH_BYTES = 64 * 2**20
-# Plans with at least this probability stay among those that are searched; log factor for plans one level from them.
-_STAYS_FROM, _NEXT_LEVEL = 1e-3, 5.0
-# Log factor of plans that stay, larger than any difference of log masses.
-_STAYS = 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class SessionGround:
-    """Ground of a session for one photograph.
-
-    Attributes:
-        ground: the plans.
-        records: the same plans as they are stored.
-        levels: levels of the plans; None outside of venues.
-        anchors: places of the plans on Earth.
-        hints: hints about the first photograph.
-        warnings: warnings about plans that are not searched.
-    """
-
-    ground: Ground
-    records: Sequence[PlanRecord]
-    levels: Sequence[float | None]
-    anchors: Sequence[Anchor | None]
-    hints: Hints
-    warnings: Sequence[str] = ()
-
-    def place(self, candidate: Candidate) -> Place:
-        """Return the plan of a candidate, and the candidate in that plan's frame."""
-        number, own_candidate = self.ground.in_own_plan(candidate)
-        record = self.records[number]
-        return Place(
-            record.id, record.revision_id, record.plan, own_candidate, self.anchors[number], self.levels[number]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class ReadyPlans:
-    """Rows of the plans of a venue that are ready, hints about the photograph, and warnings about other plans."""
-
-    rows: PlanList
-    hints: VenueHints
-    warnings: list[str]
+# Photographs of a sequence that plans are chosen by.
+_CHOOSING = 8
 
 
 class Grounds:
-    """Makes the grounds of sessions; links of pose grids stay in memory."""
+    """Finds the ground of a query: checks what it states, waits for plans, and loads their pose grids."""
 
-    def __init__(self, localiser: Localiser, plans: VenuePlans, search: VenueSearch) -> None:
-        self._localiser = localiser
+    def __init__(
+        self,
+        *,
+        encoder: PhotographEncoder,
+        grids: GridProvider,
+        queries: Slots,
+        reads: BoundedReads,
+        executor: Executor,
+        plans: VenuePlans,
+        search: VenueSearch,
+    ) -> None:
+        self._latents_alone = not encoder.networks.predicts_profile
+        self._grids = grids
+        self._queries = queries
+        self._reads = reads
         self._plans = plans
-        self._search = search
-        self._graphs = BoundedCache[str, WalkGraph](_GRAPH_BYTES, lambda graph: graph.nbytes)
+        self.executor = executor
+        self.search = search
 
-    async def check(self, venue: VenueRecord, document: SessionDocument) -> None:
-        """Check a request for a session in a venue.
+    def site(
+        self,
+        where: Where,
+        form: CameraFields,
+        hinted: HintFields | SessionDocument | None = None,
+        *,
+        heights_m: Sequence[float | None] = (),
+        gap_m: float = GAP_M,
+        max_poses: int | None = None,
+    ) -> Site:
+        """Return the site of a query.
+
+        Args:
+            where: the plan, venue or place.
+            form: the stated camera height.
+            hinted: the stated hints; None for none.
+            heights_m: further stated camera heights (m).
+            gap_m: distance between plans of a venue, which are laid side by side.
+            max_poses: limit of the grid poses of a plan of a venue; None for no limit.
 
         Raises:
-            InvalidHintError: the hints do not match the venue.
+            InvalidPoseError: a stated height is impossible in the plan.
+            InvalidHintError: the hints do not match the plan, or the venue has no frame for a point.
+        """
+        if isinstance(where, PlanRecord):
+            return PlanSite(self, where, form, hinted, heights_m)
+        anchor = where.anchor if isinstance(where, VenueRecord) else None
+        hints = VenueHints(anchor=anchor) if hinted is None else VenueHints.from_form(hinted, anchor)
+        return VenueSite(self, where, form, hints, anchor, gap_m, max_poses)
+
+    async def check(
+        self, where: PlanRecord | VenueRecord, form: CameraFields, hinted: HintFields | SessionDocument
+    ) -> None:
+        """Check what a request states about a plan or a venue.
+
+        Raises:
+            InvalidPoseError: the camera height is above the ceiling.
+            InvalidHintError: the hints do not match the plan or venue.
             VenueUnsearchableError: the venue has no plans.
         """
-        members = await self._plans.members(venue.tenant, venue.id)
+        if isinstance(where, PlanRecord):
+            stated_height(form, where)
+            stated_hints(hinted, where.plan).check(where.plan)
+            return
+        members = await self.members(where)
         if not members:
-            raise VenueUnsearchableError(venue.id, 0)
-        VenueHints.from_form(document, venue.anchor).check(members)
+            raise VenueUnsearchableError(where.id, 0)
+        VenueHints.from_form(hinted, where.anchor).check(members)
 
-    async def of_plan(self, record: PlanRecord, query: TrackQuery) -> SessionGround:
-        """Return the ground of a session in one plan."""
-        compute = partial(self._localiser.compute, query.context)
-        grid = await self._localiser.grid(record, stated_height(query.document, record), query.context)
-        graph = await compute(partial(self._graph, record, grid))
-        hints = NO_HINTS if query.state is not None else stated_hints(query.document, record.plan)
-        ground = Ground.of_plan(record.plan, grid, graph)
-        return SessionGround(ground, [record], [None], [record.plan.anchor], hints)
-
-    async def ready(self, venue: VenueRecord, query: TrackQuery) -> ReadyPlans:
-        """Wait for a plan of a venue to be ready.
+    async def members(self, where: VenueRecord | Nearby) -> PlanList:
+        """Return the current row of every plan of a venue or near a place.
 
         Raises:
+            NoPlanNearbyError: no plan is near the place.
+        """
+        if isinstance(where, VenueRecord):
+            return await self._plans.members(where.tenant, where.id)
+        rows = await self._plans.near(where.tenant, where.place, where.within_m)
+        if not rows:
+            raise NoPlanNearbyError(str(where.place), where.within_m)
+        return rows
+
+    async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
+        """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline.
+
+        Raises:
+            PlanFailedError: the plan's pose grid could not be computed.
+            PlanNotReadyError: the pose grid was not ready by the deadline.
+            StoreUnavailableError: the pose grid is not in memory, and the database cannot be reached.
+            OverloadedError: too many pose grids are computed on demand.
+        """
+        with context.clock.stage("grid"):
+            height_m = grid_height_m(record, height.height_m, latents_alone=self._latents_alone)
+            key = self._grids.key(record.revision_id, height_m)
+            grid = self._grids.cached(key)
+            if grid is None:
+                # Not on the compute threads: a database that does not answer would block them.
+                grid = await self._reads.run(record.tenant, self._grids.find, key)
+            if grid is not None:
+                return grid
+            own_height = height_m == record.plan.camera_height_m
+            if own_height and record.failure is not None:
+                raise PlanFailedError(record.id, record.failure)
+            future = self._grids.compute(record, height_m)
+            begin = monotonic()
+            try:
+                async with asyncio.timeout(max(context.left_s, 0.0)):
+                    with self._queries.released(context.client):
+                        return await asyncio.wrap_future(future)
+            except TimeoutError as error:
+                raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
+
+
+class PlanSite:
+    """Stored plan that a query is about.
+
+    Attributes:
+        north: azimuth of true north (radians) in the plan; None where unknown.
+        height: the stated camera height.
+    """
+
+    def __init__(
+        self,
+        grounds: Grounds,
+        record: PlanRecord,
+        form: CameraFields,
+        hinted: HintFields | SessionDocument | None,
+        heights_m: Sequence[float | None],
+    ) -> None:
+        self._grounds = grounds
+        self._record = record
+        self.north = record.plan.north
+        for height_m in heights_m:
+            if height_m is not None:
+                check_height_m(record, height_m)
+        self.height = stated_height(form, record)
+        self._hints = NO_HINTS if hinted is None else stated_hints(hinted, record.plan)
+
+    async def wait(self, context: QueryContext) -> None:
+        """Check the hints.
+
+        Raises:
+            InvalidHintError: the hints do not match the plan, or exclude all of it.
+        """
+        if not self._hints.are_none:
+            # On a compute thread, because checking many rooms is slow.
+            await self._grounds.executor.compute(context, partial(self._hints.check, self._record.plan))
+
+    async def ground(self, encoded: Sequence[Query], context: QueryContext, favour: Favour | None = None) -> Ground:
+        """Wait for the pose grid; `encoded` and `favour` matter for venues alone."""
+        return Ground.of_plan(self._record, await self._grounds.grid(self._record, self.height, context), self._hints)
+
+
+class VenueSite:
+    """Plans of a venue, or near a place, that a query is about.
+
+    Attributes:
+        id: id of the venue.
+        north: azimuth of true north (radians) in the venue's frame; None where unknown.
+        ready: the plans that are ready, after `wait`.
+    """
+
+    def __init__(
+        self,
+        grounds: Grounds,
+        where: VenueRecord | Nearby,
+        form: CameraFields,
+        hints: VenueHints,
+        anchor: Anchor | None,
+        gap_m: float,
+        max_poses: int | None,
+    ) -> None:
+        self._grounds = grounds
+        self._where = where
+        self.id = where.id
+        self._form = form
+        self._hints = hints
+        self._gap_m = gap_m
+        self._max_poses = max_poses
+        self._warnings: list[str] = []
+        self.north = None if anchor is None else heading_from_degrees(anchor.north_deg)
+        self.ready = PlanList()
+
+    @property
+    def height(self) -> CameraHeight:
+        """The stated camera height, else the one that the plans share."""
+        return venue_height(self._form, self.ready)
+
+    async def wait(self, context: QueryContext) -> None:
+        """Wait for a plan to be ready.
+
+        Raises:
+            InvalidHintError: a hint does not match the venue.
             VenueUnsearchableError: no plan can be searched.
-            LaLaLocError: see `VenueSearch.ready`.
+            VenueNotReadyError: no plan was ready by the deadline.
+            NoPlanNearbyError: no plan is near the place.
         """
-        hints = VenueHints(anchor=venue.anchor)
-        if query.state is None:
-            hints = VenueHints.from_form(query.document, venue.anchor)
-        members = partial(self._plans.members, venue.tenant, venue.id)
-        rows, warnings = await self._search.ready(venue, members, hints, query.context)
-        small = rows.chosen(rows.poses <= MAX_POSES)
-        if len(small) < len(rows):
-            large = f"{len(rows) - len(small)} floor plans have more than {MAX_POSES} grid poses"
-            if not small:
-                raise VenueUnsearchableError(venue.id, len(rows), large)
-            warnings = [*warnings, f"{large} and were not searched"]
-        return ReadyPlans(small, hints, warnings)
+        read_plans = partial(self._grounds.members, self._where)
+        with context.clock.stage("wait"):
+            ready, warnings = await self._grounds.search.ready(self._where.id, read_plans, self._hints, context)
+        if self._max_poses is not None:
+            small = ready.chosen(ready.poses <= self._max_poses)
+            if len(small) < len(ready):
+                large = f"{len(ready) - len(small)} floor plans have more than {self._max_poses} grid poses"
+                if not small:
+                    raise VenueUnsearchableError(self._where.id, len(ready), large)
+                ready, warnings = small, [*warnings, f"{large} and were not searched"]
+        self.ready, self._warnings = ready, warnings
 
-    async def of_venue(
-        self, venue: VenueRecord, ready: ReadyPlans, query: TrackQuery, encoded: Query, state: TrackState | None
-    ) -> SessionGround:
-        """Return the ground of a session in a venue: all plans, or the probable ones among many.
+    async def ground(self, encoded: Sequence[Query], context: QueryContext, favour: Favour | None = None) -> Ground:
+        """Choose and load the plans to search, and lay them side by side.
 
-        Raises:
-            SessionOutdatedError: a plan with a share of the belief was replaced.
-            LaLaLocError: see `VenueSearch.searched`.
+        `favour` returns log factors by which plans are preferred in the choice alone. See `VenueSearch.load` for the
+        errors.
         """
-        by_plan = {} if state is None else state.by_plan
-        if not by_plan.keys() <= {row.revision_id for row in ready.rows}:
-            raise SessionOutdatedError(query.session_id, f"a floor plan of venue '{venue.id}' was replaced")
-        levels = [row.level for row in ready.rows]
-        compute = partial(self._localiser.compute, query.context)
-        searched = await self._search.searched(
-            venue,
-            ready.rows,
-            [encoded],
-            form=query.document,
-            hints=ready.hints,
-            warnings=ready.warnings,
-            context=query.context,
-            compute=compute,
-            favour=partial(_favour, by_plan, levels),
-        )
-        anchors = [record.plan.anchor_within(venue.anchor) for record in searched.records]
-        return await compute(partial(self._levels, searched, anchors, levels))
-
-    def _levels(
-        self, searched: SearchedPlans, anchors: Sequence[Anchor | None], levels: Sequence[float]
-    ) -> SessionGround:
-        entries = [
-            PlanOnLevel(record.plan, row.level, anchor)
-            for record, row, anchor in zip(searched.records, searched.rows, anchors, strict=True)
-        ]
-        graphs = [self._graph(record, grid) for record, grid in zip(searched.records, searched.grids, strict=True)]
-        left_out = None
-        if searched.log_mass is not None:
-            left_out = LeftOut(searched.area_share, searched.log_mass, np.array(searched.index))
-        keys = [row.revision_id for row in searched.rows]
-        ground = Ground.of_levels(searched.merged, entries, graphs, keys, levels, left_out)
-        return SessionGround(
-            ground, searched.records, [row.level for row in searched.rows], anchors, searched.hints, searched.warnings
-        )
-
-    def _graph(self, record: PlanRecord, grid: PoseGrid) -> WalkGraph:
-        """Return the links of a plan's pose grid."""
-        return self._graphs.get_or_make(
-            record.revision_id, lambda: WalkGraph.of(grid.poses, grid.layouts(record.plan), grid.step_m)
-        )
+        choosing = _spread(encoded)
+        with context.clock.stage("shortlist"):
+            loaded = await self._grounds.search.load(
+                self._where.tenant,
+                self._where.id,
+                self.ready,
+                choosing,
+                form=self._form,
+                hints=self._hints,
+                warnings=self._warnings,
+                context=context,
+                compute=partial(self._grounds.executor.compute, context),
+                favour=favour,
+            )
+            height_m = max(choosing, key=lambda query: len(query.roll)).camera_height.height_m
+            merge = partial(Ground.of_venue, loaded, self._hints, height_m, self._gap_m)
+            return await self._grounds.executor.compute(context, merge)
 
 
-def _favour(by_plan: dict[str, float], levels: Sequence[float], rows: Sequence[Row[Any]]) -> Float[np.ndarray, "p"]:
-    """Return the log factors by which a session prefers plans: those of its belief, and those one level from them."""
-    share = np.array([by_plan.get(row.revision_id, 0.0) for row in rows])
-    storey = np.searchsorted(np.unique(levels), [row.level for row in rows])
-    kept = share >= _STAYS_FROM
-    beside = np.isin(storey, [storey[kept] - 1, storey[kept] + 1])
-    return np.where(kept, _STAYS * (1.0 + share), np.where(beside, _NEXT_LEVEL, 0.0))
+Site = PlanSite | VenueSite
+
+
+def _spread(encoded: Sequence[Query]) -> list[Query]:
+    """Return photographs at even intervals, few enough to choose plans by each."""
+    index = np.unique(np.linspace(0, len(encoded) - 1, _CHOOSING).round().astype(int))
+    return [encoded[int(number)] for number in index]

@@ -24,7 +24,7 @@ from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.request_end import on_request_end
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
-from service.query import PhotographQuery, QueryContext
+from service.query import Nearby, PhotographQuery, QueryContext
 from service.query.oscp import (
     camera_fields,
     compose_oscp_answer,
@@ -144,7 +144,7 @@ class _Query:
         place, radius_m = self._place
         # Plans near a place are searched like a venue.
         form = self._form(venue_id="near").model_copy(update={"near": place, "radius_m": radius_m})
-        found = await self._runtime.venue_localiser.localise_near(self._tenant, place, radius_m, self._about(form))
+        found = await self._runtime.localiser.localise(Nearby(self._tenant, place, radius_m), self._about(form))
         return found, []
 
     async def _in_plan(self, floorplan_id: str) -> tuple[LocaliseAnswer, list[str]]:
@@ -161,13 +161,13 @@ class _Query:
         return await self._runtime.localiser.localise(record, self._about(form)), warnings
 
     async def _in_venue(self, venue_id: str) -> tuple[LocaliseAnswer, list[str]]:
-        venue, localiser = await venue_for_query(self._tenant, venue_id, self._runtime), self._runtime.venue_localiser
+        venue, localiser = await venue_for_query(self._tenant, venue_id, self._runtime), self._runtime.localiser
         form, warnings = self._form(venue_id=venue.id), list[str]()
         if self._place is not None:
             place, radius_m = self._place
             near = form.model_copy(update={"near": place, "radius_m": radius_m})
             try:
-                await localiser.check_hints(venue, near)
+                await localiser.check(venue, near)
                 form = near
             except InvalidHintError as error:
                 warnings = [_contradicted(f"has no say: {error.reason}")]

@@ -123,7 +123,7 @@ async def localise(
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
-            answer = await runtime.venue_localiser.localise(venue, query)
+            answer = await runtime.localiser.localise(venue, query)
             add_log_fields(request, plan=answer.floorplan_id, revision=answer.floorplan_revision, stage=answer.stage)
             return await _response(answer, media, tenant, runtime)
         assert form.floorplan_id is not None

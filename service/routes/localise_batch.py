@@ -114,7 +114,7 @@ async def _localiser_of(request: Request, form: LocaliseForm, tenant: str, runti
     if form.venue_id is not None:
         venue = await venue_for_query(tenant, form.venue_id, runtime)
         add_log_fields(request, venue=venue.id)
-        return lambda query: runtime.venue_localiser.localise(venue, query)
+        return lambda query: runtime.localiser.localise(venue, query)
     assert form.floorplan_id is not None
     record = await plan_for_query(tenant, form.floorplan_id, runtime)
     add_log_fields(request, plan=record.id, revision=record.revision_id)

@@ -90,7 +90,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
-            found = await runtime.venue_localiser.localise_sequence(venue, query)
+            found = await runtime.localiser.localise_sequence(venue, query)
         else:
             assert form.floorplan_id is not None
             record = await plan_for_query(tenant, form.floorplan_id, runtime)

@@ -104,7 +104,7 @@ async def create_session(request: Request, runtime: Running, tenant: Tenant, cli
     place = await _place(tenant, document, runtime)
     if isinstance(place, PlanRecord):
         _check_size(place, runtime)
-    await runtime.tracker.check(place, document)
+    await runtime.localiser.check(place, document)
 
     def store(token: str) -> Response:
         session = runtime.store.sessions.add(
@@ -187,7 +187,7 @@ async def add_photograph(
         place = await _current_place(session, document, runtime)
         add_log_fields(request, plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
         query = TrackQuery(session.id, document, session.state, form, content, context)
-        outcome = await runtime.tracker.track(place, query)
+        outcome = await runtime.localiser.track(place, query)
         stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
         finish = partial(runtime.store.sessions.finish, ttl_s=runtime.settings.storage.session_ttl_s)
         after = await runtime.reads.run(tenant, finish, session, outcome.state, stored)

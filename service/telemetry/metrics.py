@@ -103,6 +103,12 @@ class Telemetry:
             registry=self.registry,
         )
 
+    def observe_answer(self, timings_ms: Mapping[str, float], stage: str) -> None:
+        """Count an answer that ends at a stage, with the durations (ms) of all stages."""
+        for name, spent_ms in timings_ms.items():
+            self.stage_seconds.labels(name).observe(spent_ms / 1e3)
+        self.answers.labels(stage).inc()
+
     def counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
         """Add a counter; a restarted app continues with the existing one."""
         if name not in self._counters:

@@ -15,9 +15,7 @@ from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.query import HintName, Hints, NearInEach, log_factor, rooms_named
-from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from service.query.stated_pose import contradiction, near_missed
 from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HintFields
 from service.storage.plan_places import distances_m
@@ -168,21 +166,6 @@ class VenueHints:
             return []
         effect = "were not searched, because near is strict" if self.strict else "are not affected by near"
         return [f"{count} of the venue's {len(rows)} floor plans have no anchor and {effect}"]
-
-    def warnings(self, hints: Hints, found: Localisation, rows: _Rows, merged: MergedPlans) -> list[str]:
-        """Return a warning for every hint that the panorama contradicts, followed or not."""
-        answer = found.candidates[0]
-        row = rows[merged.plan_of(answer.room_index)]
-        room = merged.plan.rooms[answer.room_index]
-        texts = {
-            "near": lambda: near_missed(hints, found),
-            "rooms": lambda: (
-                f"rooms is {', '.join(repr(name) for name in self.rooms)}",
-                f"the answer lies in room '{room.id}' of floor plan '{row.plan_id}'",
-            ),
-            "level": lambda: (f"level is {self.level:g}", f"the answer is on level {row.level:g}"),
-        }
-        return [contradiction(*texts[name](), self.strict) for name in found.hints_missed]
 
     def _on_level(self, rows: _Rows) -> np.ndarray:
         return np.array([row.level == self.level for row in rows], bool)

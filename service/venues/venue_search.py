@@ -1,9 +1,9 @@
-"""Search of a venue: wait for its plans, choose those to search in full, and lay them side by side."""
+"""Search of a venue: wait for its plans, choose those to search in full, and load them."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
@@ -14,20 +14,15 @@ from jaxtyping import Float
 from sqlalchemy import Row
 
 from lalaloc_core.errors import InvalidPoseError
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import Candidate, Hints, Query
-from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.venue.merged_plans import GAP_M, MergedPlans
-from lalaloc_core.localise.venue.prototypes import share_searched
+from lalaloc_core.localise.query import HintName, Query
 from service.capacity.admission_control import Slots
+from service.capacity.query_context import QueryContext
 from service.errors import VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
-from service.query.answers import Place
-from service.query.queries import QueryContext
 from service.schemas.query_fields import CameraFields
-from service.storage.records import PlanRecord, VenueRecord
+from service.storage.records import PlanRecord
 from service.venues.plan_indices import IndexSource
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
@@ -42,50 +37,32 @@ Favour = Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]]
 
 
 @dataclass(frozen=True, eq=False)
-class SearchedPlans:
-    """Plans to search in full, and the prior masses of all plans that are ready.
+class LoadedPlans:
+    """Plans of a venue that are searched in full, and the prior masses of all plans that are ready.
 
     Attributes:
         rows: rows of the searched plans, see `Venues.searchable_plans`.
         records: the searched plans.
         grids: their pose grids.
-        merged: the searched plans side by side.
         log_mass: (p,) log masses of all plans that are ready; None if all of them are searched.
         area_share: share of their floor area that the searched plans have.
-        index: indices of the searched plans among the plans that are ready.
+        numbers: numbers of the searched plans among the plans that are ready.
+        hint_shares: see `VenueHints.shares`.
         warnings: warnings about plans that are not searched.
-        anchor: anchor of the venue.
-        hints: hints about the merged plans.
     """
 
     rows: Sequence[Row[Any]]
     records: Sequence[PlanRecord]
     grids: Sequence[PoseGrid]
-    merged: MergedPlans
     log_mass: Float[np.ndarray, "p"] | None
     area_share: float
-    index: Sequence[int]
+    numbers: Sequence[int]
+    hint_shares: Mapping[HintName, float]
     warnings: list[str]
-    anchor: Anchor | None
-    hints: Hints
-
-    def place(self, candidate: Candidate) -> Place:
-        """Return the plan of a candidate, and the candidate in that plan's frame."""
-        index, own_candidate = self.merged.in_own_plan(candidate)
-        record = self.records[index]
-        anchor, level = record.plan.anchor_within(self.anchor), self.rows[index].level
-        return Place(record.id, record.revision_id, record.plan, own_candidate, anchor, level)
-
-    def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
-        """Return the probability that the camera is in a searched plan, and (m,) each plan's share of it."""
-        probability = self.merged.by_plan(found.posterior.pose)
-        if self.log_mass is None:
-            return 1.0, probability
-        return share_searched(self.log_mass, np.array(self.index), probability), probability
 
 
 class VenueSearch:
-    """Chooser of the plans of venues that a photograph is compared with."""
+    """Reader of the plans of venues that a photograph is compared with."""
 
     def __init__(self, *, plans: VenuePlans, indices: IndexSource, encoder: PhotographEncoder, queries: Slots) -> None:
         self._plans = plans
@@ -94,7 +71,7 @@ class VenueSearch:
         self._queries = queries
 
     async def ready(
-        self, venue: VenueRecord, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
+        self, venue_id: str, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
     ) -> tuple[PlanList, list[str]]:
         """Wait for a plan to be ready; return the plans that are ready, and warnings about the others.
 
@@ -112,9 +89,9 @@ class VenueSearch:
             if ready:
                 break
             if failed == len(members):
-                raise VenueUnsearchableError(venue.id, len(members))
+                raise VenueUnsearchableError(venue_id, len(members))
             if context.left_s <= _POLL_INTERVAL_S:
-                raise VenueNotReadyError(venue.id, len(members), monotonic() - begin)
+                raise VenueNotReadyError(venue_id, len(members), monotonic() - begin)
             with self._queries.released(context.client):
                 await asyncio.sleep(_POLL_INTERVAL_S)
         waiting = len(members) - len(ready) - failed
@@ -125,9 +102,10 @@ class VenueSearch:
             warnings.append(f"{failed} of the venue's {len(members)} floor plans failed and were not searched")
         return ready, warnings
 
-    async def searched(
+    async def load(
         self,
-        venue: VenueRecord,
+        tenant: str,
+        venue_id: str,
         ready: PlanList,
         queries: Sequence[Query],
         *,
@@ -137,12 +115,12 @@ class VenueSearch:
         context: QueryContext,
         compute: Callable[..., Any],
         favour: Favour | None = None,
-        gap_m: float = GAP_M,
-    ) -> SearchedPlans:
-        """Choose the plans to search in full: all of them if they are few, otherwise the most probable ones.
+    ) -> LoadedPlans:
+        """Choose and load the plans to search in full: all of them if they are few, else the most probable ones.
 
         Args:
-            venue: the venue.
+            tenant: tenant of the plans.
+            venue_id: id of the venue.
             ready: rows of its plans that are ready.
             queries: the encoded photographs, each of which chooses plans.
             form: the stated camera height.
@@ -151,59 +129,52 @@ class VenueSearch:
             context: context of the query.
             compute: runs CPU work.
             favour: log factors by which plans are preferred in the choice alone.
-            gap_m: distance between the plans in the merged frame.
 
         Raises:
-            InvalidHintError: strict hints exclude every plan, or no searched plan has a room.
+            InvalidHintError: strict hints exclude every plan.
             InvalidPoseError: the camera height is above all ceilings.
             VenueNotReadyError: all plans were deleted meanwhile.
             DeadlineExceededError: the deadline passed.
         """
-        query = max(queries, key=lambda one: len(one.roll))
-        rows, log_mass, index = ready, None, list(range(len(ready)))
+        query = max(queries, key=lambda encoded: len(encoded.roll))
+        rows, log_mass, numbers = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
-            whole_venue = venue.id if possible is ready else None
+            whole_venue = venue_id if possible is ready else None
             # Another query may be making the index, in the time that it has itself.
             async with context.bounded():
-                known, plan_index = await self._indices.index(venue.tenant, possible, compute, venue_id=whole_venue)
+                known, plan_index = await self._indices.index(tenant, possible, compute, venue_id=whole_venue)
             manifest = self._encoder.networks.manifest
-            choosing = [(one, manifest.evidence_for(view=one.is_view)) for one in queries]
+            choosing = [(encoded, manifest.evidence_for(view=encoded.is_view)) for encoded in queries]
             log_prior = hints.log_prior(known, shares)
             preferred = None if favour is None else favour(known)
             chosen = await compute(partial(self._plans.choose, known, plan_index, choosing, log_prior, preferred))
-            rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
+            rows, log_mass, numbers = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
                 warnings.append(
                     f"the hint rooms was applied to the {len(rows)} most probable of {len(ready)} floor plans"
                 )
-        loaded = await self._plans.load(venue.tenant, rows)
+        loaded = await self._plans.load(tenant, rows)
         kept = [entry for entry in loaded if _height_is_possible(entry[1], form)]
         if len(kept) < len(loaded):
             left_out = len(loaded) - len(kept)
-            warnings = [*warnings, f"{left_out} floor plans have ceilings below camera_height_m and were not searched"]
+            warnings.append(f"{left_out} floor plans have ceilings below camera_height_m and were not searched")
         if not kept:
             if loaded:
                 check_height_m(loaded[0][1], query.camera_height.height_m)
-            raise VenueNotReadyError(venue.id, venue.plans, 0.0)
-        index_of = {row.plan_id: position for row, position in zip(rows, index, strict=True)}
-        searched_rows, records = [row for row, _, _ in kept], [record for _, record, _ in kept]
-        plans, grids = [record.plan for record in records], [grid for _, _, grid in kept]
-        merged = await compute(partial(MergedPlans.of, plans, grids, query.camera_height.height_m, gap_m))
-        return SearchedPlans(
-            rows=searched_rows,
-            records=records,
-            grids=grids,
-            merged=merged,
+            raise VenueNotReadyError(venue_id, len(ready), 0.0)
+        number_of = {row.plan_id: number for row, number in zip(rows, numbers, strict=True)}
+        searched = [row for row, _, _ in kept]
+        return LoadedPlans(
+            rows=searched,
+            records=[record for _, record, _ in kept],
+            grids=[grid for _, _, grid in kept],
             log_mass=log_mass,
-            area_share=sum(row.area_m2 for row in searched_rows) / float(ready.area_m2.sum()),
-            index=[index_of[row.plan_id] for row in searched_rows],
+            area_share=sum(row.area_m2 for row in searched) / float(ready.area_m2.sum()),
+            numbers=[number_of[row.plan_id] for row in searched],
+            hint_shares=shares,
             warnings=warnings,
-            anchor=venue.anchor,
-            hints=await compute(
-                partial(hints.in_merged_plans, searched_rows, plans, merged, shares, partly=log_mass is not None)
-            ),
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import httpx
@@ -12,9 +13,12 @@ import pytest
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Posterior, Support
+from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Candidate, Hints, Near, Query
 from lalaloc_core.localise.search.pipeline import Localisation
-from service.query.stated_pose import hint_warnings
+from lalaloc_core.render.sampling import PoseSet
+from service.query.ground import Ground
+from service.storage.records import PlanRecord
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 from tests.strategies import rectangle
 
@@ -121,11 +125,25 @@ def test_contradicted_hints_are_warned_about() -> None:
         signals={},
         hints_missed=("near", "rooms"),
     )
-    assert hint_warnings(hints, found, plan) == [
+    now = datetime.now(UTC)
+    record = PlanRecord(
+        id="p",
+        revision_id="r",
+        revision=1,
+        created_at=now,
+        updated_at=now,
+        report=None,
+        tenant="t",
+        plan=plan,
+        failure=None,
+    )
+    grid = PoseGrid(PoseSet(np.zeros((1, 2)), np.zeros(1, int)), None, np.ones((1, 8)), 1.0, 1.5)
+    ground = Ground.of_plan(record, grid, hints)
+    assert ground.hint_warnings(found) == [
         "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer is 5.0 m from there",
         "rooms is 'bedroom', 'bedroom-2', which the panorama contradicts: the answer lies in room 'hall'",
     ]
-    strict = hint_warnings(replace(hints, strict=True), replace(found, hints_missed=("near",)), plan)
-    assert strict == [
+    strict = Ground.of_plan(record, grid, replace(hints, strict=True))
+    assert strict.hint_warnings(replace(found, hints_missed=("near",))) == [
         "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer follows it because strict is set"
     ]

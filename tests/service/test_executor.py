@@ -13,9 +13,9 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
-from service.query import search_steps
+from service.query import executor
+from service.query.executor import StepRunner, completed
 from service.query.lpo_pool import LpoPool
-from service.query.search_steps import StepRunner, completed
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import warm_up_job
@@ -95,7 +95,7 @@ def test_failed_refinement_has_no_result(
     def fail(*_arguments: object, **_keywords: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
 
-    monkeypatch.setattr(search_steps, "refine_walls", fail)
+    monkeypatch.setattr(executor, "refine_walls", fail)
     assert runner_of(1).next(_search(job), None, lambda: 1e3) is None
     assert _missed(telemetry, "fault") == 1
     assert "pose refinement failed" in caplog.text
@@ -109,7 +109,7 @@ def test_refinement_stops_at_its_timeout(
 ) -> None:
     # A clock that passes a second whenever it is read.
     seconds = iter(range(1000))
-    monkeypatch.setattr(search_steps, "monotonic", lambda: float(next(seconds)))
+    monkeypatch.setattr(executor, "monotonic", lambda: float(next(seconds)))
     assert runner_of(1).next(_search(job), None, lambda: 1.5) is None
     assert _missed(telemetry, "deadline") == 1
 

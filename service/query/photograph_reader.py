@@ -1,0 +1,81 @@
+"""Reader of a query's photographs: from files to photographs, and from photographs to encoded queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
+from lalaloc_core.localise.query.stated_pose import known_heading
+from lalaloc_core.photograph import Photograph, StatedCamera
+from service.capacity.query_context import QueryContext
+from service.decoding.decoder import Decoder
+from service.query.executor import Executor
+from service.query.queries import Content
+from service.query.spots import Spot
+from service.schemas import LocaliseForm, PhotographForm, StatedHeading
+
+
+class PhotographReader:
+    """Decodes photographs in worker processes, and encodes them on the compute threads."""
+
+    def __init__(
+        self, *, decoder: Decoder, encoder: PhotographEncoder, executor: Executor, compass_tolerance_deg: float
+    ) -> None:
+        self._decoder = decoder
+        self._encoder = encoder
+        self._executor = executor
+        self._compass_tolerance_deg = compass_tolerance_deg
+
+    async def decode(
+        self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
+    ) -> list[Photograph]:
+        """Decode photographs one at a time, so that a query occupies one decoder.
+
+        Raises:
+            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
+        """
+        with context.clock.stage("decode"):
+            return [
+                await self._decoder.decode(content, stated, context.deadline, context.client) for content in contents
+            ]
+
+    def known_heading(
+        self, form: LocaliseForm | StatedHeading | PhotographForm, north: float | None, photograph: Photograph
+    ) -> KnownHeading:
+        """Return the heading in the request, else the photograph's compass heading if `north` is known, else none.
+
+        `north` is the azimuth of true north (radians) in the plan.
+        """
+        return known_heading(
+            north,
+            form.heading_deg,
+            form.heading_tolerance_deg,
+            photograph.compass_heading,
+            self._compass_tolerance_deg,
+        )
+
+    async def encode(
+        self,
+        spots: Sequence[Spot],
+        known: Sequence[KnownHeading],
+        heights: Sequence[CameraHeight],
+        context: QueryContext,
+    ) -> list[Query]:
+        """Encode photographs with their known headings one at a time, so that queries of others come in between.
+
+        Raises:
+            InvalidPhotographError: a photograph is no sphere, and the model has no encoder of views.
+            DeadlineExceededError: the deadline passed.
+        """
+        with context.clock.stage("encode"):
+            return [
+                await self._executor.compute(context, partial(self._encode, spot, heading, height))
+                for spot, heading, height in zip(spots, known, heights, strict=True)
+            ]
+
+    def _encode(self, spot: Spot, known: KnownHeading, height: CameraHeight) -> Query:
+        return self._encoder.query(
+            spot.photograph, known.heading, height, heading_tolerance=known.tolerance, others=spot.others
+        )

@@ -1,0 +1,180 @@
+"""Query about several photographs of one visit: photographs, ground, steps, answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import InvalidPoseError
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.query import CameraHeight, KnownHeading
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
+from lalaloc_core.localise.sequence import Motion
+from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
+from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.venue.merged_plans import GAP_M
+from lalaloc_core.photograph import Photograph
+from service.query.answers import compose_answer, compose_sequence_answer
+from service.query.executor import Executor
+from service.query.ground import Ground
+from service.query.grounds import Grounds, Site
+from service.query.photograph_reader import PhotographReader
+from service.query.queries import SequenceQuery
+from service.query.single_query import VENUE_CONFIG
+from service.query.spots import Spot
+from service.query.stated_pose import heights_of
+from service.schemas import SequenceAnswer
+from service.storage.records import PlanRecord, VenueRecord
+
+# Deviations of a measured motion that are possible.
+_REACH_STD = 5.0
+
+
+class SequenceSearch:
+    """Search of the places of several photographs of one visit."""
+
+    def __init__(
+        self,
+        *,
+        bundle: Bundle,
+        encoder: PhotographEncoder,
+        reader: PhotographReader,
+        grounds: Grounds,
+        executor: Executor,
+    ) -> None:
+        self._bundle = bundle
+        self._encoder = encoder
+        self._reader = reader
+        self._grounds = grounds
+        self._executor = executor
+
+    async def answer(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
+        """Localise photographs jointly.
+
+        Raises:
+            InvalidPoseError: a height per photograph is stated, and the model compares latents of one height.
+            LaLaLocError: see `Localiser.localise`.
+        """
+        form, context, count = query.form, query.context, len(query.contents)
+        if form.camera_heights_m is not None and not self._encoder.networks.predicts_profile:
+            raise InvalidPoseError(
+                "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
+                "give camera_height_m"
+            )
+        # Measured motions must not lead from one plan of a venue to its neighbour.
+        gap_m = GAP_M + max(map(_reach_m, form.steps(count)))
+        site = self._grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
+        photographs = await self._reader.decode(query.contents, form.stated_camera, context)
+        known = [
+            self._reader.known_heading(form.heading_of(index), site.north, photograph)
+            for index, photograph in enumerate(photographs)
+        ]
+        await site.wait(context)
+        heights = heights_of(form, site.height, count)
+        # A sphere shows all that other photographs from its spot could add.
+        one_query = form.motion == "turn" and not any(photograph.is_sphere for photograph in photographs)
+        turns = form.known_turns
+        if one_query and turns is not None:
+            ground, joint = await self._search_turn(query, photographs, known, turns, heights[0], site)
+            found = localised_turn(joint, turns)
+        else:
+            ground, found = await self._search_sequence(query, photographs, known, heights, site)
+            if one_query:
+                _, joint = await self._search_turn(query, photographs, known, found_turns(found), heights[0], ground)
+                found = judged_turn(found, joint)
+        timings_ms = self._executor.observe(context, found.stage)
+
+        def compose() -> SequenceAnswer:
+            spots = _spots(photographs, found, one_spot=form.motion == "turn")
+            answers = [
+                compose_answer(picture, ground, spot, heading, timings_ms=timings_ms, bundle=self._bundle)
+                for heading, picture, spot in zip(known, found.pictures, spots, strict=True)
+            ]
+            share = min(ground.share(picture) for picture in found.pictures)
+            answer = compose_sequence_answer(answers, found, form.steps(count), self._bundle.manifest, share)
+            extras: dict[str, object] = {"warnings": [*answer.warnings, *ground.warnings]}
+            if isinstance(where, VenueRecord):
+                extras["venue_id"] = where.id
+            return answer.model_copy(update=extras)
+
+        return await self._executor.compute(context, compose)
+
+    async def _search_sequence(
+        self,
+        query: SequenceQuery,
+        photographs: Sequence[Photograph],
+        known: Sequence[KnownHeading],
+        heights: Sequence[CameraHeight],
+        site: Site,
+    ) -> tuple[Ground, SequenceLocalisation]:
+        """Search the places of photographs that are linked by motions; return the ground, too."""
+        form, context = query.form, query.context
+        encoded = await self._reader.encode([Spot(photograph) for photograph in photographs], known, heights, context)
+        ground = await site.ground(encoded, context)
+        steps = localise_sequence_steps(
+            ground.plan,
+            ground.grid,
+            self._encoder.networks,
+            encoded,
+            form.steps(len(photographs)),
+            refine=form.refine,
+            top_k=form.top_k,
+            clock=context.clock,
+        )
+        return ground, await self._executor.run_search(steps, context)
+
+    async def _search_turn(
+        self,
+        query: SequenceQuery,
+        photographs: Sequence[Photograph],
+        known: Sequence[KnownHeading],
+        turns: Sequence[float],
+        height: CameraHeight,
+        place: Site | Ground,
+    ) -> tuple[Ground, Localisation]:
+        """Search the place of photographs from one spot with known headings (radians) minus that of the first.
+
+        They are one query that sees more azimuths, so that overlapping parts count once.
+        """
+        form, context = query.form, query.context
+        spot = Spot(photographs[0], list(zip(photographs[1:], turns[1:], strict=True)))
+        stated = (
+            replace(heading, heading=heading.heading - turn)
+            for heading, turn in zip(known, turns, strict=True)
+            if heading.heading is not None
+        )
+        encoded = await self._reader.encode([spot], [next(stated, known[0])], [height], context)
+        ground = place if isinstance(place, Ground) else await place.ground(encoded, context)
+        steps = localise_steps(
+            ground.plan,
+            ground.grid,
+            self._encoder.networks,
+            encoded[0],
+            refine=form.refine,
+            top_k=form.top_k,
+            # One search, whose stages are those of a sequence.
+            config=replace(LocaliseConfig() if ground.merged is None else VENUE_CONFIG, vdr_candidates=0),
+            clock=context.clock,
+        )
+        return ground, await self._executor.run_search(steps, context)
+
+
+def _reach_m(motion: Motion) -> float:
+    """Return the distance that a measured motion hardly exceeds."""
+    return 0.0 if motion.distance_m is None else motion.distance_m + _REACH_STD * motion.distance_std_m
+
+
+def _spots(photographs: Sequence[Photograph], found: SequenceLocalisation, *, one_spot: bool) -> list[Spot]:
+    """Return each photograph of a sequence, together with all others from its spot."""
+    if not one_spot:
+        return [Spot(photograph) for photograph in photographs]
+    headings = [photograph_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
+    return [
+        Spot(
+            photograph,
+            [(other, heading - headings[index]) for other, heading in zip(photographs, headings, strict=True)],
+        )
+        for index, photograph in enumerate(photographs)
+    ]

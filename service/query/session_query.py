@@ -1,0 +1,229 @@
+"""Query about the next photograph of a session: photograph, ground, steps, and the state for the one after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from sqlalchemy import Row
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.errors import InvalidStateError
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import PoseGrid
+from lalaloc_core.localise.query import KnownHeading
+from lalaloc_core.localise.tracking import TrackState
+from lalaloc_core.localise.tracking.filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.ground import Ground as TrackGround
+from lalaloc_core.localise.tracking.motion import WalkGraph
+from lalaloc_core.localise.tracking.passages import PlanOnLevel
+from service.capacity.bounded_cache import BoundedCache
+from service.errors import SessionOutdatedError
+from service.query.executor import Executor
+from service.query.geopose import geopose_at
+from service.query.ground import Ground, Place
+from service.query.grounds import Grounds, VenueSite
+from service.query.photograph_reader import PhotographReader
+from service.query.queries import TrackOutcome, TrackQuery
+from service.query.spots import Spot, read_view
+from service.schemas import (
+    ModelAnswer,
+    PathPoint,
+    PhotographForm,
+    Position,
+    RivalAnswer,
+    StoredPose,
+    TimingsAnswer,
+    TrackedPoseAnswer,
+)
+from service.storage.records import PlanRecord, VenueRecord
+
+# Poses of a plan whose belief is computed for every photograph; a belief has a weight for each pose and heading.
+MAX_POSES = 65_536
+# Memory of the links of pose grids.
+_GRAPH_BYTES = 64 * 2**20
+# Plans with at least this probability stay among those that are searched; log factor for plans one level from them.
+_STAYS_FROM, _NEXT_LEVEL = 1e-3, 5.0
+# Log factor of plans that stay, larger than any difference of log masses.
+_STAYS = 1e6
+_UNKNOWN = KnownHeading(None, 0.0, "searched")
+# Stages of tracking that answers report as a stage of a single query.
+_STAGES = {"retrieve": ("predict", "retrieve"), "lpo": ("lpo", "rank")}
+
+
+class SessionSearch:
+    """Search of the places of a session's camera; links of pose grids stay in memory."""
+
+    def __init__(
+        self,
+        *,
+        bundle: Bundle,
+        encoder: PhotographEncoder,
+        reader: PhotographReader,
+        grounds: Grounds,
+        executor: Executor,
+    ) -> None:
+        self._bundle = bundle
+        self._encoder = encoder
+        self._reader = reader
+        self._grounds = grounds
+        self._executor = executor
+        self._graphs = BoundedCache[str, WalkGraph](_GRAPH_BYTES, lambda graph: graph.nbytes)
+
+    async def answer(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
+        """Follow a camera to its next photograph.
+
+        Raises:
+            SessionOutdatedError: the model, or a plan of the venue, has changed since the session began.
+            LaLaLocError: see `Localiser.localise`.
+        """
+        form, document, context = query.form, query.document, query.context
+        (photograph,) = await self._reader.decode([query.content], form.stated_camera, context)
+        try:
+            state = None if query.state is None else TrackState.from_bytes(query.state)
+            # Hints are the prior of the first photograph.
+            hinted = document if state is None else None
+            site = self._grounds.site(where, document, hinted, max_poses=MAX_POSES)
+            known = self._reader.known_heading(form, site.north, photograph)
+            await site.wait(context)
+            (encoded,) = await self._reader.encode([Spot(photograph)], [_UNKNOWN], [site.height], context)
+            favour = None
+            if isinstance(site, VenueSite):
+                favour = _favour_of(site, {} if state is None else state.by_plan, query.session_id)
+            ground = await site.ground([encoded], context, favour)
+            levels = [row.level for row in site.ready] if isinstance(site, VenueSite) else []
+            steps = track_steps(
+                await self._executor.compute(context, partial(self._track_ground, ground, levels)),
+                self._encoder.networks,
+                state or TrackState.first(len(encoded.roll)),
+                encoded,
+                form.odometry,
+                known_heading=known,
+                hints=ground.hints,
+                top_k=document.top_k,
+                clock=context.clock,
+            )
+            tracked = await self._executor.run_search(steps, context)
+        except InvalidStateError as error:
+            raise SessionOutdatedError(query.session_id, str(error)) from error
+        timings_ms = self._executor.observe(context, tracked.stage)
+        return TrackOutcome(tracked.state.to_bytes(), self._stored(ground, tracked, Spot(photograph), form, timings_ms))
+
+    def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackGround:
+        """Return a ground with the ways through its plans; `levels` are those of all plans of the venue."""
+        if ground.merged is None or ground.loaded is None:
+            return TrackGround.of_plan(ground.plan, ground.grid, self._graph(ground.records[0], ground.grid))
+        loaded = ground.loaded
+        plans = [
+            PlanOnLevel(record.plan, row.level, anchor)
+            for record, row, anchor in zip(loaded.records, loaded.rows, ground.anchors, strict=True)
+        ]
+        graphs = [self._graph(record, grid) for record, grid in zip(loaded.records, loaded.grids, strict=True)]
+        keys = [row.revision_id for row in loaded.rows]
+        return TrackGround.of_levels(ground.merged, plans, graphs, keys, levels, ground.left_out)
+
+    def _graph(self, record: PlanRecord, grid: PoseGrid) -> WalkGraph:
+        """Return the links of a plan's pose grid."""
+        return self._graphs.get_or_make(
+            record.revision_id, lambda: WalkGraph.of(grid.poses, grid.layouts(record.plan), grid.step_m)
+        )
+
+    def _stored(
+        self,
+        ground: Ground,
+        found: Tracked,
+        spot: Spot,
+        form: PhotographForm,
+        timings_ms: dict[str, float],
+    ) -> StoredPose:
+        """Compose the part of the answer that is stored with the session; its path is the new pose alone."""
+        pose, query, best = found.pose, found.query, found.candidates[0]
+        place = ground.place(best)
+        scale = np.array([1.0, 1.0, math.degrees(1.0)])
+        heading_deg, room = heading_to_degrees(pose.heading), place.plan.rooms[pose.room_index]
+        position = Position(x_m=pose.x_m, y_m=pose.y_m)
+        camera_height_m = query.camera_height.height_m * math.exp(best.height_offset)
+        rivals = [
+            _rival(ground.place(rival), heading_to_degrees(photograph_heading(query, rival)), probability)
+            for rival, probability in zip(found.candidates, found.probability, strict=True)
+        ]
+        totals = {
+            name: sum(timings_ms.get(part, 0.0) for part in _STAGES.get(name, (name,)))
+            for name in TimingsAnswer.model_fields
+        }
+        answer = TrackedPoseAnswer(
+            number=pose.number,
+            position=position,
+            heading_deg=heading_deg,
+            room=room.name,
+            room_id=room.id,
+            floorplan_id=place.plan_id,
+            level=place.level,
+            covariance=(pose.covariance * np.outer(scale, scale)).tolist(),
+            probability=min(pose.probability, 1.0),
+            camera_height_m=camera_height_m,
+            candidates=rivals,
+            motion_contradicted=list(found.contradicted),
+            warnings=[*_warnings(found, form), *ground.warnings],
+            geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
+            view=read_view(spot),
+            timings_ms=TimingsAnswer(**totals),
+            model=ModelAnswer.of(self._bundle),
+        )
+        point = PathPoint(**{name: getattr(answer, name) for name in PathPoint.model_fields})
+        return StoredPose(mode=pose.mode, pose=answer, path=[point])
+
+
+def _rival(place: Place, heading_deg: float, probability: float) -> RivalAnswer:
+    room = place.plan.rooms[place.candidate.room_index]
+    return RivalAnswer(
+        position=Position(x_m=place.candidate.x_m, y_m=place.candidate.y_m),
+        heading_deg=heading_deg,
+        room=room.name,
+        room_id=room.id,
+        floorplan_id=place.plan_id,
+        level=place.level,
+        probability=min(probability, 1.0),
+    )
+
+
+def _warnings(found: Tracked, form: PhotographForm) -> list[str]:
+    """Return a warning for each contradicted component of the motion, and for odometry that is wrong repeatedly."""
+    warnings = [
+        f"{name} is {getattr(form, name) or 0.0:g}, which the photographs contradict by more than 4 standard deviations"
+        for name in found.contradicted
+    ]
+    return warnings + [
+        f"{name} contradicts at least 3 of the last 8 photographs: check its sign, unit and standard deviation"
+        for name in found.state.suspected
+    ]
+
+
+def _favour_of(
+    site: VenueSite, by_plan: Mapping[str, float], session_id: str
+) -> Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]]:
+    """Return a function of the log factors by which a session prefers plans.
+
+    These are the plans of its belief (`by_plan`, by revision), and those one level from them.
+
+    Raises:
+        SessionOutdatedError: a plan with a share of the belief was replaced.
+    """
+    if not by_plan.keys() <= {row.revision_id for row in site.ready}:
+        raise SessionOutdatedError(session_id, f"a floor plan of venue '{site.id}' was replaced")
+    levels = np.unique([row.level for row in site.ready])
+
+    def favour(rows: Sequence[Row[Any]]) -> Float[np.ndarray, "p"]:
+        share = np.array([by_plan.get(row.revision_id, 0.0) for row in rows])
+        storey = np.searchsorted(levels, [row.level for row in rows])
+        kept = share >= _STAYS_FROM
+        beside = np.isin(storey, [storey[kept] - 1, storey[kept] + 1])
+        return np.where(kept, _STAYS * (1.0 + share), np.where(beside, _NEXT_LEVEL, 0.0))
+
+    return favour

@@ -1,0 +1,144 @@
+"""Query about one photograph: photograph, ground, steps, answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
+from lalaloc_core.photograph import Photograph
+from service.decoding.decoder import Decoder
+from service.query.answers import compose_answer, posterior_answer
+from service.query.executor import Executor, completed
+from service.query.ground import Ground
+from service.query.grounds import Grounds
+from service.query.photograph_reader import PhotographReader
+from service.query.queries import PhotographQuery, PictureRequest, Where
+from service.query.spots import Spot
+from service.schemas import LocaliseAnswer
+from service.storage.records import PlanRecord
+
+# Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
+VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
+# Names of the heading's sources in pictures.
+_SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """An answer, and the photograph, search result and ground behind it."""
+
+    answer: LocaliseAnswer
+    photograph: Photograph
+    found: Localisation
+    ground: Ground
+
+
+class SingleSearch:
+    """Search of the place of one photograph."""
+
+    def __init__(
+        self,
+        *,
+        bundle: Bundle,
+        encoder: PhotographEncoder,
+        decoder: Decoder,
+        reader: PhotographReader,
+        grounds: Grounds,
+        executor: Executor,
+    ) -> None:
+        self._bundle = bundle
+        self._encoder = encoder
+        self._decoder = decoder
+        self._reader = reader
+        self._grounds = grounds
+        self._executor = executor
+
+    async def answer(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
+        """Localise a photograph; see `Localiser.localise` for the errors."""
+        return (await self._search(where, query)).answer
+
+    async def answer_and_draw(
+        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
+    ) -> tuple[LocaliseAnswer, bytes]:
+        """Localise a photograph and draw the answer; see `Localiser.localise_and_draw` for the errors."""
+        outcome = await self._search(record, query)
+        with query.context.clock.stage("draw"):
+            picture = await self._draw(outcome, query, request)
+        self._executor.observe_stage(query.context, "draw")
+        return outcome.answer, picture
+
+    async def _search(self, where: Where, query: PhotographQuery) -> _Outcome:
+        form, context = query.form, query.context
+        site = self._grounds.site(where, form, form)
+        # Decode first, so that an unreadable picture is refused without waiting for plans.
+        (photograph,) = await self._reader.decode([query.content], form.stated_camera, context)
+        known = self._reader.known_heading(form, site.north, photograph)
+        await site.wait(context)
+        spot = Spot(photograph)
+        (encoded,) = await self._reader.encode([spot], [known], [site.height], context)
+        ground = await site.ground([encoded], context)
+        steps = localise_steps(
+            ground.plan,
+            ground.grid,
+            self._encoder.networks,
+            encoded,
+            refine=form.refine,
+            top_k=form.top_k,
+            config=None if ground.merged is None else VENUE_CONFIG,
+            clock=context.clock,
+            hints=ground.hints,
+        )
+
+        def compose(found: Localisation) -> _Outcome:
+            answer = compose_answer(
+                found,
+                ground,
+                spot,
+                known,
+                timings_ms=self._executor.observe(context, found.stage),
+                bundle=self._bundle,
+                warnings=[*ground.hint_warnings(found), *ground.warnings],
+            )
+            return _Outcome(
+                answer.model_copy(update=self._extras(where, query, ground, found)), photograph, found, ground
+            )
+
+        return await self._executor.run_search(completed(steps, compose), context)
+
+    def _extras(self, where: Where, query: PhotographQuery, ground: Ground, found: Localisation) -> dict[str, object]:
+        """Return fields of the answer that not every answer has."""
+        if isinstance(where, PlanRecord):
+            wanted = query.form.include == "posterior"
+            return {"posterior": posterior_answer(ground, found.posterior)} if wanted else {}
+        model = self._bundle.manifest.confidence_for(view=found.query.is_view)
+        confidence = found.confidence(model, ground.share(found))
+        plans = ground.plan_probabilities(found, None if confidence is None else confidence.fit)
+        return {"venue_id": where.id, "plans": plans[: query.form.top_k]}
+
+    async def _draw(self, outcome: _Outcome, query: PhotographQuery, request: PictureRequest) -> bytes:
+        context, picture, ground = query.context, None, outcome.ground
+        if request.picture != "plan":
+            assert not isinstance(query.content, Photograph)
+            # Decode again, because the encoder's input is too small for a picture.
+            picture = await self._decoder.picture(
+                query.content,
+                query.form.stated_camera,
+                context.deadline,
+                context.client,
+                is_sphere=outcome.photograph.is_sphere,
+                max_size=PHOTOGRAPH_SIZE,
+            )
+
+        def draw() -> str:
+            model = self._bundle.manifest.confidence_for(view=outcome.found.query.is_view)
+            source = _SOURCES[outcome.answer.heading_source]
+            drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, view=outcome.photograph)
+            return draw_answer(drawn, picture, request.picture, rooms=request.rooms)
+
+        svg = await self._executor.compute(context, draw)
+        if request.as_png:
+            return await self._decoder.rasterise(svg, context.deadline, context.client)
+        return svg.encode()
