@@ -149,18 +149,18 @@ class RemoteLocaliser:
 
     async def localise(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
         """See `Localiser.localise`, for the errors as well."""
-        return self._observed(await self._call("localise", where, query.context, query))
+        return self._count(await self._call("localise", where, query.context, query))
 
     async def localise_and_draw(
         self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.localise_and_draw`."""
         found, drawn = await self._call("localise_and_draw", record, query.context, query, request)
-        return self._observed(found), drawn
+        return self._count(found), drawn
 
     async def localise_sequence(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
         """See `Localiser.localise_sequence`."""
-        return self._observed(await self._call("localise_sequence", where, query.context, query))
+        return self._count(await self._call("localise_sequence", where, query.context, query))
 
     async def track(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
         """See `Localiser.track`."""
@@ -200,7 +200,7 @@ class RemoteLocaliser:
                 return outcome.value
         raise DeadlineExceededError(self._settings.requests.request_deadline_s)
 
-    def _observed(self, answer: AnswerT) -> AnswerT:
+    def _count(self, answer: AnswerT) -> AnswerT:
         """Count an answer in the metrics of this process, which are scraped; return it."""
         self._telemetry.observe_answer(answer.timings_ms.model_dump(exclude_none=True), answer.stage)
         return answer

@@ -31,7 +31,7 @@ FoundT = TypeVar("FoundT")
 SearchSteps = Generator[RefinementJob | SequenceJob | None, Any, T]
 
 
-def completed(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> SearchSteps[T]:
+def finish_with(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> SearchSteps[T]:
     """Return the steps of a search that end with `complete(result)`, on the thread of the search."""
     return complete((yield from steps))
 

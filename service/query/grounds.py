@@ -58,7 +58,7 @@ class Grounds:
         self.executor = executor
         self.search = search
 
-    def site(
+    async def site(
         self,
         where: Where,
         form: CameraFields,
@@ -81,10 +81,14 @@ class Grounds:
         Raises:
             InvalidPoseError: a stated height is impossible in the plan.
             InvalidHintError: the hints do not match the plan, or the venue has no frame for a point.
+            NoPlanNearbyError: no plan is near the place.
         """
         if isinstance(where, PlanRecord):
             return PlanSite(self, where, form, hinted, heights_m)
         anchor = where.anchor if isinstance(where, VenueRecord) else None
+        if isinstance(where, Nearby):
+            # Before the photograph is decoded, because there may be no plan to search.
+            await self.members(where)
         hints = VenueHints(anchor=anchor) if hinted is None else VenueHints.from_form(hinted, anchor)
         return VenueSite(self, where, form, hints, anchor, gap_m, max_poses)
 

@@ -65,7 +65,7 @@ class SequenceSearch:
             )
         # Measured motions must not lead from one plan of a venue to its neighbour.
         gap_m = GAP_M + max(map(_reach_m, form.steps(count)))
-        site = self._grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
+        site = await self._grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
         photographs = await self._reader.decode(query.contents, form.stated_camera, context)
         known = [
             self._reader.known_heading(form.heading_of(index), site.north, photograph)

@@ -89,7 +89,7 @@ class SessionSearch:
             state = None if query.state is None else TrackState.from_bytes(query.state)
             # Hints are the prior of the first photograph.
             hinted = document if state is None else None
-            site = self._grounds.site(where, document, hinted, max_poses=MAX_POSES)
+            site = await self._grounds.site(where, document, hinted, max_poses=MAX_POSES)
             known = self._reader.known_heading(form, site.north, photograph)
             await site.wait(context)
             (encoded,) = await self._reader.encode([Spot(photograph)], [_UNKNOWN], [site.height], context)

@@ -11,7 +11,7 @@ from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, 
 from lalaloc_core.photograph import Photograph
 from service.decoding.decoder import Decoder
 from service.query.answers import compose_answer, posterior_answer
-from service.query.executor import Executor, completed
+from service.query.executor import Executor, finish_with
 from service.query.ground import Ground
 from service.query.grounds import Grounds
 from service.query.photograph_reader import PhotographReader
@@ -72,7 +72,7 @@ class SingleSearch:
 
     async def _search(self, where: Where, query: PhotographQuery) -> _Outcome:
         form, context = query.form, query.context
-        site = self._grounds.site(where, form, form)
+        site = await self._grounds.site(where, form, form)
         # Decode first, so that an unreadable picture is refused without waiting for plans.
         (photograph,) = await self._reader.decode([query.content], form.stated_camera, context)
         known = self._reader.known_heading(form, site.north, photograph)
@@ -106,7 +106,7 @@ class SingleSearch:
                 answer.model_copy(update=self._extras(where, query, ground, found)), photograph, found, ground
             )
 
-        return await self._executor.run_search(completed(steps, compose), context)
+        return await self._executor.run_search(finish_with(steps, compose), context)
 
     def _extras(self, where: Where, query: PhotographQuery, ground: Ground, found: Localisation) -> dict[str, object]:
         """Return fields of the answer that not every answer has."""

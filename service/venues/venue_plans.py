@@ -204,7 +204,7 @@ def most_poses(query: Query, max_poses: int) -> int:
     return min(max_poses, _MAX_COMPARISONS // (len(query.roll) * len(query.camera_height.offsets)))
 
 
-def not_excluded(ready: PlanList, log_prior: Float[np.ndarray, "p"]) -> PlanList:
+def possible_plans(ready: PlanList, log_prior: Float[np.ndarray, "p"]) -> PlanList:
     """Return the plans with a finite log prior.
 
     Raises:

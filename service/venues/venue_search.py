@@ -26,7 +26,7 @@ from service.storage.records import PlanRecord
 from service.venues.plan_indices import IndexSource
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
-from service.venues.venue_plans import VenuePlans, not_excluded
+from service.venues.venue_plans import VenuePlans, possible_plans
 
 # Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
@@ -140,7 +140,7 @@ class VenueSearch:
         rows, log_mass, numbers = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
-            possible = not_excluded(ready, hints.log_prior(ready, shares))
+            possible = possible_plans(ready, hints.log_prior(ready, shares))
             whole_venue = venue_id if possible is ready else None
             # Another query may be making the index, in the time that it has itself.
             async with context.bounded():

@@ -49,7 +49,7 @@ def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_
         (3, "3.jpg", 200),
     ]
     assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-panorama"
-    assert "LALALOC_MAX_PANORAMA_BYTES" in lines[2]["problem"]["detail"]
+    assert "LALALOC_MAX_PHOTOGRAPH_BYTES" in lines[2]["problem"]["detail"]
     alone = localise(client, plan_id, panorama, refine="none", heading_deg=90).json()
     for line in (lines[0], lines[3]):
         assert line["answer"]["position"] == alone["position"]

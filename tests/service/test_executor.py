@@ -14,7 +14,7 @@ from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
 from service.query import executor
-from service.query.executor import StepRunner, completed
+from service.query.executor import StepRunner, finish_with
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
@@ -118,4 +118,4 @@ def test_what_follows_a_search_gets_its_result(runner_of: Callable[[int], StepRu
     def complete(found: RefinementResult | None) -> str:
         return "refined" if found is not None else "not refined"
 
-    assert runner_of(1).next(completed(_search(job), complete), None, lambda: 1e3) == "refined"
+    assert runner_of(1).next(finish_with(_search(job), complete), None, lambda: 1e3) == "refined"

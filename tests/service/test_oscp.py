@@ -182,7 +182,7 @@ def test_invalid_and_large_pictures_are_refused(start_app: StartApp, tmp_path: P
         picture = client.post("/geopose", params=params, json=oscp_request(b"no picture"))
         assert_problem(picture, 422, "invalid-panorama")
         large = client.post("/geopose", params=params, json=oscp_request(bytes(2001)))
-        assert "LALALOC_MAX_PANORAMA_BYTES" in assert_problem(large, 413, "upload-too-large")["detail"]
+        assert "LALALOC_MAX_PHOTOGRAPH_BYTES" in assert_problem(large, 413, "upload-too-large")["detail"]
         larger = client.post("/geopose", params=params, json=oscp_request(bytes(90_000)))
         assert_problem(larger, 413, "upload-too-large")
         both = client.post("/geopose", params={**params, "venue_id": "v"}, json=oscp_request(b"x"))

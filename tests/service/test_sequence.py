@@ -141,9 +141,9 @@ def test_long_sequence_is_localised(client: httpx.Client, plan_id: str, pictures
 @pytest.mark.parametrize(
     ("count", "fields", "field", "message"),
     [
-        (1, {}, "photo", "is given 1 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PANORAMAS)"),
+        (1, {}, "photo", "is given 1 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PHOTOGRAPHS)"),
         (31, {}, "photo", "is given 31 times, 2 to 30 are needed"),
-        (40, {}, "photo", "is given more than 30 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PANORAMAS)"),
+        (40, {}, "photo", "is given more than 30 times, 2 to 30 are needed (LALALOC_MAX_SEQUENCE_PHOTOGRAPHS)"),
         (3, {"motions": [MOTION]}, "motions", "has 1 items, 3 photographs need 2"),
         (2, {"headings_deg": [1.0]}, "headings_deg", "has 1 items, 2 photographs need 2"),
         (2, {"camera_heights_m": [1.5]}, "camera_heights_m", "has 1 items, 2 photographs need 2"),

@@ -201,13 +201,13 @@ def test_sessions_expire_and_are_limited(
 def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
-        store = Store(database_of(tmp_path), claim_s=0.5)
+        store = Store(database_of(tmp_path), claim_s=2.0)
         store.sessions.claim("default", session_id, None)
         picture = encode_picture(512, 256, "JPEG")
         busy = send(client, session_id, picture)
         assert_problem(busy, 409, "session-busy")
         assert busy.headers["retry-after"] == "1"
-        sleep(0.6)
+        sleep(2.1)
         assert send(client, session_id, picture, number=1).status_code == 200
         assert_problem(client.get(f"/sessions/{'0' * 32}"), 404, "unknown-session")
         store.close()

@@ -52,6 +52,15 @@ def test_removed_setting_is_ignored_with_a_warning(
     assert "LALALOC_DECODE_QUEUE is ignored" in caplog.text
 
 
+def test_earlier_name_of_a_setting_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LALALOC_MAX_SEQUENCE_PANORAMAS", "7")
+    assert Settings.load().photographs.max_sequence_photographs == 7
+    assert Settings(max_panorama_bytes=9).value("max_panorama_bytes") == 9
+    monkeypatch.setenv("LALALOC_MAX_SEQUENCE_PHOTOGRAPHS", "7")
+    with pytest.raises(ConfigError, match="LALALOC_MAX_SEQUENCE_PANORAMAS is the earlier name of"):
+        Settings.load()
+
+
 def test_settings_cannot_change_once_read() -> None:
     settings = Settings.load()
     with pytest.raises(ValidationError):
