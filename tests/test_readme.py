@@ -9,11 +9,14 @@ import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import lalaloc_client
+from examples.launch import running_service
 from lalaloc_core.cli import main
 from lalaloc_core.cli import main as lalaloc
 from lalaloc_core.floorplan import FloorPlan
@@ -24,6 +27,7 @@ from service.schemas.oscp import OscpAnswer
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/**/*.md"))
+README = PAGES[0].read_text(encoding="utf-8")
 TUTORIAL = (ROOT / "docs" / "getting-started.md").read_text(encoding="utf-8")
 TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
@@ -130,6 +134,33 @@ def test_tutorial_leads_to_its_answer(
     assert kitchen["position"]["x_m"] == pytest.approx(7.1 + 0.5, abs=0.2)
     assert kitchen["position"]["y_m"] == pytest.approx(2.2 + 1.0, abs=0.2)
     assert bedroom["room"] != kitchen["room"]
+
+
+def test_readme_begins_with_a_true_answer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    [arguments, *_] = re.findall(r"^\.venv/bin/lalaloc (.*)$", README, re.MULTILINE)
+    assert main(shlex.split(arguments)) == 0
+    [expected] = re.findall(r"```\n(photograph .*?)```", README, re.DOTALL)
+    table = capsys.readouterr().out
+    assert table.split()[:11] == expected.split()[:11]
+    np.testing.assert_allclose(_numbers(table)[:2], _numbers(expected)[:2], atol=0.1)
+
+
+def test_session_of_the_readme_has_its_result(tmp_path: Path) -> None:
+    [session] = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
+    *statements, question = re.findall(r"^>>> (.*)$", session, re.MULTILINE)
+    [expected] = re.findall(r"^\(.*$", session, re.MULTILINE)
+    with running_service(0, {"LALALOC_DATA_DIR": str(tmp_path)}) as service:
+        names: dict[str, Any] = {}
+        for statement in statements:
+            exec(
+                statement.replace("http://127.0.0.1:8000", service.url).replace("examples/", f"{ROOT}/examples/"), names
+            )
+    room, position, confidence = eval(question, names)
+    expected_room, expected_position, expected_confidence = eval(expected, vars(lalaloc_client))
+    assert room == expected_room
+    assert (position.x_m, position.y_m) == pytest.approx((expected_position.x_m, expected_position.y_m), abs=0.1)
+    assert confidence == pytest.approx(expected_confidence, abs=0.05)
 
 
 def _numbers(table: str) -> list[float]:
