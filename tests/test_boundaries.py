@@ -127,6 +127,7 @@ TORCH_PACKAGES = (
     "lalaloc_core.learn.data.synthetic",
     "lalaloc_core.learn.training",
     "lalaloc_core.learn.export",
+    "lalaloc_core.evaluate.calibrate",
     "lalaloc_core.evaluate.methods",
     "lalaloc_core.evaluate.runs",
     "lalaloc_core.evaluate.report",

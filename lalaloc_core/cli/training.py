@@ -8,7 +8,6 @@ import dataclasses
 import json
 import os
 import platform
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +122,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout, train_views
+    from lalaloc_core.learn.training.run import train_stage
 
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -171,15 +170,17 @@ def _train(arguments: argparse.Namespace) -> None:
         photographs=arguments.photographs,
         segmenter=arguments.teacher,
     )
-    train: Callable[..., Any] = {
-        "layout": train_layout,
-        "image": train_image,
-        "view": train_views,
-        "end-to-end": train_end_to_end,
-    }[arguments.stage]
-    optional = {name: getattr(arguments, name) for name in ("init_from", "layout_from")}
-    given = {name: value for name, value in optional.items() if value is not None}
-    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **given)
+    train_stage(
+        arguments.stage,
+        config,
+        arguments.out,
+        device=device,
+        data=data,
+        workers=arguments.workers,
+        resume=arguments.resume,
+        init_from=arguments.init_from,
+        layout_from=arguments.layout_from,
+    )
 
 
 def _keep_freed_memory() -> None:

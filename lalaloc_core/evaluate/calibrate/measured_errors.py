@@ -20,6 +20,7 @@ from lalaloc_core.bundle import Bundle, Manifest, PredictionErrors, write_manife
 from lalaloc_core.bundle.prediction_errors import LEVELS
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
+from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Split
@@ -27,7 +28,7 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches
+from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches, errors_of
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import Refiner, localise
@@ -115,6 +116,18 @@ def predicted_shares(
             (outcomes,) = search.draws(spot.place, name, draws, rng)
             found[name].append(float(np.mean([outcome.found for outcome in outcomes])))
     return {name: np.array(values) for name, values in found.items()}
+
+
+def calibrate_errors(folder: Path, homes: int) -> Errors:
+    """Measure the errors of a bundle's predictions on generated validation homes, and store them in the bundle.
+
+    Raises:
+        InvalidInputError: the bundle has no encoder of views.
+    """
+    bundle = Bundle.open(folder)
+    if bundle.manifest.view is None:
+        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --errors")
+    return errors_of(measure_errors(bundle, outcomes_of(bundle, homes, "validation", None)).manifest)
 
 
 def measure_errors(bundle: Bundle, outcomes: Sequence[Outcome]) -> Bundle:
