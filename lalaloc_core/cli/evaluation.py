@@ -11,8 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
-from lalaloc_core.cli.arguments import count, positive, processes
+from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
@@ -28,7 +27,7 @@ def add_commands(commands: Any) -> None:
     evaluate = commands.add_parser(
         "evaluate", help="localise the queries of a data set or of generated homes, and score the answers"
     )
-    evaluate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(evaluate, "--bundle")
     evaluate.add_argument(
         "--method",
         default="lalaloc",
@@ -62,8 +61,7 @@ def add_commands(commands: Any) -> None:
     )
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
     evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
-    evaluate.add_argument("--skip-bad", action="store_true", help="skip and list unusable samples")
-    evaluate.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
+    add_options(evaluate, "--skip-bad", "--workers")
     evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; an existing run is continued")
     evaluate.add_argument("--json", action="store_true", help="print all figures as JSON")
     evaluate.set_defaults(run=_evaluate)
@@ -92,7 +90,7 @@ def add_commands(commands: Any) -> None:
     calibrate = commands.add_parser(
         "calibrate", help="fit a bundle's matching weights and confidence on generated validation homes"
     )
-    calibrate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(calibrate, "--bundle")
     _generator_arguments(calibrate)
     calibrate.add_argument(
         "--openings-weight",
@@ -141,10 +139,7 @@ def _generator_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--homes", type=count, default=100, help="number of generated homes, 4 queries each (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="random seed of generated homes (default: %(default)s)")
-    parser.add_argument(
-        "--textures", type=Path, metavar="DIR", help="material pictures for generated homes (default: procedural)"
-    )
+    add_options(parser, "--seed", "--textures")
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.cli.options import add_options
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -41,7 +42,7 @@ def add_commands(commands: Any) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run, shared by both stages"
     )
     train.add_argument("--data", type=Path, metavar="DIR", help="data set (default: homes generated during training)")
-    train.add_argument("--skip-bad", action="store_true", help="skip unusable files and log each once")
+    add_options(train, "--skip-bad", "--textures")
     train.add_argument("--minutes", type=float, help="training time, instead of --steps")
     train.add_argument("--steps", type=int, help="number of updates (default: the preset's)")
     train.add_argument("--seed", type=int, help="random seed (default: the preset's)")
@@ -91,7 +92,6 @@ def add_commands(commands: Any) -> None:
         metavar="N",
         help="maximum number of homes or scenes for validation (default: %(default)s)",
     )
-    train.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     train.set_defaults(run=_train)
 
     export = commands.add_parser("export", help="export a trained run to a model bundle")

@@ -90,8 +90,7 @@ def bench_rendering(bundle: Bundle) -> dict[str, float]:
     }
 
 
-_QUERIES = 5
-_GRID_STEP_M = 0.5
+_METHOD_QUERIES = 5
 
 
 def bench_methods(bundle: Bundle) -> dict[str, Any]:
@@ -100,7 +99,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
     The plan's wall cloud (ICP) and pose grid (LaLaLoc) are prepared before and not counted.
     """
     home = home_of_area(100.0)
-    shots = sample_shots(home, _QUERIES + 1, np.random.default_rng(2), "full")
+    shots = sample_shots(home, _METHOD_QUERIES + 1, np.random.default_rng(2), "full")
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(2)))
     grid = pose_grid(home.plan, _GRID_STEP_M)
     questions = [
@@ -127,7 +126,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
     return {
         "area_m2": home.plan.area_m2,
         "grid_poses": len(grid),
-        "queries": _QUERIES,
+        "queries": _METHOD_QUERIES,
         "icp_seconds": icp,
         "lalaloc_seconds": lalaloc,
         "icp_to_lalaloc_ratio": icp / lalaloc,

@@ -17,16 +17,18 @@ from jaxtyping import UInt8
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
-from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.encoders import Encoders
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
-from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, Refiner, StageClock, localise
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, Refiner, StageClock, localise
+from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
@@ -146,6 +148,40 @@ def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
     """Return LPO in this process. Sets torch to one thread, because its tensors are too small to share."""
     torch.set_num_threads(1)
     return PoseRefiner.from_bundle(bundle, config).refine
+
+
+# Step of the grids of `LocalModel`.
+GRID_STEP_M = 0.5
+
+
+class LocalModel:
+    """Model that localises photographs in this process, on one thread."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.encoder = PhotographEncoder(bundle, threads=1)
+        self.networks = self.encoder.networks
+        self.refiner = local_refiner(bundle)
+
+    def grid(self, plan: FloorPlan, camera_height_m: float) -> PoseGrid:
+        """Compute the pose grid of a plan, with latents if the model compares only these."""
+        latents = not self.networks.predicts_profile
+        return build_grid(plan, self.networks, step_m=GRID_STEP_M, camera_height_m=camera_height_m, latents=latents)
+
+    def open(self, content: bytes, stated: StatedCamera | None = None) -> Photograph:
+        """Read a photograph in the sizes that the model needs.
+
+        Raises:
+            InvalidPhotographError: the photograph cannot be read.
+        """
+        manifest = self.bundle.manifest
+        return open_photograph(
+            content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
+        )
+
+    def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
+        """Search a plan."""
+        return localise(plan, grid, self.networks, query, refiner=self.refiner)
 
 
 def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:

@@ -7,19 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
-from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
 
 # Five homes and five offices, each with and without openings; the fit of the confidence has other ones.
 _EACH, _HOMES, _OFFICES = 5, (2, 0), 77
-_GRID_STEP_M = 0.5
 # Confidence above which a photograph counts as accepted.
 ACCEPTED = 0.5
 
@@ -40,16 +36,15 @@ def foreign_confidences(
     """
     if bundle.manifest.confidence is None:
         return []
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    model = LocalModel(bundle)
     height, size = CameraHeight(CAMERA_HEIGHT_M), (bundle.manifest.image_height, bundle.manifest.image_width)
     images = [photograph.photograph.image(*size) for photograph in photographs]
     found = []
     for plan in plans:
-        latents = not encoders.predicts_profile
-        grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=CAMERA_HEIGHT_M, latents=latents)
+        grid = model.grid(plan, CAMERA_HEIGHT_M)
         for photograph, image in zip(photographs, images, strict=True):
             heading = photograph.outlines[0].main_direction if heading_known else None
-            answer = localise(plan, grid, encoders, encoders.query(image, heading, height), refiner=refiner)
+            answer = model.localise(plan, grid, model.networks.query(image, heading, height))
             confidence = answer.confidence(bundle.manifest.confidence)
             if confidence is not None:
                 found.append(confidence.position)

@@ -142,8 +142,6 @@ class ViewPhotograph:
 
     def open(self, size: PatchSize) -> Photograph:
         """Read the photograph as the service reads a file."""
-        content = io.BytesIO()
-        Image.fromarray(self._pixels()).save(content, "JPEG", quality=_JPEG_QUALITY)
         tilted = self.stated == "tilt"
         stated = StatedCamera(
             projection="perspective",
@@ -151,7 +149,7 @@ class ViewPhotograph:
             pitch_deg=math.degrees(self.pitch) if tilted else None,
             roll_deg=math.degrees(self.roll) if tilted else None,
         )
-        return open_photograph(content.getvalue(), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
+        return open_photograph(encode_jpeg(self._pixels()), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return the whole sphere at the given size, turned to the view."""
@@ -165,6 +163,13 @@ class ViewPhotograph:
     def _pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         camera = Perspective.of_hfov(*_VIEW_SIZE, math.radians(self.field_deg))
         return cut_view(self.sphere.pixels, camera, azimuth=self.azimuth, pitch=self.pitch, roll=self.roll)
+
+
+def encode_jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Return a picture as a JPEG file."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, "JPEG", quality=_JPEG_QUALITY)
+    return content.getvalue()
 
 
 def cut_view(
