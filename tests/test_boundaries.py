@@ -53,7 +53,6 @@ LAYERS = {
     "lalaloc_core.importers": 6,
     # Training.
     "lalaloc_core.learn.metrics": 1,
-    "lalaloc_core.learn.azimuth_metrics": 1,
     "lalaloc_core.learn.synth.records": 2,
     "lalaloc_core.learn.synth.homes": 2,
     "lalaloc_core.learn.synth": 3,

@@ -32,7 +32,11 @@ from lalaloc_core.evaluate.calibrate.parameter_fits import (
     fit_matching_weights,
     with_heading_doubt,
 )
-from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
+from lalaloc_core.evaluate.methods.method import (
+    Pose,
+    PredictedCandidate,
+)
+from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans

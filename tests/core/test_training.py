@@ -24,7 +24,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, sources
 from lalaloc_core.learn.training import layout_stage as layout_stage_module
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches

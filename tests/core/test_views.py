@@ -18,7 +18,7 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.export.run import export_into
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.training import losses

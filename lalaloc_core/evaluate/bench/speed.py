@@ -26,8 +26,7 @@ from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache
 from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import TEST, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, Home, home_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.encoders import Encoders

@@ -19,7 +19,8 @@ from scipy import optimize
 from lalaloc_core.bundle import ConfidenceModel, LogisticModel, MatchingWeights
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M, marginal_information
 

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
@@ -106,7 +106,9 @@ class LaLaLoc:
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
             candidates=tuple(
-                FoundCandidate(pose=found_pose(found.query, candidate), terms=candidate.terms, probability=probability)
+                PredictedCandidate(
+                    pose=found_pose(found.query, candidate), terms=candidate.terms, probability=probability
+                )
                 for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
             ),
             retrieved=grid_index(grid, found.best["retrieval"]),
@@ -218,15 +220,10 @@ def encode(
     return Query(latents, rolls, 0.0, heading_known=question.heading_known, camera_height=height, profile=profile)
 
 
-def found_pose(query: Query, candidate: Candidate) -> FoundPose:
+def found_pose(query: Query, candidate: Candidate) -> Pose:
     """Return a candidate as a pose of the panorama."""
-    return FoundPose(
-        x_m=candidate.x_m,
-        y_m=candidate.y_m,
-        room_index=candidate.room_index,
-        heading=photograph_heading(query, candidate),
-        distance=candidate.cost,
-    )
+    heading = photograph_heading(query, candidate)
+    return Pose.at(candidate.position_m, candidate.room_index, heading, candidate.cost)
 
 
 def grid_index(grid: PoseGrid, candidate: Candidate) -> int:

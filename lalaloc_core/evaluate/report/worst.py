@@ -18,17 +18,31 @@ from jaxtyping import Float
 from PIL import Image
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
+from lalaloc_core.conventions import TWO_PI, column_azimuths
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
-from lalaloc_core.evaluate.report.pictures import FOUND_COLOUR, PREDICTED_COLOUR, TRUE_COLOUR, layout_lines
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.report.pictures import (
+    FOUND_COLOUR,
+    PER_SHEET,
+    PICTURE_HEIGHT,
+    PICTURE_WIDTH,
+    PREDICTED_COLOUR,
+    TRUE_COLOUR,
+    Thumbnail,
+    draw_sheet,
+    layout_lines,
+)
 from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
-from lalaloc_core.evaluate.report.sheets import PER_SHEET, PICTURE_HEIGHT, PICTURE_WIDTH, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.tables import distance, percent
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.predictions import (
+    Prediction,
+    RunFolder,
+    RunInfo,
+)
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Camera, Scene
@@ -256,8 +270,8 @@ def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> f
     """Return the matching cost of a pose."""
     assert query.profile is not None
     config = MatchingConfig()
-    poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
-    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
+    poses = PoseSet(pose.position_m[None], np.array([pose.room_index]))
+    heading = np.array([pose.heading - query.roll[0]])
     layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
     cost, _ = MatchingCost(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
     return float(cost[0, 0])
@@ -272,6 +286,6 @@ def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
 
 def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
     """Return the log wall profile (m) of a pose, in the frame of the query's first hypothesis."""
-    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
-    position_m, room = np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index])
+    heading = np.array([pose.heading - query.roll[0]])
+    position_m, room = pose.position_m[None], np.array([pose.room_index])
     return np.log(profiles_at(scene.plan, position_m, room, heading, columns))

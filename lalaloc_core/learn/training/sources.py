@@ -21,7 +21,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

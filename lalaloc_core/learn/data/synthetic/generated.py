@@ -16,7 +16,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
