@@ -167,8 +167,6 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
 
         info = RunInfo(
             label="all stages",
-            method="lalaloc",
-            kind="panorama",
             dataset=dataset.description,
             split="test",
             data=str(root),

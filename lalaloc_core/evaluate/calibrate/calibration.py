@@ -153,8 +153,6 @@ class _Queries:
     def _run_info(self, name: str, known: bool) -> RunInfo:
         return RunInfo(
             label=f"calibration, {name} homes, heading {'known' if known else 'searched'}",
-            method="lalaloc",
-            kind="panorama",
             dataset="generated homes",
             split="validation",
             generated=self._generated[name],

@@ -245,8 +245,6 @@ def evaluate_photographs(
         per_camera = 1 if field_deg is None else _VIEWS
         info = RunInfo(
             label=f"photographs in galleries, {name}",
-            method="lalaloc",
-            kind="panorama",
             dataset=dataset.description,
             split="test",
             data=str(data),

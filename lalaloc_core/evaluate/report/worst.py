@@ -34,9 +34,8 @@ from lalaloc_core.evaluate.report.pictures import (
     draw_sheet,
     layout_lines,
 )
-from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
+from lalaloc_core.evaluate.report.reopening import ReopenedRun
 from lalaloc_core.evaluate.report.tables import distance, percent
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluate.runs.predictions import (
     Prediction,
@@ -45,8 +44,7 @@ from lalaloc_core.evaluate.runs.predictions import (
 )
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import PoseSet
@@ -210,10 +208,8 @@ class _QueryAnalyser:
     """Data set and model of a run, reopened to analyse its queries."""
 
     def __init__(self, info: RunInfo) -> None:
-        self._info = info
-        self._dataset = build_dataset(info)
-        self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
-        encoders = None if info.bundle is None else open_model(info)
+        self._run = ReopenedRun(info)
+        encoders = None if info.bundle is None else self._run.open_model()
         self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
 
     def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
@@ -222,15 +218,16 @@ class _QueryAnalyser:
         Raises:
             DatasetError: the query is missing or has changed.
         """
-        scene, camera = find_camera(self._dataset, prediction)
-        image = scene.photograph(camera, self._appearance).image(PICTURE_HEIGHT, PICTURE_WIDTH)
+        scene, camera = self._run.find_camera(prediction)
+        image = self._run.photograph(scene, camera).image(PICTURE_HEIGHT, PICTURE_WIDTH)
         found, height = prediction.final_pose, camera.camera_height_m
         strokes = [_layout(scene, prediction.truth, height, TRUE_COLOUR, 3.0)]
         if found is not None:
             strokes.append(_layout(scene, found, height, FOUND_COLOUR, 1.5))
         fit: dict[str, float | None] = {}
         if self._encoders is not None:
-            query = self._encode(self._encoders, scene, camera)
+            question = self._run.question(scene, camera)
+            query = encode(self._encoders, question, read_image(self._encoders, question))
             floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
             strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
@@ -255,10 +252,6 @@ class _QueryAnalyser:
             **fit,
         )
         return worst, draw_strokes(image, strokes)
-
-    def _encode(self, encoders: Encoders, scene: Scene, camera: Camera) -> Query:
-        question = repeat_question(self._info, scene, camera, self._appearance)
-        return encode(encoders, question, read_image(encoders, question))
 
 
 def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width: float) -> Stroke:

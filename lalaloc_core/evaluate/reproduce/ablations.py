@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.evaluate.reproduce.table import Budget
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -25,7 +26,6 @@ from lalaloc_core.learn.training.run import StageName, train_stage
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.render.sampling import TripletSampling
 
-Budget = Literal["small", "full"]
 BUDGETS: tuple[Budget, ...] = get_args(Budget)
 BASE = "paper"
 _BUNDLE = "bundle"

@@ -94,10 +94,10 @@ class RunInfo:
     """
 
     label: str
-    method: MethodName
-    kind: QueryKind
     dataset: str
     split: Split
+    method: MethodName = "lalaloc"
+    kind: QueryKind = "panorama"
     settings: dict[str, Any] = field(default_factory=dict)
     data: str | None = None
     data_format: str | None = None

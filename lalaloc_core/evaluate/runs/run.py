@@ -27,7 +27,15 @@ from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes, photograph_facts
+from lalaloc_core.learn.data.dataset import (
+    Appearance,
+    Camera,
+    Dataset,
+    Scene,
+    collect_error,
+    load_scenes,
+    photograph_facts,
+)
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # Fields of a run that may differ when it resumes.
@@ -150,12 +158,8 @@ def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list
     for scene in load_scenes(session.dataset, [name], problems):
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
-            try:
+            with collect_error(problems):
                 predictions.append(evaluator.predict(camera, session.method))
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
     return predictions, problems or []
 
 

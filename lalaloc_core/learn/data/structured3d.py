@@ -22,7 +22,7 @@ import numpy as np
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split, collect_error
 from lalaloc_core.learn.data.photographs import FilePhotograph
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 
@@ -140,12 +140,8 @@ class Structured3D:
             # Some rooms have perspective pictures only.
             if not (folder / "panorama").is_dir():
                 continue
-            try:
+            with collect_error(problems):
                 cameras.append(self._camera(annotation, name, folder.name, folder / "panorama"))
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
         return Scene(name=name, plan=annotation.plan, cameras=tuple(cameras))
 
     def _camera(self, annotation: Annotation, scene: str, room: str, folder: Path) -> Camera:
