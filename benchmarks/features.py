@@ -23,7 +23,7 @@ from benchmarks.harness import argument_parser
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.sphere_network import SphereNetwork
 

@@ -24,7 +24,7 @@ from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
-from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.encoders import Encoders

@@ -22,8 +22,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.encoders import Encoders

@@ -40,8 +40,7 @@ from lalaloc_core.learn.data.synthetic.generated import (
 )
 from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph, tilt_by_hand
 from lalaloc_core.learn.synth.homes.buildings import building_of
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size

@@ -16,7 +16,7 @@ from PIL import Image
 from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.views import cut_view
-from lalaloc_core.learn.synth.homes.plans import Home, Opening, OpeningKind
+from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective

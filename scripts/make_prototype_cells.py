@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, Home, home_of
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, half_norms, nearest
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings

@@ -40,14 +40,14 @@ def _tiny_bundle(folder: Path) -> Path:
     from lalaloc_core.learn.export.run import export_run
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.learn.training.run import train_image, train_layout
+    from lalaloc_core.learn.training.run import train_stage
 
     torch.set_num_threads(1)
     device = torch.device("cpu")
     # Rendering the usual number of validation panoramas would take longer than the training.
     data = TrainingData(validation_scenes=2)
-    train_layout(PRESETS["tiny"], folder, device=device, data=data, workers=0)
-    train_image(PRESETS["tiny"], folder, device=device, data=data, workers=0)
+    train_stage("layout", PRESETS["tiny"], folder, device=device, data=data, workers=0)
+    train_stage("image", PRESETS["tiny"], folder, device=device, data=data, workers=0)
     return export_run(folder, folder / "bundle", name="tiny", version="test").folder
 
 

@@ -53,7 +53,6 @@ LAYERS = {
     "lalaloc_core.importers": 6,
     # Training.
     "lalaloc_core.learn.metrics": 1,
-    "lalaloc_core.learn.azimuth_metrics": 1,
     "lalaloc_core.learn.synth.records": 2,
     "lalaloc_core.learn.synth.homes": 2,
     "lalaloc_core.learn.synth": 3,
@@ -127,6 +126,7 @@ TORCH_PACKAGES = (
     "lalaloc_core.learn.data.synthetic",
     "lalaloc_core.learn.training",
     "lalaloc_core.learn.export",
+    "lalaloc_core.evaluate.calibrate",
     "lalaloc_core.evaluate.methods",
     "lalaloc_core.evaluate.runs",
     "lalaloc_core.evaluate.report",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lalaloc_core.cli.plan_files import check_picture_name, write_picture
+from lalaloc_core.cli.plan_files import check_picture_name, write_picture, write_text
 from lalaloc_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -68,9 +68,9 @@ def write_files(
     from lalaloc_core.draw.places import draw_places
 
     if arguments.csv is not None:
-        _write(arguments.csv, _csv(answers))
+        write_text(arguments.csv, _csv(answers))
     if arguments.geojson is not None:
-        _write(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
+        write_text(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
     if arguments.map is not None:
         write_picture(draw_places(plan, places), arguments.map, "--map")
 
@@ -133,10 +133,3 @@ def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str,
             }
         )
     return {"type": "FeatureCollection", "features": features}
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8", newline="")
-    except OSError as error:
-        raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.cli.arguments import positive
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera
+from lalaloc_core.cli.options import add_options, positive
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
@@ -45,10 +45,8 @@ def add_commands(commands: Any) -> None:
         help="metres above the floor, which give lengths their scale (default: %(default)s)",
     )
     features.set_defaults(run=_features)
-    for parser in (encode, features):
-        parser.add_argument(
-            "--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)"
-        )
+    add_options(encode, "--bundle")
+    add_options(features, "--bundle")
 
 
 def _encode(arguments: argparse.Namespace) -> None:

@@ -11,20 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
-from lalaloc_core.cli.arguments import count, positive, processes
+from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
 
-# Ratio of calibration homes to homes that get photographs of other homes.
-_PER_MISMATCHED_HOME = 1
-# Views of each camera, at equal angles.
-_VIEWS_PER_CAMERA = 2
-# Ratio of calibration homes to homes that are also asked for in plans without openings.
-_PER_UNOPENED_HOME = 4
-# Homes of the cohort.
-_COHORT_HOMES = 60
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
 # Columns of the printed table.
@@ -36,7 +27,7 @@ def add_commands(commands: Any) -> None:
     evaluate = commands.add_parser(
         "evaluate", help="localise the queries of a data set or of generated homes, and score the answers"
     )
-    evaluate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(evaluate, "--bundle")
     evaluate.add_argument(
         "--method",
         default="lalaloc",
@@ -70,8 +61,7 @@ def add_commands(commands: Any) -> None:
     )
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
     evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
-    evaluate.add_argument("--skip-bad", action="store_true", help="skip and list unusable samples")
-    evaluate.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
+    add_options(evaluate, "--skip-bad", "--workers")
     evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; an existing run is continued")
     evaluate.add_argument("--json", action="store_true", help="print all figures as JSON")
     evaluate.set_defaults(run=_evaluate)
@@ -100,7 +90,7 @@ def add_commands(commands: Any) -> None:
     calibrate = commands.add_parser(
         "calibrate", help="fit a bundle's matching weights and confidence on generated validation homes"
     )
-    calibrate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(calibrate, "--bundle")
     _generator_arguments(calibrate)
     calibrate.add_argument(
         "--openings-weight",
@@ -149,10 +139,7 @@ def _generator_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--homes", type=count, default=100, help="number of generated homes, 4 queries each (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="random seed of generated homes (default: %(default)s)")
-    parser.add_argument(
-        "--textures", type=Path, metavar="DIR", help="material pictures for generated homes (default: procedural)"
-    )
+    add_options(parser, "--seed", "--textures")
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
@@ -261,116 +248,20 @@ def _worst(arguments: argparse.Namespace) -> None:
     print_json(write_worst(arguments.folder, arguments.out, arguments.count))
 
 
-def _measure_errors(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.evaluate.bench.prediction_errors import measure_errors, outcomes_of
-    from lalaloc_core.localise.localisability.predicted_localisability import errors_of
-
-    bundle = Bundle.open(arguments.bundle)
-    if bundle.manifest.view is None:
-        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --errors")
-    manifest = measure_errors(bundle, outcomes_of(bundle, arguments.homes, "validation", None)).manifest
-    sphere, view = errors_of(manifest)
-    print_json({"sphere_spread": sphere.spread, "view_spread": view.spread})
-
-
 def _calibrate(arguments: argparse.Namespace) -> None:
     if arguments.errors:
-        _measure_errors(arguments)
+        from lalaloc_core.evaluate.calibrate.measured_errors import calibrate_errors
+
+        sphere, view = calibrate_errors(arguments.bundle, arguments.homes)
+        print_json({"sphere_spread": sphere.spread, "view_spread": view.spread})
         return
-    from lalaloc_core.bundle import Bundle, MatchingWeights
-    from lalaloc_core.evaluate.appearance import fit_appearance
-    from lalaloc_core.evaluate.calibrate import (
-        Answers,
-        calibrate,
-        fit_matching_weights,
-        store_cohort,
-        store_matching_weights,
-        with_heading_doubt,
-    )
-    from lalaloc_core.evaluate.runs.factories import build_dataset, describe_model
-    from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-    from lalaloc_core.evaluate.runs.run import run_evaluation
-    from lalaloc_core.learn.data.synthetic import training_plans
-    from lalaloc_core.localise.encode.encoders import Encoders
-    from lalaloc_core.localise.match import cohort_of
+    from lalaloc_core.evaluate.calibrate.calibration import CalibrationConfig, calibrate
 
-    def run_info(generated: dict[str, Any], known: bool, source: str) -> RunInfo:
-        heading = "known" if known else "searched"
-        return RunInfo(
-            label=f"calibration, {source} homes, heading {heading}",
-            method="lalaloc",
-            kind="panorama",
-            dataset="generated homes",
-            split="validation",
-            generated=generated,
-            views={"per_camera": _VIEWS_PER_CAMERA} if arguments.views else None,
-            heading_known=known,
-            bundle=str(arguments.bundle),
-            model=describe_model(arguments.bundle),
-        )
-
-    def predictions(generated: dict[str, Any], known: bool, source: str) -> list[Prediction]:
-        info = run_info(generated, known, source)
-        if arguments.out is not None:
-            return run_evaluation(RunFolder(arguments.out / f"{source}-{'known' if known else 'searched'}"), info)
-        with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
-            return run_evaluation(RunFolder(Path(folder)), info)
-
-    bundle = Bundle.open(arguments.bundle)
-    if arguments.views and bundle.manifest.view is None:
-        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --views")
-    if not arguments.views:
-        cohort_plans = training_plans(_COHORT_HOMES, arguments.seed)
-        store_cohort(bundle, cohort_of(cohort_plans, bundle.manifest.profile_columns, arguments.seed))
-    own = _generated(arguments, None)
-    disturbed = own | {"generator": "disturbed"}
-    mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
-    # Weights first: confidence is fitted on predictions made with them.
-    weights = bundle.manifest.evidence_for(view=arguments.views)
-    weights = replace(weights, tail=arguments.tail or weights.tail)
-    if not arguments.keep_evidence:
-        # Views are of the same plans, so they share the appearance that was fitted on spheres.
-        appearance = bundle.manifest.evidence.appearance
-        encoders = Encoders(Bundle.open(arguments.bundle), threads=1)
-        if encoders.predicts_structure and not arguments.views:
-            datasets = [build_dataset(run_info(source, True, "appearance")) for source in (own, disturbed)]
-            scenes = (dataset.load(name) for dataset in datasets for name in dataset.scenes("validation"))
-            appearance = fit_appearance(encoders, scenes)
-        store_matching_weights(bundle, replace(weights, appearance=appearance), views=arguments.views)
-        default = MatchingWeights(appearance=appearance, tail=weights.tail)
-        weights = fit_matching_weights(
-            [prediction for heading in (True, False) for prediction in predictions(own, heading, "unweighed")], default
-        )
-    if arguments.openings_weight is not None:
-        weights = replace(weights, openings=arguments.openings_weight)
-    store_matching_weights(Bundle.open(arguments.bundle), weights, views=arguments.views)
-    print_json(dataclasses.asdict(weights))
-    few = max(arguments.homes // _PER_UNOPENED_HOME, 1)
-    known, searched = (
-        Answers(
-            own=predictions(own, heading, "own"),
-            disturbed=[
-                *predictions(disturbed, heading, "disturbed"),
-                *predictions(own | {"generator": "unopened", "homes": few}, heading, "unopened"),
-            ],
-            mismatched=[
-                *predictions(mismatched, heading, "mismatched"),
-                *predictions(own | {"generator": "foreign"}, heading, "foreign"),
-            ],
-        )
-        for heading in (True, False)
-    )
-    if not arguments.keep_evidence:
-        weights = with_heading_doubt(weights, known, searched)
-        store_matching_weights(Bundle.open(arguments.bundle), weights, views=arguments.views)
-    queries = f"{len(known.own)} {'views' if arguments.views else 'panoramas'}"
-    description = (
-        f"{queries} of {arguments.homes} generated validation homes, all furniture levels; confidence "
-        f"besides on the same disturbed, and on {len(known.mismatched)} photographs of others or of no room"
-    )
-    bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description, views=arguments.views)
-    print_json(bundle.manifest.metrics)
+    names = [field.name for field in dataclasses.fields(CalibrationConfig)]
+    config = CalibrationConfig(**{name: getattr(arguments, name) for name in names})
+    manifest = calibrate(arguments.bundle, config).manifest
+    print_json(dataclasses.asdict(manifest.evidence_for(view=arguments.views)))
+    print_json(manifest.metrics)
 
 
 def _generated_homes(arguments: argparse.Namespace) -> dict[str, Any]:

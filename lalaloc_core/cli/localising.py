@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.answer_files import add_file_options, check_file_options, write_files
-from lalaloc_core.cli.arguments import heading, positive, tolerance
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
+from lalaloc_core.cli.options import add_options, heading, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, print_json, print_table
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from lalaloc_core.draw.answer import DrawnAnswer
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.photograph import StatedCamera
-
-_GRID_STEP_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +61,7 @@ def add_commands(commands: Any) -> None:
         metavar="DEG",
         help="maximum error of --heading, at most 45 degrees (default: 0)",
     )
-    localise.add_argument(
-        "--camera-height",
-        type=positive,
-        metavar="M",
-        help="metres above the floor (default: the plan's, otherwise estimated)",
-    )
+    add_options(localise, "--camera-height")
     add_camera_options(localise)
     localise.add_argument(
         "--out",
@@ -85,9 +78,7 @@ def add_commands(commands: Any) -> None:
     )
     add_file_options(localise)
     localise.add_argument("--json", action="store_true", help="print JSON: a list with one answer per photograph")
-    localise.add_argument(
-        "--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)"
-    )
+    add_options(localise, "--bundle")
     add_plan_options(localise)
     localise.set_defaults(run=_localise)
 
@@ -112,7 +103,7 @@ def _localise(arguments: argparse.Namespace) -> None:
             continue
         for warning in answer.document["warnings"]:
             print(f"warning: {answer.photograph}: {warning}", file=sys.stderr)
-        rows.append(_row(answer.photograph, answer.drawn))
+        rows.append(_row(answer.document, answer.drawn))
         places.append((answer.photograph.stem, answer.drawn.camera))
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
@@ -142,24 +133,17 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
     from tqdm import tqdm
 
     from lalaloc_core.draw.answer import drawn_answer
-    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
     from lalaloc_core.localise.belief import advice_for, information_bits
     from lalaloc_core.localise.encode.features import is_features, read_features
-    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
     from lalaloc_core.localise.query import known_heading, stated_height
-    from lalaloc_core.localise.search.pipeline import localise
-    from lalaloc_core.localise.search.retrieval import build_grid
-    from lalaloc_core.photograph import StatedCamera, open_photograph
+    from lalaloc_core.photograph import StatedCamera
 
     bundle = Bundle.open(arguments.bundle)
-    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    encoders, manifest = encoder.networks, bundle.manifest
+    model = LocalModel(bundle)
     height = stated_height(plan, arguments.camera_height)
     # Models that compare only latents need a pose grid per camera height.
-    grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
-    grid = build_grid(
-        plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m, latents=not encoders.predicts_profile
-    )
+    grid = model.grid(plan, plan.camera_height_m if model.networks.predicts_profile else height.height_m)
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
     for path in paths:
         content = b""
@@ -171,10 +155,8 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
                         raise InvalidPhotographError("the camera is stated to `lalaloc encode`; leave its options out")
                     view = read_features(content, bundle)
                 else:
-                    view = open_photograph(
-                        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
-                    )
-                encoder.check(view)
+                    view = model.open(content, stated)
+                model.encoder.check(view)
         except InvalidPhotographError as error:
             if len(arguments.photographs) == 1:
                 raise
@@ -182,11 +164,11 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
             continue
         tolerance_deg = arguments.heading_tolerance or 0.0
         known = known_heading(plan.north, arguments.heading, tolerance_deg, view.compass_heading)
-        query = encoder.query(view, known.heading, height, heading_tolerance=known.tolerance)
-        found = localise(plan, grid, encoders, query, refiner=refiner)
-        model = manifest.confidence_for(view=query.is_view)
-        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source], view=view)
-        confidence = found.confidence(model)
+        query = model.encoder.query(view, known.heading, height, heading_tolerance=known.tolerance)
+        found = model.localise(plan, grid, query)
+        confidence_model = bundle.manifest.confidence_for(view=query.is_view)
+        drawn = drawn_answer(plan, grid, found, confidence_model, _SOURCES[known.source], view=view)
+        confidence = found.confidence(confidence_model)
         sure = found.posterior.position if confidence is None else confidence.position
         advice = advice_for([view.azimuths], sure)
         source = "searched" if found.heading_contradicted else known.source
@@ -207,8 +189,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
 
 def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
     """Return an answer as JSON, with the field names of the API."""
-    room, camera = drawn.plan.rooms[drawn.room_index], drawn.camera
-    covariance = None
+    camera, covariance = drawn.camera, None
     if camera.covariance_m2 is not None:
         xx, xy, yy = camera.covariance_m2
         covariance = [[xx, xy], [xy, yy]]
@@ -221,11 +202,11 @@ def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
         }
         for rival in drawn.rivals
     ]
-    best = {"position": {"x_m": camera.x_m, "y_m": camera.y_m}, "heading_deg": camera.heading_deg, "room": room.name}
+    pose = pose_document(drawn.plan, drawn.room_index, camera.x_m, camera.y_m, camera.heading_deg)
+    best = {name: pose[name] for name in ("position", "heading_deg", "room")}
     return {
         "photograph": str(path),
-        **best,
-        "room_id": room.id,
+        **pose,
         "confidence": drawn.confidence,
         "covariance_m2": covariance,
         "camera_height_m": drawn.camera_height_m,
@@ -237,18 +218,14 @@ _HEAD = ("photograph", "room", "x m", "y m", "heading °", "95 % within", "camer
 _SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
 
-def _row(photograph: Path, drawn: DrawnAnswer) -> tuple[str, ...]:
+def _row(document: dict[str, Any], drawn: DrawnAnswer) -> tuple[str, ...]:
     from lalaloc_core.draw.answer import ellipse_m
 
-    camera = drawn.camera
-    within = "-" if camera.covariance_m2 is None else f"{100 * ellipse_m(camera.covariance_m2)[0]:.0f} cm"
+    covariance = drawn.camera.covariance_m2
     return (
-        str(photograph),
-        drawn.plan.rooms[drawn.room_index].name,
-        f"{camera.x_m:.2f}",
-        f"{camera.y_m:.2f}",
-        f"{camera.heading_deg or 0.0:.1f}",
-        within,
+        document["photograph"],
+        *pose_cells(document),
+        "-" if covariance is None else f"{100 * ellipse_m(covariance)[0]:.0f} cm",
         f"{drawn.camera_height_m:.2f}",
         "-" if drawn.confidence is None else f"{100 * drawn.confidence:.1f} %",
     )

@@ -9,8 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
-from lalaloc_core.cli.arguments import count, positive, processes
+from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.annotated import GALLERIES
@@ -36,11 +35,10 @@ _GROUPS = (
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     bench = commands.add_parser("bench", help="measure the figures of the results page and print them as JSON")
-    bench.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(bench, "--bundle", "--textures")
     bench.add_argument(
         "--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each (default: %(default)s)"
     )
-    bench.add_argument("--textures", type=Path, metavar="DIR", help="material pictures for the test panoramas")
     bench.add_argument("--out", type=Path, metavar="FILE", help="also write the JSON to FILE; --only updates FILE")
     bench.add_argument("--only", choices=_GROUPS, action="append", help="one group of figures; repeat for more")
     bench.add_argument(
@@ -54,9 +52,6 @@ def add_commands(commands: Any) -> None:
     )
     photographs.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder of annotated photographs")
     photographs.add_argument(
-        "--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)"
-    )
-    photographs.add_argument(
         "--galleries",
         type=int,
         choices=range(1, GALLERIES + 1),
@@ -66,7 +61,7 @@ def add_commands(commands: Any) -> None:
     photographs.add_argument(
         "--view", type=positive, action="append", default=[], metavar="DEG", help="also views of this field; repeatable"
     )
-    photographs.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
+    add_options(photographs, "--bundle", "--workers")
     photographs.add_argument(
         "--out", type=Path, default=Path("photographs"), metavar="DIR", help="folder of results (default: %(default)s)"
     )
@@ -90,12 +85,8 @@ def add_commands(commands: Any) -> None:
         metavar="DIR",
         help="folder of models, runs and tables (default: %(default)s)",
     )
-    reproduce.add_argument(
-        "--bundle", type=Path, default=default_bundle(), help="model bundle of the shipped model's rows"
-    )
     reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row (default: by --budget)")
-    reproduce.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
-    reproduce.add_argument("--skip-bad", action="store_true", help="skip and count unusable samples")
+    add_options(reproduce, "--bundle", "--skip-bad", "--workers")
     reproduce.set_defaults(run=_reproduce)
 
 

@@ -87,6 +87,18 @@ def write_picture(svg: str, out: Path, option: str = "--out") -> None:
         raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, its line ends as they are.
+
+    Raises:
+        InvalidInputError: the file cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8", newline="")
+    except OSError as error:
+        raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
+
+
 def check_picture_name(out: Path, option: str = "--out") -> None:
     """Refuse a picture file with another suffix than .svg or .png.
 

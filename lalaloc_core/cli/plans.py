@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.cli.options import add_options
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
@@ -41,7 +41,7 @@ def add_commands(commands: Any) -> None:
     check.add_argument(
         "--picture", type=Path, metavar="FILE", help="map of that probability, .png or .svg; needs --localisability"
     )
-    check.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
+    add_options(check, "--bundle")
     draw = actions.add_parser("draw", help="draw a plan as PNG or SVG")
     draw.add_argument("--out", type=Path, required=True, metavar="FILE", help="picture to write, .png or .svg")
     export = actions.add_parser("export", help="write a plan in another format")

@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.cli.options import add_options
 from lalaloc_core.learn.data.dataset import SPLITS
-
-# The exit code that shells use for a command ended by Ctrl-C.
-_INTERRUPTED = 130
 
 
 def add_commands(commands: Any) -> None:
@@ -19,11 +17,10 @@ def add_commands(commands: Any) -> None:
     synth.add_argument("--scenes", type=int, required=True, help="number of scenes in total; existing ones are kept")
     synth.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
     synth.add_argument("--split", choices=("all", *SPLITS), default="all", help="split (default: %(default)s)")
-    synth.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
     synth.add_argument(
         "--height", type=int, default=256, help="height of a panorama in pixels, half its width (default: %(default)s)"
     )
-    synth.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
+    add_options(synth, "--seed", "--textures")
     synth.add_argument("--workers", type=int, default=1, help="rendering processes (default: %(default)s)")
     synth.set_defaults(run=_synth)
 
@@ -35,8 +32,7 @@ def add_commands(commands: Any) -> None:
         metavar="FILE",
         help="picture to write (default: %(default)s)",
     )
-    sheet.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
-    sheet.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
+    add_options(sheet, "--seed", "--textures")
     sheet.set_defaults(run=_contact_sheet)
 
 
@@ -48,8 +44,8 @@ def _synth(arguments: argparse.Namespace) -> None:
     try:
         written = synthesise(settings, numbers, workers=arguments.workers)
     except KeyboardInterrupt:
-        print("interrupted; run the same command again to continue", file=sys.stderr)
-        raise SystemExit(_INTERRUPTED) from None
+        print("run the same command again to continue", file=sys.stderr)
+        raise
     counts = ", ".join(f"{len(scenes)} {split}" for split, scenes in numbers.items())
     print(f"{arguments.out}: {counts}; {written} of them new")
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.cli.arguments import heading, positive
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
-from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
+from lalaloc_core.cli.options import add_options, heading
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from lalaloc_core.localise.tracking.trajectories import Trajectory
     from lalaloc_core.photograph import StatedCamera
 
-_GRID_STEP_M = 0.5
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})
 _HEAD = ("photograph", "mode", "room", "x m", "y m", "heading °", "probability")
 
@@ -57,12 +56,12 @@ def add_commands(commands: Any) -> None:
         metavar="DEG",
         help="azimuth of the photographs' centre relative to the odometry's x, clockwise (default: 0)",
     )
-    track.add_argument("--camera-height", type=positive, metavar="M", help="metres above the floor")
+    add_options(track, "--camera-height")
     add_camera_options(track)
     track.add_argument("--trajectory", type=Path, metavar="FILE", help="TUM file of the poses in the plan to write")
     track.add_argument("--out", type=Path, metavar="FILE", help="picture of the path to write, .png or .svg")
     track.add_argument("--json", action="store_true", help="print JSON: a list with one pose per photograph")
-    track.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)")
+    add_options(track, "--bundle")
     add_plan_options(track)
     track.set_defaults(run=_track)
 
@@ -82,13 +81,18 @@ def _track(arguments: argparse.Namespace) -> None:
         lines = [
             tum_line(answer.time_s, pose.position_m, _height_m(answer.tracked), pose.heading) for answer, pose in poses
         ]
-        _write(arguments.trajectory, "\n".join(lines) + "\n")
+        write_text(arguments.trajectory, "\n".join(lines) + "\n")
     if arguments.out is not None:
         write_picture(_picture(plan, [answer.tracked for answer in found]), arguments.out)
+    documents = [_document(answer, plan) for answer in found]
     if arguments.json:
-        print_json([_document(answer, plan) for answer in found], JSON_DECIMALS)
+        print_json(documents, JSON_DECIMALS)
     else:
-        print_table(_HEAD, [_row(answer, plan) for answer in found])
+        rows = [
+            (answer.path.name, pose["mode"], *pose_cells(pose), f"{100.0 * pose['probability']:.1f} %")
+            for answer, pose in zip(found, documents, strict=True)
+        ]
+        print_table(_HEAD, rows)
 
 
 def _photographs(folder: Path) -> list[tuple[float, Path]]:
@@ -124,44 +128,31 @@ def _followed(
     """Return the answer of each photograph, with a progress bar on a terminal."""
     from tqdm import tqdm
 
-    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
-    from lalaloc_core.localise.search.retrieval import build_grid
     from lalaloc_core.localise.tracking import TrackState
     from lalaloc_core.localise.tracking.filter import track_steps
     from lalaloc_core.localise.tracking.ground import Ground
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
-    from lalaloc_core.photograph import open_photograph
 
-    bundle = Bundle.open(arguments.bundle)
-    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    encoders, manifest = encoder.networks, bundle.manifest
-    sphere, patch = sphere_size(manifest), patch_size(manifest)
+    model = LocalModel(Bundle.open(arguments.bundle))
     height = stated_height(plan, arguments.camera_height)
-    grid = build_grid(
-        plan,
-        encoders,
-        step_m=_GRID_STEP_M,
-        camera_height_m=height.height_m,
-        latents=not encoders.predicts_profile,
-    )
-    ground, errors, mount = Ground.of_plan(plan, grid), OdometryErrors(), arguments.mount
+    ground, errors, mount = Ground.of_plan(plan, model.grid(plan, height.height_m)), OdometryErrors(), arguments.mount
     state, before_s = None, None
     found: list[_Found] = []
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
         content = content_of(path)
         with named(path):
-            view = open_photograph(content, sphere_size=sphere, stated=stated, patch_size=patch)
-            query = encoder.query(view, None, height)
+            view = model.open(content, stated)
+            query = model.encoder.query(view, None, height)
         state = state or TrackState.first(len(query.roll))
         motion = None
         if trajectory is not None and before_s is not None:
             motion = trajectory.motion(before_s, time_s, errors, math.radians(mount))
         known = known_heading(plan.north, None, 0.0, view.compass_heading)
-        steps = track_steps(ground, encoders, state, query, motion, known_heading=known)
-        answer = run_steps(steps, refiner)
+        steps = track_steps(ground, model.networks, state, query, motion, known_heading=known)
+        answer = run_steps(steps, model.refiner)
         contradictions = [f"the photographs contradict {name} of the odometry" for name in answer.contradicted]
         for warning in (*view.warnings, *contradictions):
             print(f"warning: {path}: {warning}", file=sys.stderr)
@@ -191,27 +182,11 @@ def _document(answer: _Found, plan: FloorPlan) -> dict[str, Any]:
         "photograph": str(answer.path),
         "number": pose.number,
         "mode": pose.mode,
-        "position": {"x_m": pose.x_m, "y_m": pose.y_m},
-        "heading_deg": math.degrees(pose.heading) % 360.0,
-        "room": plan.rooms[pose.room_index].name,
-        "room_id": plan.rooms[pose.room_index].id,
+        **pose_document(plan, pose.room_index, pose.x_m, pose.y_m, math.degrees(pose.heading) % 360.0),
         "probability": pose.probability,
         "motion_contradicted": list(answer.tracked.contradicted),
         "view": answer.view,
     }
-
-
-def _row(answer: _Found, plan: FloorPlan) -> tuple[str, ...]:
-    pose = answer.tracked.pose
-    return (
-        answer.path.name,
-        pose.mode,
-        plan.rooms[pose.room_index].name,
-        f"{pose.x_m:.2f}",
-        f"{pose.y_m:.2f}",
-        f"{math.degrees(pose.heading) % 360.0:.1f}",
-        f"{100.0 * pose.probability:.1f} %",
-    )
 
 
 def _text(path: Path) -> str:
@@ -219,10 +194,3 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInputError(f"'{path}' cannot be read as text: {error}") from error
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error

@@ -8,11 +8,11 @@ import dataclasses
 import json
 import os
 import platform
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.cli.options import add_options
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -42,7 +42,7 @@ def add_commands(commands: Any) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="folder of the run, shared by both stages"
     )
     train.add_argument("--data", type=Path, metavar="DIR", help="data set (default: homes generated during training)")
-    train.add_argument("--skip-bad", action="store_true", help="skip unusable files and log each once")
+    add_options(train, "--skip-bad", "--textures")
     train.add_argument("--minutes", type=float, help="training time, instead of --steps")
     train.add_argument("--steps", type=int, help="number of updates (default: the preset's)")
     train.add_argument("--seed", type=int, help="random seed (default: the preset's)")
@@ -92,7 +92,6 @@ def add_commands(commands: Any) -> None:
         metavar="N",
         help="maximum number of homes or scenes for validation (default: %(default)s)",
     )
-    train.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     train.set_defaults(run=_train)
 
     export = commands.add_parser("export", help="export a trained run to a model bundle")
@@ -123,7 +122,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout, train_views
+    from lalaloc_core.learn.training.run import train_stage
 
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -171,15 +170,17 @@ def _train(arguments: argparse.Namespace) -> None:
         photographs=arguments.photographs,
         segmenter=arguments.teacher,
     )
-    train: Callable[..., Any] = {
-        "layout": train_layout,
-        "image": train_image,
-        "view": train_views,
-        "end-to-end": train_end_to_end,
-    }[arguments.stage]
-    optional = {name: getattr(arguments, name) for name in ("init_from", "layout_from")}
-    given = {name: value for name, value in optional.items() if value is not None}
-    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **given)
+    train_stage(
+        arguments.stage,
+        config,
+        arguments.out,
+        device=device,
+        data=data,
+        workers=arguments.workers,
+        resume=arguments.resume,
+        init_from=arguments.init_from,
+        layout_from=arguments.layout_from,
+    )
 
 
 def _keep_freed_memory() -> None:

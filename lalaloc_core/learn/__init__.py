@@ -1,4 +1,4 @@
 """Training of models: data sets, synthetic homes, training and export.
 
-Begin with `training/loop.py`.
+Begin with `training/run.py`.
 """

@@ -1,12 +1,13 @@
-"""Chamfer distance of layouts and accuracy of localisation; the distance works on numpy and torch arrays."""
+"""Metrics of localisation and of predictions by azimuth: formulas only, so that training can validate with them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from array_api_compat import array_namespace
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import Array
 
@@ -50,3 +51,147 @@ class Accuracy:
     def to_dict(self) -> dict[str, int | float]:
         """Return the metrics by name."""
         return asdict(self)
+
+
+# Quantiles of the predicted Laplace distributions at which the share of errors is reported.
+QUANTILES = (0.5, 0.8, 0.9, 0.95)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AzimuthMeasures:
+    """Measures of one photograph, against the annotated outline nearest to the prediction.
+
+    Attributes:
+        outline: number of that outline.
+        log_error: (w,) predicted minus true log distance of the wall; infinite where the prediction is NaN.
+        log_scale: (w,) predicted log scale of `log_error`, of a Laplace distribution.
+        confusion: azimuths by true (row) and predicted class; None if no classes were predicted.
+    """
+
+    outline: int
+    log_error: Float[np.ndarray, "w"]
+    log_scale: Float[np.ndarray, "w"]
+    confusion: Int[np.ndarray, "c c"] | None = None
+
+    @property
+    def median_error(self) -> float:
+        """Median of |Δ log d|."""
+        return float(np.median(np.abs(self.log_error)))
+
+    @property
+    def error_90(self) -> float:
+        """90 % quantile of |Δ log d|."""
+        return float(np.quantile(np.abs(self.log_error), 0.9, method="higher"))
+
+    @property
+    def bias(self) -> float:
+        """Median of Δ log d: positive where walls are predicted too far."""
+        return float(np.median(self.log_error))
+
+    @property
+    def scale_ratio(self) -> float:
+        """Median ratio of errors to their predicted scale; 1 for a calibrated prediction."""
+        return float(np.median(self._normalised) / np.log(2.0))
+
+    @property
+    def within(self) -> Float[np.ndarray, "q"]:
+        """Share of the errors within each predicted quantile of `QUANTILES`; equal to it if calibrated."""
+        limits = -np.log1p(-np.array(QUANTILES))
+        return (self._normalised[:, None] <= limits).mean(axis=0)
+
+    @property
+    def _normalised(self) -> Float[np.ndarray, "w"]:
+        return np.abs(self.log_error) * np.exp(-self.log_scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassScores:
+    """Scores of predicted classes.
+
+    Attributes:
+        balanced_accuracy: mean recall of the classes that occur.
+        recall: by class; None if the class never occurs.
+        precision: by class; None if the class is never predicted.
+    """
+
+    balanced_accuracy: float
+    recall: Mapping[str, float | None]
+    precision: Mapping[str, float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AzimuthSummary:
+    """Measures over several photographs.
+
+    Attributes:
+        n: number of photographs.
+        median_error: median over the photographs of their median |Δ log d|.
+        error_90: median over the photographs of their 90 % quantile of |Δ log d|.
+        scale_ratio: median over the photographs.
+        within: share of all azimuths within each predicted quantile.
+        classes: over all azimuths; None if no classes were predicted.
+    """
+
+    n: int
+    median_error: float
+    error_90: float
+    scale_ratio: float
+    within: Mapping[str, float]
+    classes: ClassScores | None = None
+
+
+def measure_azimuths(
+    profiles_m: Sequence[Float[np.ndarray, "w"]],
+    log_profile: Float[np.ndarray, "w"],
+    log_scale: Float[np.ndarray, "w"],
+    true_classes: Int[np.ndarray, "w"] | None = None,
+    class_scores: Float[np.ndarray, "w c"] | None = None,
+) -> AzimuthMeasures:
+    """Compare a prediction with an annotation.
+
+    `profiles_m` are the true wall profiles, one per annotated outline. `class_scores` are log probabilities, or any
+    score that is largest for the likeliest class, and need `true_classes`.
+    """
+    errors = [np.nan_to_num(log_profile - np.log(profile), nan=np.inf) for profile in profiles_m]
+    outline = int(np.argmin([np.median(np.abs(error)) for error in errors]))
+    confusion = None
+    if class_scores is not None:
+        assert true_classes is not None
+        confusion = np.zeros((class_scores.shape[1],) * 2, dtype=int)
+        np.add.at(confusion, (true_classes, class_scores.argmax(axis=1)), 1)
+    return AzimuthMeasures(outline=outline, log_error=errors[outline], log_scale=log_scale, confusion=confusion)
+
+
+def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[str]) -> AzimuthSummary:
+    """Summarise photographs with equal weight.
+
+    `measures` has one item per photograph, at least one; `classes` are names by code.
+    """
+    within = np.mean([measure.within for measure in measures], axis=0)
+    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
+    return AzimuthSummary(
+        n=len(measures),
+        median_error=float(np.median([measure.median_error for measure in measures])),
+        error_90=float(np.median([measure.error_90 for measure in measures])),
+        scale_ratio=float(np.median([measure.scale_ratio for measure in measures])),
+        within={f"{quantile:g}": float(share) for quantile, share in zip(QUANTILES, within, strict=True)},
+        classes=score_classes(np.sum(confusions, axis=0), classes) if confusions else None,
+    )
+
+
+def score_classes(confusion: Int[np.ndarray, "c c"], classes: Sequence[str]) -> ClassScores:
+    """Compute the scores of a table of counts by true (row) and predicted class."""
+    correct, occurring, predicted = (
+        counts.tolist() for counts in (np.diag(confusion), confusion.sum(axis=1), confusion.sum(axis=0))
+    )
+    recall = {name: _share(correct[k], occurring[k]) for k, name in enumerate(classes)}
+    known = [share for share in recall.values() if share is not None]
+    return ClassScores(
+        balanced_accuracy=float(np.mean(known)) if known else float("nan"),
+        recall=recall,
+        precision={name: _share(correct[k], predicted[k]) for k, name in enumerate(classes)},
+    )
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

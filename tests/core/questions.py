@@ -11,8 +11,11 @@ import torch
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.evaluate.methods.method import Question
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunInfo
+from lalaloc_core.evaluate.methods.method import Pose, Question
+from lalaloc_core.evaluate.runs.predictions import (
+    Prediction,
+    RunInfo,
+)
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph
 from lalaloc_core.localise.encode.encoders import Encoders

@@ -14,6 +14,7 @@ from PIL import Image, ImageColor
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.report.photographs import (
     CLASS_COLOURS,
     FIGURES_FILE,
@@ -23,17 +24,15 @@ from lalaloc_core.evaluate.report.photographs import (
     evaluate_photographs,
 )
 from lalaloc_core.evaluate.report.tables import percent
-from lalaloc_core.evaluate.runs.foreign import foreign_plans
-from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, score_galleries
+from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, foreign_plans, score_galleries
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
-from lalaloc_core.learn.azimuth_metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
+from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.learn.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
 from lalaloc_core.learn.data.dataset_detection import open_dataset
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening
-from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
+from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.profile import wall_profile

@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 
 from lalaloc_core.cli import main
 from lalaloc_core.learn.synth.augmentation.photometric import jittered
-from lalaloc_core.learn.training.batch_streams import PanoramaBatches
+from lalaloc_core.learn.training.batch_streams import PanoramaBatches, ReplayBuffer
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer, rotate_images
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
 from lalaloc_core.learn.training.rotation import Rotation
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_layout_encoder, panorama_batches

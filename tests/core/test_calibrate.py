@@ -23,17 +23,20 @@ from lalaloc_core.bundle import (
     write_manifest,
 )
 from lalaloc_core.errors import BundleError, InvalidInputError
-from lalaloc_core.evaluate.appearance import fit_appearance, mixtures, redrawn
-from lalaloc_core.evaluate.calibrate import (
+from lalaloc_core.evaluate.calibrate.calibration import store_cohort, store_confidence
+from lalaloc_core.evaluate.calibrate.opening_appearance import fit_appearance, mixtures, redrawn
+from lalaloc_core.evaluate.calibrate.parameter_fits import (
     Answers,
-    calibrate,
     cross_validate,
     fit_confidence,
     fit_matching_weights,
-    store_cohort,
     with_heading_doubt,
 )
-from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
+from lalaloc_core.evaluate.methods.method import (
+    Pose,
+    PredictedCandidate,
+)
+from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans
@@ -260,7 +263,7 @@ class TestConfidence:
 
     def test_calibration_keeps_the_model_identity(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
         try:
-            calibrated = calibrate(
+            calibrated = store_confidence(
                 opened_bundle, Answers(own=believable(200, 0)), Answers(own=believable(50, 1)), "made-up queries"
             )
             again = Bundle.open(tiny_bundle)

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
-from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.decode import VdrDecode
-from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
+from lalaloc_core.evaluate.methods.explicit import ExplicitLayout, depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import DepthGrid, Layout

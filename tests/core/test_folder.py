@@ -19,8 +19,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.folder import OwnData
-from lalaloc_core.learn.data.structured3d import Structured3D
-from lalaloc_core.learn.data.structured3d_splits import ERRATA, EXCLUDED_BY_PAPER
+from lalaloc_core.learn.data.structured3d import ERRATA, EXCLUDED_BY_PAPER, Structured3D
 from lalaloc_core.learn.data.zind import Zind
 from tests.strategies import plan_document, rectangle
 

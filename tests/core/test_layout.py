@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import building_of
-from lalaloc_core.learn.synth.homes.plans import generate_home
-from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
 from lalaloc_core.localise.match import Layouts, layouts_at
 from lalaloc_core.localise.match.layouts import layouts_of_plans
 from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient

@@ -12,7 +12,7 @@ from lalaloc_core.bundle.prediction_errors import correlated
 from lalaloc_core.conditions import CONDITIONS, HARDEST, condition_of, parts_of
 from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.bench.prediction_errors import measured
+from lalaloc_core.evaluate.calibrate.measured_errors import measured
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.localisability.localisability_report import report_of, summary_of
 from lalaloc_core.localise.localisability.predicted_localisability import (

@@ -21,13 +21,17 @@ from PIL import Image
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.draw.heat import Cells
 from lalaloc_core.errors import RunError
+from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.report import write_report
 from lalaloc_core.evaluate.report.gallery import PER_GROUP, choose_queries
 from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_panorama, layout_lines
 from lalaloc_core.evaluate.report.reading import TOTAL, stage_times
 from lalaloc_core.evaluate.report.tables import distance, number
 from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder
+from lalaloc_core.evaluate.runs.predictions import (
+    Prediction,
+    RunFolder,
+)
 from lalaloc_core.evaluate.runs.score import position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.render.depth import layout_depth

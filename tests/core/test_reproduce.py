@@ -24,7 +24,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.data import TrainingData
-from lalaloc_core.learn.training.run import train_layout
+from lalaloc_core.learn.training.run import train_stage
 from tests.core.questions import question_at, run_info
 from tests.strategies import plan_document, rectangle
 
@@ -279,7 +279,7 @@ class TestTraining:
     def test_variant_resumes_on_its_own_data_set_only(self, tmp_path: Path) -> None:
         config = ablations.ABLATIONS["layout-mlp"].config["small"]
         shorter = config.with_settings({"layout.steps": 2})
-        train_layout(shorter, tmp_path / "layout-mlp", device=CPU, data=TrainingData(dataset=HOMES), workers=0)
+        train_stage("layout", shorter, tmp_path / "layout-mlp", device=CPU, data=TrainingData(dataset=HOMES), workers=0)
         with pytest.raises(CheckpointError, match="not on"):
             train("layout-mlp", tmp_path, homes=dataclasses.replace(HOMES, seed=1))
         resumed = train("layout-mlp", tmp_path)

@@ -15,7 +15,7 @@ from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
-from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.localise.belief import suppress
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.match import (

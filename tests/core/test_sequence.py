@@ -18,7 +18,7 @@ from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, split_renderer_cache
-from lalaloc_core.learn.synth.homes.splits import VALIDATION, home_of
+from lalaloc_core.learn.synth.homes.plans import VALIDATION, home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.encoders import Encoders

@@ -19,9 +19,8 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, largest_simple_part, signed_area
-from lalaloc_core.learn.data.structured3d import Structured3D
+from lalaloc_core.learn.data.structured3d import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL, Structured3D, scene_numbers
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
-from lalaloc_core.learn.data.structured3d_splits import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import random_poses

@@ -17,9 +17,8 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
 from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
-from lalaloc_core.learn.synth.homes.plans import Home, generate_home
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN
-from lalaloc_core.learn.synth.homes.splits import home_of as home_of_split
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, Home, generate_home
+from lalaloc_core.learn.synth.homes.plans import home_of as home_of_split
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, contact_sheet, sample_shots
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.facts import facts_of

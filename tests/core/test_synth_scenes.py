@@ -20,14 +20,13 @@ from lalaloc_core.learn.synth.camera.exposure import Exposure, sample_exposure, 
 from lalaloc_core.learn.synth.camera.jpeg import compress
 from lalaloc_core.learn.synth.camera.patches import cover_poles
 from lalaloc_core.learn.synth.furniture.furnish import furnish, rectangle, wall_frame
-from lalaloc_core.learn.synth.homes.plans import generate_home
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, generate_home, home_of
 from lalaloc_core.learn.synth.records import Column, Joined, Records
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
+from lalaloc_core.learn.synth.scene.doors import boards, hang_leaves
 from lalaloc_core.learn.synth.scene.facts import FACTS, facts_of
-from lalaloc_core.learn.synth.scene.leaves import boards, hang_leaves
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.mirrors import Reflection
 from lalaloc_core.learn.synth.scene.render_scene import Sun

@@ -27,15 +27,20 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import column_azimuths
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.learn.data.dataset import Split
-from lalaloc_core.learn.data.structured3d import FURNITURE, LIGHTING, Structured3D
-from lalaloc_core.learn.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
+from lalaloc_core.learn.data.structured3d import (
+    EXCLUDED_BY_PAPER,
+    FURNITURE,
+    LIGHTING,
+    OFFICIAL,
+    Structured3D,
+    scene_numbers,
+)
 from lalaloc_core.learn.data.structured3d_writer import build_annotation, layout_pixels, room_type, write_depth
 from lalaloc_core.learn.data.synthetic import writing as module
 from lalaloc_core.learn.data.synthetic.generated import split_renderer_cache
 from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, wall_frame
-from lalaloc_core.learn.synth.homes.plans import Home, generate_home
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, Home, generate_home, home_of
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.lighting import MOODS
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

@@ -24,7 +24,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, sources
 from lalaloc_core.learn.training import layout_stage as layout_stage_module
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
@@ -37,7 +37,7 @@ from lalaloc_core.learn.training.layout_stage import LayoutStage
 from lalaloc_core.learn.training.loop import run_stage
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.rotation import sample_rotation
-from lalaloc_core.learn.training.run import train_image
+from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder
 from lalaloc_core.nets import LayoutEncoder
@@ -252,7 +252,7 @@ class TestCheckpoint:
 
     def test_missing_layout_checkpoint_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint"):
-            train_image(TINY, tmp_path, device=CPU)
+            train_stage("image", TINY, tmp_path, device=CPU)
         with pytest.raises(CheckpointError, match="no checkpoint"):
             export_run(tmp_path, tmp_path / "out", name="none", version="1")
 

@@ -25,7 +25,7 @@ from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.run import train_layout
+from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import SceneSource
 from lalaloc_core.learn.training.validate import ImageValidation, LayoutValidation
 from lalaloc_core.render.sampling import random_poses
@@ -188,7 +188,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_resuming_on_other_data_is_refused(self, data: OwnData) -> None:
         folder = data.root.parent / "run"
-        trained = train_layout(CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)
+        trained = train_stage("layout", CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)
         assert (
             Checkpoint.load(folder / "layout.pt").data
             == trained.data
@@ -196,7 +196,7 @@ class TestRuns:
         )
         assert {"val_within_1m", "val_median_cm"} <= set(trained.metrics)
         with pytest.raises(CheckpointError, match="homes generated while training"):
-            train_layout(CONFIG, folder, device=CPU, workers=0, resume=True)
+            train_stage("layout", CONFIG, folder, device=CPU, workers=0, resume=True)
 
     def test_command_exits_with_2_at_a_bad_file(self, data: OwnData, capsys: pytest.CaptureFixture[str]) -> None:
         words = ["train", "layout", "--preset", "tiny", "--steps", "3", "--workers", "0", "--device", "cpu"]

@@ -30,7 +30,7 @@ from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.loop import run_stage
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.run import train_image, train_layout
+from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.validate import cached_pictures
@@ -208,9 +208,9 @@ class TestHiddenParts:
 def folder(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train against the layout encoder of a ring, resume once, and export a bundle."""
     folder = tmp_path_factory.mktemp("run")
-    run.train_image(SHORT, folder, device=CPU, data=FEW, workers=0, layout_from=tiny_bundle)
+    run.train_stage("image", SHORT, folder, device=CPU, data=FEW, workers=0, layout_from=tiny_bundle)
     longer = SHORT.with_settings({"image.steps": 3})
-    run.train_image(longer, folder, device=CPU, data=FEW, workers=0, resume=True)
+    run.train_stage("image", longer, folder, device=CPU, data=FEW, workers=0, resume=True)
     export_run(folder, folder / "bundle", name="tiny-trunk", version="1", last=True)
     return folder
 
@@ -241,7 +241,7 @@ class TestRuns:
 
     def test_starting_from_a_ring_image_encoder_is_refused(self, tiny_bundle: Path, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="was trained with architecture ring"):
-            run.train_image(SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
+            run.train_stage("image", SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
 
     def test_run_starts_from_a_trunk_bundle(self, folder: Path) -> None:
         start = load_warm_start(folder / "bundle", "image", TINY)
@@ -277,8 +277,14 @@ class TestRuns:
         nothing = Checkpoint(stage="image", config=config, weights={})
         monkeypatch.setattr(run, "run_stage", lambda *_, **__: nothing)
         for resume, expected in ((False, 1), (True, 1)):
-            run.train_image(
-                config, folder, device=CPU, data=dataclasses.replace(FEW, validation_scenes=0), workers=0, resume=resume
+            run.train_stage(
+                "image",
+                config,
+                folder,
+                device=CPU,
+                data=dataclasses.replace(FEW, validation_scenes=0),
+                workers=0,
+                resume=resume,
             )
             assert len(loaded) == expected
 
@@ -307,7 +313,7 @@ class TestRefusals:
 
 
 def trained(folder: Path, init_from: Path, config: TrainConfig = SHORT_RING) -> Checkpoint:
-    return train_image(config, folder, device=CPU, data=FEW, workers=0, init_from=init_from)
+    return train_stage("image", config, folder, device=CPU, data=FEW, workers=0, init_from=init_from)
 
 
 class TestWarmStart:
@@ -366,11 +372,11 @@ class TestWarmStart:
         assert second.begun_from["begun_from"]["name"] == "tiny"
         layouts = [Checkpoint.load(tmp_path / name / "layout.pt") for name in ("first", "second")]
         assert same_weights(layouts[0].weights, layouts[1].weights)
-        again = train_image(SHORT_RING, tmp_path / "second", device=CPU, data=FEW, workers=0, resume=True)
+        again = train_stage("image", SHORT_RING, tmp_path / "second", device=CPU, data=FEW, workers=0, resume=True)
         assert again.begun_from == second.begun_from
 
     def test_layout_stage_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
-        layout = train_layout(SHORT_RING, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
+        layout = train_stage("layout", SHORT_RING, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
         assert layout.begun_from["name"] == "tiny"
         assert set(layout.begun_from) == {"name", "version", "sha256", "minutes_in_all"}
         trained(tmp_path, tiny_bundle)

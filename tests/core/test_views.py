@@ -18,14 +18,14 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.export.run import export_into
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.run import train_views
+from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.view_stage import middle
 from lalaloc_core.localise.encode.view_encoder import LevelPatch, OnnxViewEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
@@ -158,7 +158,7 @@ class TestTraining:
     @pytest.mark.slow
     def test_a_run_is_exported_and_answers_queries(self, tmp_path: Path) -> None:
         run = tmp_path / "run"
-        train_views(SHORT, run, device=CPU, data=TrainingData(validation_scenes=1), workers=0)
+        train_stage("view", SHORT, run, device=CPU, data=TrainingData(validation_scenes=1), workers=0)
         checkpoint = Checkpoint.load(run / "view.pt", stage="view")
         assert checkpoint.step == 2
         assert {"val_nll", "val_log_error_80", "val_opening_accuracy_106"} <= checkpoint.metrics.keys()
@@ -193,7 +193,7 @@ class TestTraining:
     def test_a_data_set_is_refused(self, tmp_path: Path) -> None:
         data = TrainingData(dataset=GeneratedScenes(homes=1))
         with pytest.raises(ConfigError, match="without a data set"):
-            train_views(SHORT, tmp_path, device=CPU, data=data)
+            train_stage("view", SHORT, tmp_path, device=CPU, data=data)
 
     def test_only_seen_azimuths_count(self) -> None:
         target = torch.zeros(1, 4)

@@ -18,7 +18,7 @@ from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, opening_entries
 from lalaloc_core.learn.data.structured3d_annotation import read_annotation
 from lalaloc_core.learn.data.structured3d_writer import build_annotation
 from lalaloc_core.learn.data.zind import Zind

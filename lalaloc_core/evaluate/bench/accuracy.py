@@ -65,37 +65,39 @@ _VIEW_BENCHMARKS = {
 }
 
 
+_HEADINGS = {"known_heading": True, "unknown_heading": False}
+
+
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Measure accuracy in generated test homes, 4 queries each; in at most 100 unfurnished and heldout ones."""
-    return {
-        name: summarise(run_benchmark(bundle, benchmark, homes, textures)) for name, benchmark in _BENCHMARKS.items()
-    }
+    return _figures(bundle, _BENCHMARKS, homes, textures)
 
 
 def bench_views(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Measure accuracy of views in at most 100 furnished test and out-of-distribution homes, 4 queries each."""
-    return {
-        name: summarise(run_benchmark(bundle, benchmark, homes, textures))
-        for name, benchmark in _VIEW_BENCHMARKS.items()
-    }
+    return _figures(bundle, _VIEW_BENCHMARKS, homes, textures)
 
 
 def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Measure accuracy with the latent, the predicted wall profile, or both in the matching cost."""
     homes = min(homes, _MAX_EVIDENCE_HOMES)
     return {
-        heading: {
-            evidence: summarise(
-                run_benchmark(
-                    bundle,
-                    Benchmark(settings={"evidence": evidence}, heading_known=heading == "known_heading"),
-                    homes,
-                    textures,
-                )
-            )
-            for evidence in ("latent", "profile", "both")
-        }
-        for heading in ("known_heading", "unknown_heading")
+        heading: _figures(
+            bundle,
+            {
+                term: Benchmark(settings={"evidence": term}, heading_known=known)
+                for term in ("latent", "profile", "both")
+            },
+            homes,
+            textures,
+        )
+        for heading, known in _HEADINGS.items()
+    }
+
+
+def _figures(bundle: Bundle, benchmarks: Mapping[str, Benchmark], homes: int, textures: Path | None) -> dict[str, Any]:
+    return {
+        name: summarise(run_benchmark(bundle, benchmark, homes, textures)) for name, benchmark in benchmarks.items()
     }
 
 
@@ -111,7 +113,6 @@ def run_benchmark(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Pa
         generated["generator"] = "copies"
     info = RunInfo(
         label=f"{benchmark.kind}, {benchmark.furniture}",
-        method="lalaloc",
         kind=benchmark.kind,
         dataset="out-of-distribution homes" if benchmark.heldout else "generated homes",
         split="test",
@@ -171,7 +172,6 @@ HEIGHTS: Mapping[str, Mapping[str, Any]] = {
     "20_cm_too_low": {"camera_height_error_m": -0.2},
     "unknown": {"camera_height": "unknown"},
 }
-_HEADINGS = {"known_heading": True, "unknown_heading": False}
 
 
 def bench_terms(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
@@ -203,10 +203,13 @@ def _rows(
     copies: bool = False,
 ) -> dict[str, Any]:
     """Return the figures by row and heading."""
-    figures: dict[str, Any] = {name: {} for name in rows}
-    for name, settings in rows.items():
-        for heading, known in _HEADINGS.items():
-            minor = heldout or copies
-            benchmark = Benchmark(settings=settings, heading_known=known, heldout=heldout, copies=copies, minor=minor)
-            figures[name][heading] = summarise(run_benchmark(bundle, benchmark, homes, textures))
-    return figures
+    common: dict[str, Any] = {"heldout": heldout, "copies": copies, "minor": heldout or copies}
+    return {
+        name: _figures(
+            bundle,
+            {heading: Benchmark(settings=row, heading_known=known, **common) for heading, known in _HEADINGS.items()},
+            homes,
+            textures,
+        )
+        for name, row in rows.items()
+    }

@@ -13,9 +13,9 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
 from lalaloc_core.learn.data.dataset import Camera, Dataset
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.render.layout import render_layout
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conditions import CONDITIONS
-from lalaloc_core.evaluate.bench.prediction_errors import outcomes_of, predicted_shares
+from lalaloc_core.evaluate.calibrate.measured_errors import outcomes_of, predicted_shares
 from lalaloc_core.localise.localisability.predicted_localisability import errors_of
 
 # Each spot is localised six times.

@@ -11,16 +11,13 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.speed import home_of_area
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import StageClock, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 
-_GRID_STEP_M = 0.5
 _FUNCTIONS = 20
 _STAGES = ("encode", "retrieve", "vdr", "lpo")
 
@@ -33,19 +30,17 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
     home = home_of_area(100.0)
     shots = sample_shots(home, queries, np.random.default_rng(1), "full")
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
-    height, width = encoders.manifest.image_height, encoders.manifest.image_width
+    model = LocalModel(bundle)
+    height, width = bundle.manifest.image_height, bundle.manifest.image_width
     images = renderers.renderer(height, width).render(shots).cpu().numpy()
-    camera_m = home.plan.camera_height_m
-    latents = not encoders.predicts_profile
-    grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m, latents=latents)
+    grid = model.grid(home.plan, home.plan.camera_height_m)
 
     def time_query(index: int, *, known: bool) -> dict[str, float]:
         clock, shot = StageClock(), shots[index]
         with clock.stage("encode"):
             heading = shot.heading if known else None
-            query = encoders.query(images[index], heading, CameraHeight(shot.camera_height_m))
-        localise(home.plan, grid, encoders, query, refiner=refiner, clock=clock)
+            query = model.networks.query(images[index], heading, CameraHeight(shot.camera_height_m))
+        localise(home.plan, grid, model.networks, query, refiner=model.refiner, clock=clock)
         return clock.timings_ms
 
     lines = [f"| stage, median of {queries} queries | known heading | unknown heading |", "|---|---|---|"]

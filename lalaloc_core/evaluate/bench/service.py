@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import socket
@@ -18,13 +17,12 @@ from typing import Any
 
 import httpx
 import numpy as np
-from PIL import Image
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import without_openings
-from lalaloc_core.learn.data.views import cut_view
+from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective
@@ -42,7 +40,7 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
     shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
     materials = MaterialLibrary.create(np.random.default_rng(1), textures)
     images = PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()
-    pictures = [_jpeg(image) for image in images]
+    pictures = [encode_jpeg(image) for image in images]
     with running_service(bundle.folder) as (client, process):
         plan_id, bare_id = _upload(client, home.plan), _upload(client, without_openings(home.plan))
         report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
@@ -94,7 +92,7 @@ def _phone_photograph(sphere: np.ndarray) -> bytes:
     camera = Perspective.of_hfov(*_PHONE_SIZE, math.radians(_PHONE_FIELD_DEG))
     view = cut_view(sphere, camera, azimuth=0.0, pitch=0.0, roll=0.0)
     noise = np.random.default_rng(0).normal(0.0, 4.0, view.shape)
-    return _jpeg((view + noise).clip(0.0, 255.0).astype(np.uint8))
+    return encode_jpeg((view + noise).clip(0.0, 255.0).astype(np.uint8))
 
 
 @contextmanager
@@ -154,9 +152,3 @@ def _wait_until(condition: Callable[[], bool], message: str) -> None:
         if time.monotonic() > deadline:
             raise TimeoutError(message)
         time.sleep(0.1)
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "JPEG", quality=90)
-    return buffer.getvalue()

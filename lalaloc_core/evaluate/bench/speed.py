@@ -26,8 +26,7 @@ from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache
 from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import TEST, home_of
+from lalaloc_core.learn.synth.homes.plans import TEST, Home, home_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.encoders import Encoders
@@ -90,8 +89,7 @@ def bench_rendering(bundle: Bundle) -> dict[str, float]:
     }
 
 
-_QUERIES = 5
-_GRID_STEP_M = 0.5
+_METHOD_QUERIES = 5
 
 
 def bench_methods(bundle: Bundle) -> dict[str, Any]:
@@ -100,7 +98,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
     The plan's wall cloud (ICP) and pose grid (LaLaLoc) are prepared before and not counted.
     """
     home = home_of_area(100.0)
-    shots = sample_shots(home, _QUERIES + 1, np.random.default_rng(2), "full")
+    shots = sample_shots(home, _METHOD_QUERIES + 1, np.random.default_rng(2), "full")
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(2)))
     grid = pose_grid(home.plan, _GRID_STEP_M)
     questions = [
@@ -127,7 +125,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
     return {
         "area_m2": home.plan.area_m2,
         "grid_poses": len(grid),
-        "queries": _QUERIES,
+        "queries": _METHOD_QUERIES,
         "icp_seconds": icp,
         "lalaloc_seconds": lalaloc,
         "icp_to_lalaloc_ratio": icp / lalaloc,
@@ -169,8 +167,6 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
 
         info = RunInfo(
             label="all stages",
-            method="lalaloc",
-            kind="panorama",
             dataset=dataset.description,
             split="test",
             data=str(root),

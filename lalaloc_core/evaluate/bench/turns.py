@@ -10,25 +10,19 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.evaluate.calibrate.measured_errors import Spot, photograph_of, spots
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise
-from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.motion import Motion
 from lalaloc_core.localise.sequence.search import localise_sequence
 from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
-from lalaloc_core.photograph import Photograph
 
-_FIELD_DEG, _VIEWS = 80.0, 3
-GRID_STEP_M = 0.5
 # Photographs taken while turning on the spot are this close together (m).
 _TURNED_STD_M = 0.1
 
@@ -46,46 +40,35 @@ def bench_turns(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, 
 
     The heading is unknown, and so are the angles between the views, unless the row says that they are known.
     """
-    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    spheres = GeneratedScenes(homes=homes, furniture="full", textures=textures)
-    scenes = ViewScenes(spheres, _FIELD_DEG, _VIEWS)
+    model = LocalModel(bundle)
     answers: dict[str, list[_Answer]] = {}
-    for name in scenes.scenes("test"):
-        scene = scenes.load(name)
-        for first in range(0, len(scene.cameras), _VIEWS):
-            for row, answer in _at_spot(scene.plan, scene.cameras[first : first + _VIEWS], encoder, refiner).items():
-                answers.setdefault(row, []).append(answer)
+    for spot in spots(homes, "test", textures):
+        for row, answer in _at_spot(spot, model).items():
+            answers.setdefault(row, []).append(answer)
     return {row: _summary(found) for row, found in answers.items()}
 
 
-def _at_spot(
-    plan: FloorPlan, views: Sequence[Camera], encoder: PhotographEncoder, refiner: Refiner
-) -> dict[str, _Answer]:
+def _at_spot(spot: Spot, model: LocalModel) -> dict[str, _Answer]:
     """Localise the views of one spot with known and with unknown angles between them."""
-    manifest, height = encoder.networks.manifest, CameraHeight(views[0].camera_height_m)
-    opened = [_opened(view, encoder) for view in views]
-    grid = build_grid(plan, encoder.networks, step_m=GRID_STEP_M, camera_height_m=height.height_m, latents=False)
+    (plan, views), encoder, manifest = spot, model.encoder, model.bundle.manifest
+    height = CameraHeight(views[0].camera_height_m)
+    opened = [photograph_of(view).open(patch_size(manifest)) for view in views]
+    grid = model.grid(plan, height.height_m)
 
     def as_one(turns: Sequence[float]) -> Localisation:
         query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
-        return localise(plan, grid, encoder.networks, query, refiner=refiner)
+        return model.localise(plan, grid, query)
 
-    known = as_one([float(wrap_angle(view.heading - views[0].heading)) for view in views])
+    known = as_one(spot.turns)
     believed = known.confidence(manifest.confidence_for(view=True))
     motions = [Motion(distance_m=0.0, distance_std_m=_TURNED_STD_M)] * (len(views) - 1)
     queries = [encoder.query(view, None, height) for view in opened]
-    unknown = localise_sequence(plan, grid, encoder.networks, queries, motions, refiner=refine_sequence)
+    unknown = localise_sequence(plan, grid, model.networks, queries, motions, refiner=refine_sequence)
     unknown = judged_turn(unknown, as_one(found_turns(unknown)))
     return {
         "known_angles": _answer(known, views[0], None if believed is None else believed.position),
         "unknown_angles": _answer(unknown.pictures[0], views[0], unknown.confidence(manifest)),
     }
-
-
-def _opened(camera: Camera, encoder: PhotographEncoder) -> Photograph:
-    (photograph,) = camera.photographs.values()
-    assert isinstance(photograph, ViewPhotograph)
-    return photograph.open(patch_size(encoder.networks.manifest))
 
 
 def _answer(found: Localisation, camera: Camera, confidence: float | None) -> _Answer:

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import WALL_CODE, wrap_angle
-from lalaloc_core.evaluate.bench.turns import GRID_STEP_M
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import cut_view
+from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.localise.belief import CONFIDENT
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
-from lalaloc_core.photograph import Photograph, open_photograph
+from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.render.sampling import PoseSet
 
 _SPHERE_SIZE, _VIEW_SIZE = (512, 1024), (640, 480)
@@ -42,20 +35,20 @@ def bench_uninformative(bundle: Bundle, homes: int, textures: Path | None) -> di
     A blank wall is the wall without openings that fills the view and is nearest, in unfurnished homes. A landscape is
     a textured ground below a sky, drawn for this.
     """
-    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
+    model = LocalModel(bundle)
     scenes = GeneratedScenes(homes=homes, furniture="empty", textures=textures)
     confidence: dict[str, list[float]] = {"blank_wall": [], "ceiling": [], "landscape": []}
     for name in scenes.scenes("test"):
         scene = scenes.load(name)
-        networks = encoder.networks
         for number, camera in enumerate(scene.cameras):
             height = CameraHeight(camera.camera_height_m)
-            grid = build_grid(scene.plan, networks, step_m=GRID_STEP_M, camera_height_m=height.height_m, latents=False)
+            grid = model.grid(scene.plan, height.height_m)
             rng = np.random.default_rng([len(confidence["ceiling"]), number])
             for kind, picture in _pictures(scene.plan, camera, rng).items():
                 field_deg = _WALL_DEG if kind == "blank_wall" else _FIELD_DEG
-                query = encoder.query(_opened(picture, field_deg, bundle), None, height)
-                answer = localise(scene.plan, grid, networks, query, refiner=refiner)
+                stated = StatedCamera(projection="perspective", hfov_deg=field_deg)
+                query = model.encoder.query(model.open(encode_jpeg(picture), stated), None, height)
+                answer = model.localise(scene.plan, grid, query)
                 believed = answer.confidence(bundle.manifest.confidence_for(view=True))
                 confidence[kind].append(math.nan if believed is None else believed.position)
     return {kind: _summary(found) for kind, found in confidence.items()}
@@ -108,16 +101,6 @@ def landscape(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     below = elevation < 0.0
     picture[below] = patches[below][..., None] * rng.uniform(60.0, 150.0, 3)
     return picture.clip(0.0, 255.0).astype(np.uint8)
-
-
-def _opened(picture: UInt8[np.ndarray, "h w 3"], field_deg: float, bundle: Bundle) -> Photograph:
-    content = io.BytesIO()
-    Image.fromarray(picture).save(content, "JPEG", quality=90)
-    stated = StatedCamera(projection="perspective", hfov_deg=field_deg)
-    manifest = bundle.manifest
-    return open_photograph(
-        content.getvalue(), sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
-    )
 
 
 def _summary(confidence: list[float]) -> dict[str, float]:

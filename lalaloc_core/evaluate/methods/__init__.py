@@ -4,6 +4,6 @@ Begin with `method.py`, the question and the answer. `lalaloc.py` is this projec
 `decode.py` are the paper's baselines. `similarity.py` retrieves with the true layout or pose.
 """
 
-from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Question
+from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question
 
-__all__ = ["Answer", "FoundPose", "Method", "Question"]
+__all__ = ["Answer", "Method", "Pose", "Question"]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch.nn import functional
 
-from lalaloc_core.evaluate.methods.alignment import depth_aligner
+from lalaloc_core.evaluate.methods.explicit import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.evaluate.methods.method import Answer, Question
 from lalaloc_core.localise.encode.encoders import Encoders

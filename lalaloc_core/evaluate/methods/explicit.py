@@ -7,25 +7,43 @@ prediction takes the ceiling of the room that it is compared with.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import read_image
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
 from lalaloc_core.localise.encode.encoders import Encoders
-from lalaloc_core.localise.refine import RefinementJob
+from lalaloc_core.localise.refine import LpoConfig, RefinementJob
+from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock
 from lalaloc_core.localise.search.vogel import disc_poses
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.sampling import PoseSet
+
+
+def depth_aligner(*, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> PoseOptimiser:
+    """Return an optimiser that moves poses within their rooms until their layout depths match target images.
+
+    The targets of its jobs are flattened depth images (m), rows first; its costs are mean absolute differences (m).
+    `columns` are those of the rendered wall profiles, of which the images keep every `thinning`-th. `config` has the
+    margins and Adam's schedule.
+    """
+
+    def depth(
+        profile_m: Float[Tensor, "k w"], camera_height_m: Float[Tensor, "k"], ceiling_height_m: Float[Tensor, "k"]
+    ) -> Float[Tensor, "k d"]:
+        return layout_depth(profile_m[:, ::thinning], camera_height_m, ceiling_height_m, rows).flatten(1)
+
+    return PoseOptimiser(depth, columns, norm="l1", config=replace(config or LpoConfig(), method="adam"))
+
 
 _ROWS = 32
 
@@ -56,7 +74,7 @@ class ExplicitLayout:
             profile_m, heading = self._profile(question, image)
         with clock.stage("retrieve"):
             retrieved, distance = grid.nearest(profile_m)
-        stages = {"retrieval": _pose(question, question.grid, retrieved, distance)}
+        stages = {"retrieval": question.pose_of(question.grid, retrieved, distance)}
         with clock.stage("vdr"):
             config = self._config
             radius_m = config.vdr_radius_steps * question.grid_step_m
@@ -64,7 +82,7 @@ class ExplicitLayout:
             disc, _ = disc_poses(plan, centre, samples=config.vdr_samples, radius_m=radius_m)
             # The disc contains its centre, so its nearest pose is at least as near as the retrieved one.
             nearest, distance = self._rendered(question, disc, heading).nearest(profile_m)
-            stages["vdr"] = _pose(question, disc, nearest, distance)
+            stages["vdr"] = question.pose_of(disc, nearest, distance)
         with clock.stage("align"):
             stages["align"] = self._align(question, profile_m, heading, stages["vdr"])
         return Answer(stages=stages, retrieved=retrieved, timings_ms=clock.timings_ms)
@@ -88,14 +106,12 @@ class ExplicitLayout:
         depth = layout_depth(profile, camera, ceiling, _ROWS).astype(np.float32)
         return _RenderedPoses(depth, question.camera.camera_height_m, ceiling)
 
-    def _align(
-        self, question: Question, profile_m: Float[np.ndarray, "w"], heading: float, start: FoundPose
-    ) -> FoundPose:
+    def _align(self, question: Question, profile_m: Float[np.ndarray, "w"], heading: float, start: Pose) -> Pose:
         room = np.array([start.room_index])
         camera, ceiling = np.array([question.camera.camera_height_m]), question.plan.ceiling_heights_m[room]
         job = RefinementJob(
             targets=layout_depth(profile_m[None], camera, ceiling, _ROWS).reshape(1, -1),
-            position_m=np.array([[start.x_m, start.y_m]]),
+            position_m=start.position_m[None],
             heading=np.array([heading]),
             walls_m=question.plan.walls_m[room],
             camera_height_m=camera,
@@ -103,8 +119,7 @@ class ExplicitLayout:
             optimise_heading=False,
         )
         aligned = self._aligner.refine(job)
-        poses = PoseSet(aligned.position_m, room)
-        return _pose(question, poses, 0, float(aligned.cost[0]))
+        return Pose.at(aligned.position_m[0], start.room_index, question.camera.heading, float(aligned.cost[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +140,3 @@ class _RenderedPoses:
             distance[below] = np.abs(self.depth_m[below] - depth.astype(np.float32)).mean(axis=(1, 2))
         index = int(distance.argmin())
         return index, float(distance[index])
-
-
-def _pose(question: Question, poses: PoseSet, index: int, distance: float) -> FoundPose:
-    return FoundPose(
-        x_m=float(poses.position_m[index, 0]),
-        y_m=float(poses.position_m[index, 1]),
-        room_index=int(poses.room_index[index]),
-        heading=question.camera.heading,
-        distance=distance,
-    )

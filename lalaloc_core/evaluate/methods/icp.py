@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, plan_key
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Question, plan_key
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.search.pipeline import StageClock
 
@@ -97,14 +97,10 @@ class Icp:
             best = int(aligned.rms_m.argmin())
         position = aligned.shift_m[best]
         room = int(plan.room_index_at(position[None])[0])
-        found = FoundPose(
-            x_m=float(position[0]),
-            y_m=float(position[1]),
-            room_index=room if room >= 0 else int(question.grid.room_index[best]),
-            # Turns are counter-clockwise, azimuths clockwise.
-            heading=float(wrap_angle(question.camera.heading - aligned.turn[best])),
-            distance=float(aligned.rms_m[best]),
-        )
+        room = room if room >= 0 else int(question.grid.room_index[best])
+        # Turns are counter-clockwise, azimuths clockwise.
+        heading = float(wrap_angle(question.camera.heading - aligned.turn[best]))
+        found = Pose.at(position, room, heading, float(aligned.rms_m[best]))
         return Answer(stages={"icp": found}, timings_ms=clock.timings_ms)
 
     def _scan(self, question: Question) -> Float[np.ndarray, "n 2"]:

@@ -16,17 +16,19 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
-from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
+from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.encoders import Encoders
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
-from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, Refiner, StageClock, localise
+from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, Refiner, StageClock, localise
+from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
@@ -104,7 +106,9 @@ class LaLaLoc:
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
             candidates=tuple(
-                FoundCandidate(pose=found_pose(found.query, candidate), terms=candidate.terms, probability=probability)
+                PredictedCandidate(
+                    pose=found_pose(found.query, candidate), terms=candidate.terms, probability=probability
+                )
                 for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
             ),
             retrieved=grid_index(grid, found.best["retrieval"]),
@@ -148,6 +152,40 @@ def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
     return PoseRefiner.from_bundle(bundle, config).refine
 
 
+# Step of the grids of `LocalModel`.
+GRID_STEP_M = 0.5
+
+
+class LocalModel:
+    """Model that localises photographs in this process, on one thread."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.encoder = PhotographEncoder(bundle, threads=1)
+        self.networks = self.encoder.networks
+        self.refiner = local_refiner(bundle)
+
+    def grid(self, plan: FloorPlan, camera_height_m: float) -> PoseGrid:
+        """Compute the pose grid of a plan, with latents if the model compares only these."""
+        latents = not self.networks.predicts_profile
+        return build_grid(plan, self.networks, step_m=GRID_STEP_M, camera_height_m=camera_height_m, latents=latents)
+
+    def open(self, content: bytes, stated: StatedCamera | None = None) -> Photograph:
+        """Read a photograph in the sizes that the model needs.
+
+        Raises:
+            InvalidPhotographError: the photograph cannot be read.
+        """
+        manifest = self.bundle.manifest
+        return open_photograph(
+            content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
+        )
+
+    def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
+        """Search a plan."""
+        return localise(plan, grid, self.networks, query, refiner=self.refiner)
+
+
 def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return the photograph of a panorama query at the encoder's size; None for layout queries.
 
@@ -182,15 +220,10 @@ def encode(
     return Query(latents, rolls, 0.0, heading_known=question.heading_known, camera_height=height, profile=profile)
 
 
-def found_pose(query: Query, candidate: Candidate) -> FoundPose:
+def found_pose(query: Query, candidate: Candidate) -> Pose:
     """Return a candidate as a pose of the panorama."""
-    return FoundPose(
-        x_m=candidate.x_m,
-        y_m=candidate.y_m,
-        room_index=candidate.room_index,
-        heading=photograph_heading(query, candidate),
-        distance=candidate.cost,
-    )
+    heading = photograph_heading(query, candidate)
+    return Pose.at(candidate.position_m, candidate.room_index, heading, candidate.cost)
 
 
 def grid_index(grid: PoseGrid, candidate: Candidate) -> int:

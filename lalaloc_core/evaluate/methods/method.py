@@ -9,6 +9,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph
@@ -40,6 +41,10 @@ class Question:
         """Ceiling height of the true room, part of the true layout."""
         return float(self.plan.ceiling_heights_m[self.camera.room_index])
 
+    def pose_of(self, poses: PoseSet, index: int, distance: float | None = None) -> Pose:
+        """Return one of some poses, with the camera's heading."""
+        return Pose.at(poses.position_m[index], poses.room_index[index], self.camera.heading, distance)
+
     def true_profile(self, columns: int) -> Float[np.ndarray, "{columns}"]:
         """Return the wall profile (m) of the true pose at heading 0, for layout queries and oracles."""
         room = np.array([self.camera.room_index])
@@ -57,21 +62,40 @@ class Question:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoundPose:
-    """Predicted pose; `heading` in radians, `distance` by the method's own measure."""
+class Pose:
+    """Pose in a plan; `distance` to the query by the method's own measure, None without one."""
 
     x_m: float
     y_m: float
     room_index: int
-    heading: float
+    heading_deg: float
     distance: float | None = None
+
+    @classmethod
+    def at(
+        cls, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, distance: float | None = None
+    ) -> Pose:
+        """Return the pose at a position, with a heading in radians."""
+        x_m, y_m = map(float, position_m)
+        heading_deg = heading_to_degrees(heading)
+        return cls(x_m=x_m, y_m=y_m, room_index=int(room_index), heading_deg=heading_deg, distance=distance)
+
+    @property
+    def position_m(self) -> Float[np.ndarray, "2"]:
+        """Position in the plan frame."""
+        return np.array([self.x_m, self.y_m])
+
+    @property
+    def heading(self) -> float:
+        """Heading in radians."""
+        return heading_from_degrees(self.heading_deg)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoundCandidate:
+class PredictedCandidate:
     """Candidate pose with its terms of the matching cost and its posterior probability."""
 
-    pose: FoundPose
+    pose: Pose
     terms: dict[str, float]
     probability: float
 
@@ -89,8 +113,8 @@ class Answer:
         heading_confidence: probability of a heading error below 5°; None without a confidence model.
     """
 
-    stages: dict[str, FoundPose] = field(default_factory=dict)
-    candidates: tuple[FoundCandidate, ...] = ()
+    stages: dict[str, Pose] = field(default_factory=dict)
+    candidates: tuple[PredictedCandidate, ...] = ()
     retrieved: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: Float[np.ndarray, "p p"] | None = None

@@ -7,6 +7,7 @@ with every pose. `SimilarityRetrieval` and `PoseOracle` use the true layout or p
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Literal, get_args
@@ -19,7 +20,7 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Question, grid_key
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.search.pipeline import StageClock
 from lalaloc_core.render.depth import back_project, layout_depth
@@ -67,7 +68,27 @@ def layouts_at(
     return profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[rooms]
 
 
-class ChamferGrid:
+class _Grid(ABC):
+    """Layouts of poses, compared with a query whose wall profile has `columns` columns."""
+
+    columns: int
+
+    @abstractmethod
+    def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
+        """Return the distance of the query to every pose."""
+
+    def nearest(self, query: Layout) -> int:
+        """Return the index of the pose nearest to the query."""
+        return int(self.distances(query).argmin())
+
+    def _check_columns(self, query: Layout) -> None:
+        if len(query.profile_m) != self.columns:
+            raise InvalidInputError(
+                f"the query's wall profile has {len(query.profile_m)} columns; this grid needs {self.columns}"
+            )
+
+
+class ChamferGrid(_Grid):
     """Symmetric Chamfer distance (m) between back-projected point clouds, see `learn.metrics.chamfer_distance`."""
 
     def __init__(
@@ -110,7 +131,7 @@ class ChamferGrid:
         return best_index
 
     def _pair(self, query: Layout) -> _Comparison:
-        _require_columns(query, self.columns)
+        self._check_columns(query)
         return _Comparison(self._depth_m, self._clouds_m, query)
 
 
@@ -147,7 +168,7 @@ class _Comparison:
         return float(KDTree(self._clouds_m[index]).query(searched)[0].sum()) / len(self._query_m)
 
 
-class DepthGrid:
+class DepthGrid(_Grid):
     """Mean absolute difference of layout depth images, in metres or relative to each image's maximum."""
 
     def __init__(
@@ -166,20 +187,16 @@ class DepthGrid:
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
         """Return the distance of the query to every pose."""
-        _require_columns(query, self.columns)
+        self._check_columns(query)
         depth = self._scaled(query.depth_m(self._depth.shape[1])[None])
         return np.abs(self._depth - depth).mean(axis=(1, 2), dtype=np.float64)
-
-    def nearest(self, query: Layout) -> int:
-        """Return the index of the pose nearest to the query."""
-        return int(self.distances(query).argmin())
 
     def _scaled(self, depth_m: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
         scale = depth_m.max(axis=(1, 2), keepdims=True) if self._relative else 1.0
         return (depth_m / scale).astype(np.float32)
 
 
-class EdgeGrid:
+class EdgeGrid(_Grid):
     """2-D Chamfer distance (pixels) between the edges of layouts as panoramas, which wrap around horizontally."""
 
     def __init__(
@@ -194,16 +211,12 @@ class EdgeGrid:
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
         """Return the distance of the query to every pose."""
-        _require_columns(query, self.columns)
+        self._check_columns(query)
         heights = np.array([query.camera_height_m]), np.array([query.ceiling_height_m])
         edges = edge_image(query.profile_m[None], *heights, self._rows)[0]
         to_poses = self._field[:, edges.ravel()].mean(axis=1, dtype=np.float64)
         to_query = np.bincount(self._owner, weights=distance_field(edges).ravel()[self._pixel])
         return to_poses + to_query / self._count
-
-    def nearest(self, query: Layout) -> int:
-        """Return the index of the pose nearest to the query."""
-        return int(self.distances(query).argmin())
 
 
 LayoutGrid = ChamferGrid | DepthGrid | EdgeGrid
@@ -259,13 +272,6 @@ def _corners(profile_m: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, "n w"]:
     return np.abs(neighbours - 2.0 * math.cos(step) * inverse) > _CORNER_BEND * step * inverse
 
 
-def _require_columns(query: Layout, columns: int) -> None:
-    if len(query.profile_m) != columns:
-        raise InvalidInputError(
-            f"the query's wall profile has {len(query.profile_m)} columns; this grid needs {columns}"
-        )
-
-
 class SimilarityRetrieval:
     """Retrieval of the grid pose whose layout is nearest the true layout (table "Layout-similarity metric").
 
@@ -301,10 +307,5 @@ class PoseOracle:
 
 
 def _retrieved(question: Question, index: int, clock: StageClock) -> Answer:
-    found = FoundPose(
-        x_m=float(question.grid.position_m[index, 0]),
-        y_m=float(question.grid.position_m[index, 1]),
-        room_index=int(question.grid.room_index[index]),
-        heading=question.camera.heading,
-    )
+    found = question.pose_of(question.grid, index)
     return Answer(stages={"retrieval": found}, retrieved=index, timings_ms=clock.timings_ms)

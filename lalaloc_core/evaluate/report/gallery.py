@@ -21,10 +21,9 @@ from lalaloc_core.evaluate.report.pictures import (
     draw_panorama,
 )
 from lalaloc_core.evaluate.report.reading import Run
-from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
+from lalaloc_core.evaluate.report.reopening import ReopenedRun
 from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
-from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
+from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.localise.encode.encoders import Encoders
@@ -123,11 +122,8 @@ class _CardWriter:
         Raises:
             DatasetError, InvalidInputError: the data set is missing or has changed.
         """
-        self._run = run
-        self._dataset = build_dataset(run.info)
-        self._appearance = choose_appearance(self._dataset, run.info.furniture, run.info.lighting)
-        self._left_out = left_out
-        self._encoders = _open_encoders(run.info, left_out)
+        self._run, self._reopened, self._left_out = run, ReopenedRun(run.info), left_out
+        self._encoders = _open_encoders(self._reopened, left_out)
         self._errors_m = position_errors_m(run.predictions)
         self._heading_errors_deg = heading_errors_deg(run.predictions)
         self._outcomes = outcomes(run.predictions)
@@ -139,8 +135,8 @@ class _CardWriter:
             DatasetError: the scene is missing or has changed.
         """
         prediction = self._run.predictions[index]
-        scene, camera = find_camera(self._dataset, prediction)
-        question = repeat_question(self._run.info, scene, camera, self._appearance)
+        scene, camera = self._reopened.find_camera(prediction)
+        question = self._reopened.question(scene, camera)
         pose = prediction.final_pose
         return Card(
             scene=prediction.scene,
@@ -162,20 +158,20 @@ class _CardWriter:
 
     def _panorama(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[EncodedPicture]:
         try:
-            image = scene.photograph(camera, self._appearance).image(PANORAMA_HEIGHT, PANORAMA_WIDTH)
+            image = self._reopened.photograph(scene, camera).image(PANORAMA_HEIGHT, PANORAMA_WIDTH)
         except (LaLaLocError, OSError) as error:
             self._left_out.append(f"A panorama is left out: {error}.")
             return []
         return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.final_pose)]
 
 
-def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
+def _open_encoders(run: ReopenedRun, left_out: list[str]) -> Encoders | None:
     """Return the run's model, or None if the method compares no latents or the model is missing."""
-    if info.method not in _LATENT_METHODS:
-        left_out.append(f"Method “{info.method}” compares no latents, so there is no map of latent distances.")
+    if run.info.method not in _LATENT_METHODS:
+        left_out.append(f"Method “{run.info.method}” compares no latents, so there is no map of latent distances.")
         return None
     try:
-        return open_model(info)
+        return run.open_model()
     except (LaLaLocError, OSError) as error:
         left_out.append(f"The maps of latent distances are left out, because the model cannot be opened: {error}.")
         return None

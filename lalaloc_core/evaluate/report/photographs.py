@@ -22,25 +22,26 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR
-from lalaloc_core.evaluate.report.sheets import Thumbnail, draw_sheet
+from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.tables import percent
 from lalaloc_core.evaluate.runs.factories import describe_model
-from lalaloc_core.evaluate.runs.foreign import ACCEPTED, foreign_confidences, foreign_plans
 from lalaloc_core.evaluate.runs.galleries import (
+    ACCEPTED,
     GalleryAnswer,
     GalleryScores,
     answers_in_galleries,
     describe_answers,
+    foreign_confidences,
+    foreign_plans,
     score_galleries,
 )
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.azimuth_metrics import ClassScores, summarise_azimuths
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
+from lalaloc_core.learn.metrics import ClassScores, summarise_azimuths
 from lalaloc_core.localise.encode.encoders import Encoders
 
 _HEIGHT, _WIDTH = 256, 512
@@ -244,8 +245,6 @@ def evaluate_photographs(
         per_camera = 1 if field_deg is None else _VIEWS
         info = RunInfo(
             label=f"photographs in galleries, {name}",
-            method="lalaloc",
-            kind="panorama",
             dataset=dataset.description,
             split="test",
             data=str(data),

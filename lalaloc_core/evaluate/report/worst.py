@@ -18,21 +18,33 @@ from jaxtyping import Float
 from PIL import Image
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
+from lalaloc_core.conventions import TWO_PI, column_azimuths
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
-from lalaloc_core.evaluate.report.pictures import FOUND_COLOUR, PREDICTED_COLOUR, TRUE_COLOUR, layout_lines
-from lalaloc_core.evaluate.report.reopening import find_camera, open_model, repeat_question
-from lalaloc_core.evaluate.report.sheets import PER_SHEET, PICTURE_HEIGHT, PICTURE_WIDTH, Thumbnail, draw_sheet
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.report.pictures import (
+    FOUND_COLOUR,
+    PER_SHEET,
+    PICTURE_HEIGHT,
+    PICTURE_WIDTH,
+    PREDICTED_COLOUR,
+    TRUE_COLOUR,
+    Thumbnail,
+    draw_sheet,
+    layout_lines,
+)
+from lalaloc_core.evaluate.report.reopening import ReopenedRun
 from lalaloc_core.evaluate.report.tables import distance, percent
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.predictions import (
+    Prediction,
+    RunFolder,
+    RunInfo,
+)
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import PoseSet
@@ -196,10 +208,8 @@ class _QueryAnalyser:
     """Data set and model of a run, reopened to analyse its queries."""
 
     def __init__(self, info: RunInfo) -> None:
-        self._info = info
-        self._dataset = build_dataset(info)
-        self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
-        encoders = None if info.bundle is None else open_model(info)
+        self._run = ReopenedRun(info)
+        encoders = None if info.bundle is None else self._run.open_model()
         self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
 
     def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
@@ -208,15 +218,16 @@ class _QueryAnalyser:
         Raises:
             DatasetError: the query is missing or has changed.
         """
-        scene, camera = find_camera(self._dataset, prediction)
-        image = scene.photograph(camera, self._appearance).image(PICTURE_HEIGHT, PICTURE_WIDTH)
+        scene, camera = self._run.find_camera(prediction)
+        image = self._run.photograph(scene, camera).image(PICTURE_HEIGHT, PICTURE_WIDTH)
         found, height = prediction.final_pose, camera.camera_height_m
         strokes = [_layout(scene, prediction.truth, height, TRUE_COLOUR, 3.0)]
         if found is not None:
             strokes.append(_layout(scene, found, height, FOUND_COLOUR, 1.5))
         fit: dict[str, float | None] = {}
         if self._encoders is not None:
-            query = self._encode(self._encoders, scene, camera)
+            question = self._run.question(scene, camera)
+            query = encode(self._encoders, question, read_image(self._encoders, question))
             floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
             strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
@@ -242,10 +253,6 @@ class _QueryAnalyser:
         )
         return worst, draw_strokes(image, strokes)
 
-    def _encode(self, encoders: Encoders, scene: Scene, camera: Camera) -> Query:
-        question = repeat_question(self._info, scene, camera, self._appearance)
-        return encode(encoders, question, read_image(encoders, question))
-
 
 def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width: float) -> Stroke:
     lines = layout_lines(scene.plan, pose, camera_height_m, PICTURE_HEIGHT, PICTURE_WIDTH)
@@ -256,8 +263,8 @@ def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> f
     """Return the matching cost of a pose."""
     assert query.profile is not None
     config = MatchingConfig()
-    poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
-    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
+    poses = PoseSet(pose.position_m[None], np.array([pose.room_index]))
+    heading = np.array([pose.heading - query.roll[0]])
     layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
     cost, _ = MatchingCost(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
     return float(cost[0, 0])
@@ -272,6 +279,6 @@ def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
 
 def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
     """Return the log wall profile (m) of a pose, in the frame of the query's first hypothesis."""
-    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
-    position_m, room = np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index])
+    heading = np.array([pose.heading - query.roll[0]])
+    position_m, room = pose.position_m[None], np.array([pose.room_index])
     return np.log(profiles_at(scene.plan, position_m, room, heading, columns))

@@ -7,26 +7,25 @@ schedule, the same for every row of a table.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.evaluate.reproduce.table import Budget
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
+from lalaloc_core.learn.training.run import StageName, train_stage
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.render.sampling import TripletSampling
 
-Budget = Literal["small", "full"]
 BUDGETS: tuple[Budget, ...] = get_args(Budget)
 BASE = "paper"
 _BUNDLE = "bundle"
@@ -38,7 +37,7 @@ class Ablation:
     """Trained variant; `layout_from` is the variant whose layout encoder it uses, None for its own."""
 
     config: dict[Budget, TrainConfig]
-    stages: tuple[Literal["layout", "image", "end-to-end"], ...]
+    stages: tuple[StageName, ...]
     layout_from: str | None = None
 
 
@@ -146,15 +145,10 @@ def train_ablation(
     teacher = folder
     if ablation.layout_from is not None:
         teacher = out / ablation.layout_from
-        _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, train_layout, common)
+        _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, common)
     trained = False
     for stage in ablation.stages:
-        if stage == "layout":
-            trained |= _finish(stage, config, folder, train_layout, common)
-        elif stage == "image":
-            trained |= _finish(stage, config, folder, train_image, {**common, "teacher": teacher})
-        else:
-            trained |= _finish(stage, config, folder, train_end_to_end, common)
+        trained |= _finish(stage, config, folder, common | ({"teacher": teacher} if stage == "image" else {}))
     bundle = folder / _BUNDLE
     if not trained and (bundle / MANIFEST_NAME).exists():
         return Bundle.open(bundle)
@@ -171,9 +165,7 @@ def train_ablation(
     )
 
 
-def _finish(
-    stage: str, config: TrainConfig, folder: Path, train: Callable[..., Checkpoint], arguments: dict[str, Any]
-) -> bool:
+def _finish(stage: StageName, config: TrainConfig, folder: Path, arguments: dict[str, Any]) -> bool:
     """Train a stage to its end; return False if it already was."""
     path = folder / f"{stage}.pt"
     exists = path.exists()
@@ -185,5 +177,5 @@ def _finish(
             return False
     # The earlier export is out of date.
     (folder / _BUNDLE / MANIFEST_NAME).unlink(missing_ok=True)
-    train(config, folder, resume=exists, **arguments)
+    train_stage(stage, config, folder, resume=exists, **arguments)
     return True

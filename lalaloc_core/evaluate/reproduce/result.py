@@ -7,16 +7,13 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import matplotlib.figure
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, RunError
-from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, SHARES
+from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, SHARES, Budget
 from lalaloc_core.evaluate.runs.predictions import without_infinity
-
-Budget = Literal["small", "full"]
 
 
 @dataclass(frozen=True, kw_only=True)

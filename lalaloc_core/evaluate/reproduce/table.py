@@ -10,6 +10,7 @@ from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.predictions import MethodName
 from lalaloc_core.learn.data.dataset import Split
 
+Budget = Literal["small", "full"]
 # Columns: fields of `evaluate.runs.score.Scores` and its `StageScores`, or seconds per query of a stage
 # ("seconds:vdr") or of all stages ("seconds").
 Column = str

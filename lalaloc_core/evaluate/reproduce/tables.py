@@ -39,30 +39,28 @@ def _row(group: str, name: str, query: RowQuery, columns: Sequence[Column] = (),
     return Row(group=group, name=name, query=query, paper=_paper(columns, *figures))
 
 
+def _table(name: str, title: str, source: str, columns: Sequence[Column], *rows: Row) -> Table:
+    return Table(name=name, title=title, source=source, split="test", columns=tuple(columns), rows=rows)
+
+
 def _localisation() -> Table:
     columns = (*_RECALL, *_ACCURACY)
     explicit, decode = (RowQuery(method=method, model=SHIPPED) for method in ("explicit", "decode"))
     explicit_layout, decode_layout = (replace(query, kind="layout") for query in (explicit, decode))
-    return Table(
-        name="localisation",
-        title="Localisation with a floor plan prior",
-        source="tab:localisation",
-        split="test",
-        columns=columns,
-        rows=(
-            _row("", _ORACLE, _ORACLE_QUERY, columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
-            _row(_LAYOUT, "2D ICP", _ICP_LAYOUT, columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
-            _row(_LAYOUT, "Explicit layout + localisation", explicit_layout),
-            _row(_LAYOUT, "VDR + decode, shipped model", decode_layout),
-            _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
-            _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
-            _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
-            _row(_PANORAMA, _HORIZON_NET, explicit, columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
-            _row(_PANORAMA, "VDR + decode, shipped model", decode),
-            _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
-            _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
-        ),
+    rows = (
+        _row("", _ORACLE, _ORACLE_QUERY, columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
+        _row(_LAYOUT, "2D ICP", _ICP_LAYOUT, columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
+        _row(_LAYOUT, "Explicit layout + localisation", explicit_layout),
+        _row(_LAYOUT, "VDR + decode, shipped model", decode_layout),
+        _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
+        _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
+        _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
+        _row(_PANORAMA, _HORIZON_NET, explicit, columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
+        _row(_PANORAMA, "VDR + decode, shipped model", decode),
+        _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
+        _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
     )
+    return _table("localisation", "Localisation with a floor plan prior", "tab:localisation", columns, *rows)
 
 
 def _coarse_grid() -> Table:
@@ -76,14 +74,8 @@ def _coarse_grid() -> Table:
         _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 11.5, 0.026, 0.461, 0.795),
         _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
     )
-    return Table(
-        name="coarse-grid",
-        title="Localisation on a 1 m grid",
-        source="tab:1m_refinement",
-        split="test",
-        columns=columns,
-        rows=tuple(replace(row, query=replace(row.query, grid_step_m=1.0)) for row in rows),
-    )
+    coarse = [replace(row, query=replace(row.query, grid_step_m=1.0)) for row in rows]
+    return _table("coarse-grid", "Localisation on a 1 m grid", "tab:1m_refinement", columns, *coarse)
 
 
 def _furniture() -> Table:
@@ -100,14 +92,7 @@ def _furniture() -> Table:
             _row(group, _PAPER, _lalaloc("paper", furniture=level), _RETRIEVAL, *lalaloc),
             _row(group, _OURS, _lalaloc(SHIPPED, furniture=level)),
         ]
-    return Table(
-        name="furniture",
-        title="Level of furniture",
-        source="tab:furniture",
-        split="test",
-        columns=_RETRIEVAL,
-        rows=tuple(rows),
-    )
+    return _table("furniture", "Level of furniture", "tab:furniture", _RETRIEVAL, *rows)
 
 
 def _refinement() -> Table:
@@ -130,14 +115,7 @@ def _refinement() -> Table:
         for model in ("paper", SHIPPED)
         for name, stage, method, settings, paper in figures
     ]
-    return Table(
-        name="refinement",
-        title="Pose refinement",
-        source="tab:refinement",
-        split="test",
-        columns=columns,
-        rows=tuple(rows),
-    )
+    return _table("refinement", "Pose refinement", "tab:refinement", columns, *rows)
 
 
 def _vogel_samples() -> Table:
@@ -151,15 +129,8 @@ def _vogel_samples() -> Table:
         for name, stage in (("VDR", "vdr"), ("VDR + LPO", None)):
             query = _lalaloc(SHIPPED, settings=settings)
             rows.append(Row(group=f"{samples} samples", name=name, query=query, stage=stage))
-    return Table(
-        name="vogel-samples",
-        title="Samples of the Vogel disc, with and without LPO",
-        source="fig:vdr_sample",
-        split="test",
-        columns=columns,
-        rows=tuple(rows),
-        form="figure",
-    )
+    title = "Samples of the Vogel disc, with and without LPO"
+    return replace(_table("vogel-samples", title, "fig:vdr_sample", columns, *rows), form="figure")
 
 
 def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, tuple[float, float, float]]) -> Table:
@@ -189,6 +160,7 @@ def _ablation(name: str, title: str, source: str, *rows: Row) -> Table:
     return Table(name=name, title=title, source=source, split="validation", columns=_RETRIEVAL, rows=rows)
 
 
+_FAST_PAPER = _lalaloc("paper", settings=_WITHOUT_VDR)
 _ORACLE_ON_VALIDATION = _row("", _ORACLE, _ORACLE_QUERY, _RETRIEVAL, 1.0, 0.908, 20.0)
 
 TABLES: tuple[Table, ...] = (
@@ -257,24 +229,14 @@ TABLES: tuple[Table, ...] = (
         _trained(_PANORAMA, "L2 + log-ratio′", "image-l2-log-ratio", "panorama", 0.607, 0.599, 24.6),
         _trained(_PANORAMA, "L2 + distilled log-ratio", "image-l2-kd", "panorama", 0.589, 0.569, 25.0),
     ),
-    Table(
-        name="time",
-        title="Time per stage",
-        source="tab:time",
-        split="test",
-        columns=_TIMES,
-        rows=(
+    replace(
+        _table(
+            "time",
+            "Time per stage",
+            "tab:time",
+            _TIMES,
             _row("", _ICP_DEPTH, _ICP, ("seconds",), 20.1),
-            _row(
-                "`paper`",
-                "LaLaLoc without VDR",
-                _lalaloc("paper", settings=_WITHOUT_VDR),
-                _TIMES,
-                0.05,
-                None,
-                2.33,
-                2.38,
-            ),
+            _row("`paper`", "LaLaLoc without VDR", _FAST_PAPER, _TIMES, 0.05, None, 2.33, 2.38),
             _row("`paper`", "LaLaLoc", _lalaloc("paper"), _TIMES, 0.05, 2.87, 1.73, 4.65),
             _row("shipped model", "LaLaLoc without VDR", _lalaloc(SHIPPED, settings=_WITHOUT_VDR)),
             _row("shipped model", "LaLaLoc", _lalaloc(SHIPPED)),

@@ -1,4 +1,4 @@
-"""Scores in galleries: retrieval of an annotated photograph's own room among similar rooms."""
+"""Annotated photographs in plans: retrieval of their own room among similar ones, and confidence in other buildings."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading_errors_deg, position_errors_m
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import GalleryKey
-from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
+from lalaloc_core.learn.heldout.homes import HomeKey, home_of
+from lalaloc_core.localise.query import CameraHeight
 
 # A position is right within this distance or this share of the room's size (the root of its area).
 NEAR_M, NEAR_SHARE = 0.5, 0.1
@@ -140,3 +146,40 @@ def describe_answers(answers: Sequence[GalleryAnswer], photograph: str) -> str:
         return "not evaluated"
     missed = [f"{answer.rank or 'none'}" for answer in own if not answer.located]
     return f"{len(own) - len(missed)} of {len(own)}" + (f" (ranks {', '.join(missed)})" if missed else "")
+
+
+# Five homes and five offices, each with and without openings; the fit of the confidence has other ones.
+_EACH, _HOMES, _OFFICES = 5, (2, 0), 77
+# Confidence above which a photograph counts as accepted.
+ACCEPTED = 0.5
+
+
+def foreign_plans() -> list[FloorPlan]:
+    """Return out-of-distribution homes and offices, each with openings and then without."""
+    homes = [home_of(HomeKey(*_HOMES, index)).plan.plan for index in range(_EACH)]
+    offices = [office_plan(np.random.default_rng([_OFFICES, index])) for index in range(_EACH)]
+    return [drawn for plan in homes + offices for drawn in (plan, without_openings(plan))]
+
+
+def foreign_confidences(
+    bundle: Bundle, photographs: Sequence[AnnotatedPhotograph], plans: Sequence[FloorPlan], *, heading_known: bool
+) -> list[float]:
+    """Return the confidence of every photograph in every plan; empty for a model without confidence.
+
+    A known heading is one at which the walls of the photographed room are parallel to the plan's axes.
+    """
+    if bundle.manifest.confidence is None:
+        return []
+    model = LocalModel(bundle)
+    height, size = CameraHeight(CAMERA_HEIGHT_M), (bundle.manifest.image_height, bundle.manifest.image_width)
+    images = [photograph.photograph.image(*size) for photograph in photographs]
+    found = []
+    for plan in plans:
+        grid = model.grid(plan, CAMERA_HEIGHT_M)
+        for photograph, image in zip(photographs, images, strict=True):
+            heading = photograph.outlines[0].main_direction if heading_known else None
+            answer = model.localise(plan, grid, model.networks.query(image, heading, height))
+            confidence = answer.confidence(bundle.manifest.confidence)
+            if confidence is not None:
+                found.append(confidence.position)
+    return found

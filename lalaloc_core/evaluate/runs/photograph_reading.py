@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import BundleError
-from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.query import CameraHeight
 

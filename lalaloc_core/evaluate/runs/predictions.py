@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, RunError
-from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.evaluate.methods.method import Pose, PredictedCandidate, QueryKind
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Split
 
@@ -30,26 +30,6 @@ PREDICTIONS_FILE = "predictions.jsonl"
 SCORES_FILE = "scores.json"
 
 MethodName = Literal["lalaloc", "oracle", "pose-oracle", "similarity", "icp", "explicit", "decode"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pose:
-    """Pose in a plan; `distance` to the query by the method's own measure, None without one."""
-
-    x_m: float
-    y_m: float
-    room_index: int
-    heading_deg: float
-    distance: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class PredictedCandidate:
-    """Candidate pose with its terms of the matching cost and its posterior probability."""
-
-    pose: Pose
-    terms: dict[str, float]
-    probability: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,10 +94,10 @@ class RunInfo:
     """
 
     label: str
-    method: MethodName
-    kind: QueryKind
     dataset: str
     split: Split
+    method: MethodName = "lalaloc"
+    kind: QueryKind = "panorama"
     settings: dict[str, Any] = field(default_factory=dict)
     data: str | None = None
     data_format: str | None = None

@@ -22,13 +22,20 @@ import torch
 from tqdm import tqdm
 
 from lalaloc_core.configuration import build_config
-from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
-from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Question
+from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
-from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes, photograph_facts
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.learn.data.dataset import (
+    Appearance,
+    Camera,
+    Dataset,
+    Scene,
+    collect_error,
+    load_scenes,
+    photograph_facts,
+)
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # Fields of a run that may differ when it resumes.
@@ -151,12 +158,8 @@ def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list
     for scene in load_scenes(session.dataset, [name], problems):
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
-            try:
+            with collect_error(problems):
                 predictions.append(evaluator.predict(camera, session.method))
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
     return predictions, problems or []
 
 
@@ -188,24 +191,19 @@ class _SceneEvaluator:
             heading_known=info.heading_known,
         )
         answer = method.locate(question)
-        x_m, y_m = camera.position_m
-        truth = FoundPose(x_m=float(x_m), y_m=float(y_m), room_index=camera.room_index, heading=camera.heading)
         return Prediction(
             scene=scene.name,
             camera=camera.name,
             room=scene.plan.rooms[camera.room_index].name,
             camera_height_m=camera.camera_height_m,
-            truth=_pose(truth),
-            stages={stage: _pose(found) for stage, found in answer.stages.items()},
+            truth=Pose.at(camera.position_m, camera.room_index, camera.heading),
+            stages=answer.stages,
             layout_hit=self._layout_hit(question, answer),
             pose_hit=self._pose_hit(camera, answer),
             room_rank=answer.rank_of_room(camera.room_index),
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
-            candidates=tuple(
-                PredictedCandidate(pose=_pose(candidate.pose), terms=candidate.terms, probability=candidate.probability)
-                for candidate in answer.candidates
-            ),
+            candidates=answer.candidates,
             confidence=answer.confidence,
             heading_confidence=answer.heading_confidence,
             found_height_m=answer.camera_height_m,
@@ -228,13 +226,3 @@ class _SceneEvaluator:
             return None
         distance = np.linalg.norm(self._grid.position_m - camera.position_m, axis=1)
         return int(distance.argmin()) == answer.retrieved
-
-
-def _pose(found: FoundPose) -> Pose:
-    return Pose(
-        x_m=found.x_m,
-        y_m=found.y_m,
-        room_index=found.room_index,
-        heading_deg=heading_to_degrees(found.heading),
-        distance=found.distance,
-    )

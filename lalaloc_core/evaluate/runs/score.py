@@ -19,6 +19,7 @@ from scipy.stats import binomtest
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import SCORES_FILE, Prediction, RunFolder, without_infinity
 from lalaloc_core.files import atomic_write
 
@@ -148,23 +149,23 @@ def score_run(folder: RunFolder) -> dict[str, Any]:
 
 def position_errors_m(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
     """Return the position errors (m) of the poses after a stage (None: the final poses); NaN without a pose."""
-    errors = np.full(len(predictions), np.nan)
-    for index, prediction in enumerate(predictions):
-        pose = prediction.pose_after(stage)
-        if pose is not None:
-            errors[index] = np.hypot(pose.x_m - prediction.truth.x_m, pose.y_m - prediction.truth.y_m)
-    return errors
+    return _errors(predictions, stage, lambda pose, truth: np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m))
 
 
 def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
     """Return the absolute heading errors (degrees) of the poses after a stage, as `position_errors_m`."""
-    errors = np.full(len(predictions), np.nan)
-    for index, prediction in enumerate(predictions):
-        pose = prediction.pose_after(stage)
-        if pose is not None:
-            difference = np.radians(pose.heading_deg - prediction.truth.heading_deg)
-            errors[index] = abs(np.degrees(float(wrap_angle(difference))))
-    return errors
+
+    def error_deg(pose: Pose, truth: Pose) -> float:
+        return abs(np.degrees(float(wrap_angle(np.radians(pose.heading_deg - truth.heading_deg)))))
+
+    return _errors(predictions, stage, error_deg)
+
+
+def _errors(
+    predictions: Sequence[Prediction], stage: str | None, error: Callable[[Pose, Pose], float]
+) -> Float[np.ndarray, "n"]:
+    poses = [(prediction.pose_after(stage), prediction.truth) for prediction in predictions]
+    return np.array([np.nan if pose is None else error(pose, truth) for pose, truth in poses], dtype=float)
 
 
 def reliability_bins(

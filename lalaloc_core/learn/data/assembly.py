@@ -16,7 +16,7 @@ from jaxtyping import Float
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, ROOM_TYPES
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, opening_entries
 from lalaloc_core.learn.data.polygon_rings import floor_without, largest_simple_part
 
 # Minimum area share of the largest simple part of an outline that crosses itself.

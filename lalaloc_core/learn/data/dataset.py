@@ -7,8 +7,9 @@ true pose with its photographs. Photographs are decoded on demand.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import ClassVar, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -139,6 +140,41 @@ class Dataset(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class HomeScenes:
+    """Base of data sets of generated homes with a few cameras each; `split_numbers` has their splits.
+
+    `homes` are per split. With `furniture` None each camera has its own level, which its photograph does not state.
+    """
+
+    split_numbers: ClassVar[dict[Split, int]]
+    homes: int
+    shots_per_home: int = 4
+    seed: int = 0
+    furniture: Literal["empty", "simple", "full"] | None = "full"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, with the configured furniture level."""
+        return (Appearance(self.furniture),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of a split's scenes; empty without such a split."""
+        return [f"{split}-{index:05d}" for index in range(self.homes)] if split in self.split_numbers else []
+
+    def home_number(self, name: str) -> tuple[int, int]:
+        """Return the numbers of a scene's split and home.
+
+        Raises:
+            DatasetError: there is no such scene.
+        """
+        split, _, index = name.partition("-")
+        number = next((n for known, n in self.split_numbers.items() if known == split), None)
+        if number is None or not index.isdecimal():
+            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
+        return number, int(index)
+
+
 def load_scenes(dataset: Dataset, names: Iterable[str], problems: list[DatasetError] | None = None) -> Iterator[Scene]:
     """Load scenes one after another.
 
@@ -148,9 +184,24 @@ def load_scenes(dataset: Dataset, names: Iterable[str], problems: list[DatasetEr
         DatasetError: a scene or camera cannot be used and `problems` is None.
     """
     for name in names:
-        try:
+        with collect_error(problems):
             yield dataset.load(name, problems)
-        except DatasetError as error:
-            if problems is None:
-                raise
-            problems.append(error)
+
+
+@contextmanager
+def collect_error(problems: list[DatasetError] | None) -> Iterator[None]:
+    """Append an error to `problems` instead of raising it; None raises it."""
+    try:
+        yield
+    except DatasetError as error:
+        if problems is None:
+            raise
+        problems.append(error)
+
+
+class WithoutDepth:
+    """Base of photographs that have no depth."""
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        """Raise an error: there is no depth."""
+        raise DatasetError(f"photographs of kind '{type(self).__name__}' have no depth")

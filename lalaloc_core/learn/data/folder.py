@@ -25,7 +25,7 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.assembly import path_below, pose_fault
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split, collect_error
 from lalaloc_core.learn.data.photographs import FilePhotograph
 
 PLAN_FILE = "plan.json"
@@ -67,15 +67,11 @@ class OwnData:
         plan = _read_plan(folder / PLAN_FILE, name)
         cameras: dict[str, Camera] = {}
         for row in _read_table(folder / POSES_FILE, _REQUIRED, _OPTIONAL, scene=name):
-            try:
+            with collect_error(problems):
                 camera = _camera(row, plan, folder)
                 if camera.name in cameras:
                     raise row.error("panorama", "it is a duplicate of an earlier line")
                 cameras[camera.name] = camera
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
         return Scene(name=name, plan=plan, cameras=tuple(cameras.values()))
 
     @cached_property

@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening
-from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom, plan_of_rooms
 from lalaloc_core.learn.synth.homes.plans import generate_home
 
 GALLERY_ROOMS = 20

@@ -22,10 +22,32 @@ import numpy as np
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split, collect_error
 from lalaloc_core.learn.data.photographs import FilePhotograph
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
-from lalaloc_core.learn.data.structured3d_splits import scene_numbers
+
+# Scene numbers of the official splits.
+OFFICIAL: dict[Split, range] = {"train": range(3000), "validation": range(3000, 3250), "test": range(3250, 3500)}
+
+# "Some scenes had corrupted data" (paper, section 5), as listed in the authors' published code.
+EXCLUDED_BY_PAPER: dict[Split, tuple[int, ...]] = {
+    "train": (
+        *(278, 335, 379, 683, 1192, 1212, 1753, 1840, 1852, 1855, 2025),
+        *(2110, 2205, 2209, 2223, 2309, 2339, 2357, 2401, 2593, 2956),
+    ),
+    "validation": (3086, 3117, 3121, 3239),
+    "test": (3307,),
+}
+
+# "Invalid scenes" in the errata of the data set; scenes listed only here are kept so that results are comparable.
+ERRATA = (1155, 1192, 1714, 1816, 1852, 3398)
+
+
+def scene_numbers(split: Split) -> tuple[int, ...]:
+    """Return the numbers of a split's scenes without those excluded by the paper: 2979, 246 and 249 remain."""
+    excluded = set(EXCLUDED_BY_PAPER[split])
+    return tuple(number for number in OFFICIAL[split] if number not in excluded)
+
 
 ANNOTATION_FILE = "annotation_3d.json"
 RENDERING_FOLDER = "2D_rendering"
@@ -63,7 +85,7 @@ class Synthetic:
 class Structured3D:
     """Copy of Structured3D or a part of it, or generated scenes in its layout.
 
-    Scenes excluded by the paper are not in the splits, see `structured3d_splits`.
+    Scenes excluded by the paper are not in the splits, see `EXCLUDED_BY_PAPER`.
     """
 
     root: Path
@@ -118,12 +140,8 @@ class Structured3D:
             # Some rooms have perspective pictures only.
             if not (folder / "panorama").is_dir():
                 continue
-            try:
+            with collect_error(problems):
                 cameras.append(self._camera(annotation, name, folder.name, folder / "panorama"))
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
         return Scene(name=name, plan=annotation.plan, cameras=tuple(cameras))
 
     def _camera(self, annotation: Annotation, scene: str, room: str, folder: Path) -> Camera:

@@ -13,12 +13,20 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split
+from lalaloc_core.learn.data.dataset import (
+    Appearance,
+    Camera,
+    Dataset,
+    DatasetPhotograph,
+    Scene,
+    Split,
+    WithoutDepth,
+)
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph, open_photograph
@@ -122,7 +130,7 @@ class CachedSphere:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ViewPhotograph:
+class ViewPhotograph(WithoutDepth):
     """Part of a sphere, as an ordinary camera takes it.
 
     Attributes:
@@ -142,8 +150,6 @@ class ViewPhotograph:
 
     def open(self, size: PatchSize) -> Photograph:
         """Read the photograph as the service reads a file."""
-        content = io.BytesIO()
-        Image.fromarray(self._pixels()).save(content, "JPEG", quality=_JPEG_QUALITY)
         tilted = self.stated == "tilt"
         stated = StatedCamera(
             projection="perspective",
@@ -151,20 +157,23 @@ class ViewPhotograph:
             pitch_deg=math.degrees(self.pitch) if tilted else None,
             roll_deg=math.degrees(self.roll) if tilted else None,
         )
-        return open_photograph(content.getvalue(), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
+        return open_photograph(encode_jpeg(self._pixels()), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return the whole sphere at the given size, turned to the view."""
         pixels = self.sphere.photograph.image(height, width)
         return np.roll(pixels, -round(self.azimuth / TWO_PI * width), axis=1)
 
-    def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Raise an error: there is no depth."""
-        raise DatasetError("views have no depth")
-
     def _pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         camera = Perspective.of_hfov(*_VIEW_SIZE, math.radians(self.field_deg))
         return cut_view(self.sphere.pixels, camera, azimuth=self.azimuth, pitch=self.pitch, roll=self.roll)
+
+
+def encode_jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Return a picture as a JPEG file."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, "JPEG", quality=_JPEG_QUALITY)
+    return content.getvalue()
 
 
 def cut_view(

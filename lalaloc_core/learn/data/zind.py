@@ -26,8 +26,8 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, path_below, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split, collect_error
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening
 from lalaloc_core.learn.data.photographs import FilePhotograph
 
 DATA_FILE = "zind_data.json"
@@ -139,12 +139,8 @@ class _FloorReader:
         rooms = {room: places[outline.name] for room, outline in outlines.items() if outline.name in places}
         cameras = []
         for panorama in self._panoramas:
-            try:
+            with collect_error(problems):
                 cameras.append(self._camera(panorama, plan, rooms.get(panorama.complete_room)))
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
         return Scene(name=self._scene, plan=plan, cameras=tuple(cameras))
 
     def _walk(self, floor: dict[str, Any]) -> Iterator[_Panorama]:

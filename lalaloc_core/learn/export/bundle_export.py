@@ -10,6 +10,8 @@ import dataclasses
 import logging
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +78,8 @@ def export_bundle(
         ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is unchanged.
     """
     for module in filter(None, (layout_encoder, image_encoder, decoder)):
-        module.cpu().eval().requires_grad_(False)
-        _round_to_half(module)
-    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
-        work = Path(scratch)
+        _freeze(module)
+    with _new_files(folder) as work:
         _save_weights(layout_encoder, work / LAYOUT_WEIGHTS)
         if decoder is not None:
             _save_weights(decoder, work / DECODER_WEIGHTS)
@@ -93,9 +93,16 @@ def export_bundle(
         # go too.
         for file in (MANIFEST_NAME, *BUNDLE_FILES):
             (folder / file).unlink(missing_ok=True)
-        for path in work.iterdir():
-            (folder / path.name).write_bytes(path.read_bytes())
     return write_manifest(folder, manifest)
+
+
+@contextmanager
+def _new_files(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose files are copied to `folder` at the end, if there is no error."""
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        yield Path(scratch)
+        for path in Path(scratch).iterdir():
+            (folder / path.name).write_bytes(path.read_bytes())
 
 
 def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, training: dict[str, Any]) -> Bundle:
@@ -104,17 +111,14 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, 
     Raises:
         ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
     """
-    encoder.cpu().eval().requires_grad_(False)
-    _round_to_half(encoder)
+    _freeze(encoder)
     generator = torch.Generator().manual_seed(0)
     size = (_PARITY_BATCH, config.view.image_height, config.view.image_width, 4)
     image = torch.randint(0, 256, size, dtype=torch.uint8, generator=generator)
     heights = torch.empty(_PARITY_BATCH).uniform_(1.0, 1.9, generator=generator)
     outputs = ["log_profile", "log_scale", "log_share", "seen", *_STRUCTURE_OUTPUTS]
-    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
-        path = Path(scratch) / VIEW_ONNX
-        _export(path, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
-        (bundle.folder / VIEW_ONNX).write_bytes(path.read_bytes())
+    with _new_files(bundle.folder) as work:
+        _export(work / VIEW_ONNX, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
     _save_weights(encoder, bundle.folder / VIEW_WEIGHTS, beside=bundle.folder / VIEW_ONNX)
     view = ViewManifest(
         config=dataclasses.asdict(config.view),
@@ -137,14 +141,10 @@ def replace_image_encoder(
     Raises:
         ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
     """
-    encoder.cpu().eval().requires_grad_(False)
-    _round_to_half(encoder)
-    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
-        work = Path(scratch)
+    _freeze(encoder)
+    with _new_files(bundle.folder) as work:
         parity = _export_image_network(work, config, encoder)
         _save_weights(encoder, work / IMAGE_WEIGHTS, beside=work / IMAGE_ONNX)
-        for path in work.iterdir():
-            (bundle.folder / path.name).write_bytes(path.read_bytes())
     described = {"config": config.to_dict(), "image": training, "parity_max_abs_difference": parity}
     manifest = dataclasses.replace(
         bundle.manifest, training={**bundle.manifest.training, **described}, **_image_entries(config, encoder)
@@ -160,13 +160,10 @@ def reexport_networks(
     Raises:
         ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
     """
-    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
-        work = Path(scratch)
+    with _new_files(bundle.folder) as work:
         for module in filter(None, (layout_encoder, image_encoder)):
             module.cpu().eval().requires_grad_(False)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
-        for path in work.iterdir():
-            (bundle.folder / path.name).write_bytes(path.read_bytes())
     training = {**bundle.manifest.training, "parity_max_abs_difference": parity}
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, training=training))
 
@@ -275,7 +272,9 @@ def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tens
     return difference
 
 
-def _round_to_half(module: nn.Module) -> None:
+def _freeze(module: nn.Module) -> None:
+    """Put a network into evaluation mode and round its weights in place."""
+    module.cpu().eval().requires_grad_(False)
     for parameter in module.parameters():
         if parameter.numel() >= _HALF_FROM_ELEMENTS:
             parameter.data = parameter.data.half().float()

@@ -14,8 +14,6 @@ from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.learn.heldout.plans import HeldoutPlan
 
 OpeningKind = Literal["open door", "shut door", "arch", "passage", "front door", "window"]
-# Occupied stretches per room and edge.
-_Taken = dict[tuple[int, int], list[tuple[float, float]]]
 _CORNER_M = 0.1
 _OUTLOOK_M = 1.6
 _OUTER_WALL_M = 0.28
@@ -92,26 +90,16 @@ def sample_openings(plan: HeldoutPlan, rng: np.random.Generator) -> list[Opening
     """Draw doors that connect all rooms, a front door, and windows in outer walls."""
     rooms = plan.plan.rooms
     walls = [wall for index, room in enumerate(rooms) for wall in walls_of(room, index)]
-    taken: _Taken = {}
-    openings = _sample_doors(plan, walls, taken, rng)
+    holes = _Holes(rooms)
+    openings = _sample_doors(plan, walls, holes, rng)
     outer = [wall for wall in walls if wall.length_m > 0.9 and _has_outlook(wall, rooms)]
     fronts = [wall for wall in outer if wall.length_m > 1.3 and plan.kinds[wall.room] in ("living", "corridor")]
     if fronts:
         front = fronts[rng.integers(len(fronts))]
         left_m = rng.uniform(0.15, front.length_m - 1.15)
-        openings.append(
-            _opening(
-                "front door",
-                front,
-                span_m=(left_m, left_m + 0.95),
-                heights_m=(0.0, 2.1),
-                depth_m=_OUTER_WALL_M,
-                rooms=rooms,
-                taken=taken,
-            )
-        )
+        openings.append(holes.open("front door", front, (left_m, left_m + 0.95), (0.0, 2.1), _OUTER_WALL_M))
     for wall in outer:
-        openings += _sample_windows(wall, rooms, plan, taken, rng)
+        openings += _sample_windows(wall, plan, holes, rng)
     return openings
 
 
@@ -136,7 +124,7 @@ def with_openings(plan: HeldoutPlan, openings: Sequence[Opening]) -> HeldoutPlan
     return replace(plan, plan=FloorPlan.from_dict(document))
 
 
-def _sample_doors(plan: HeldoutPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
+def _sample_doors(plan: HeldoutPlan, walls: list[Wall], holes: _Holes, rng: np.random.Generator) -> list[Opening]:
     contacts = [
         contact
         for first in walls
@@ -155,7 +143,7 @@ def _sample_doors(plan: HeldoutPlan, walls: list[Wall], taken: _Taken, rng: np.r
         new = (first.room in joined) != (second.room in joined)
         if (first.room, second.room) in pairs or not (new or rng.random() < 0.35):
             continue
-        door = _sample_door(plan, first, second, (low, high), depth, taken, rng)
+        door = _sample_door(plan, first, second, (low, high), depth, holes, rng)
         if door is not None:
             doors.append(door)
             pairs.add((first.room, second.room))
@@ -169,7 +157,7 @@ def _sample_door(
     second: Wall,
     span: tuple[float, float],
     depth: float,
-    taken: _Taken,
+    holes: _Holes,
     rng: np.random.Generator,
 ) -> Opening | None:
     low, high = span[0] + _CORNER_M, span[1] - _CORNER_M
@@ -181,30 +169,17 @@ def _sample_door(
     left = rng.uniform(low, max(low, high - width))
     ceiling = min(plan.plan.rooms[wall.room].ceiling_height_m for wall in (first, second))
     top = min(rng.uniform(2.0, 2.4) if wide else rng.uniform(1.98, 2.12), ceiling - 0.12)
-    if not _is_free(taken, first, left, left + width) or not _is_free(
-        taken, second, *_seen_from(second, first, left, left + width)
-    ):
+    span_behind = _seen_from(second, first, left, left + width)
+    if not (holes.is_free(first, left, left + width) and holes.is_free(second, *span_behind)):
         return None
     swing = float(np.radians(rng.uniform(15, 110)))
-    return _opening(
-        kind,
-        first,
-        span_m=(left, left + width),
-        heights_m=(0.0, top),
-        depth_m=depth,
-        rooms=plan.plan.rooms,
-        taken=taken,
-        behind=second,
-        swing=swing,
-    )
+    return holes.open(kind, first, (left, left + width), (0.0, top), depth, behind=second, swing=swing)
 
 
-def _sample_windows(
-    wall: Wall, rooms: tuple[Room, ...], plan: HeldoutPlan, taken: _Taken, rng: np.random.Generator
-) -> list[Opening]:
+def _sample_windows(wall: Wall, plan: HeldoutPlan, holes: _Holes, rng: np.random.Generator) -> list[Opening]:
     if plan.kinds[wall.room] == "closet" or rng.random() < (0.55 if plan.kinds[wall.room] == "corridor" else 0.25):
         return []
-    ceiling = rooms[wall.room].ceiling_height_m
+    ceiling = plan.plan.rooms[wall.room].ceiling_height_m
     count = max(1, int(rng.uniform(0.6, 1.0) * wall.length_m / 2.2))
     slot = wall.length_m / count
     full_length = rng.random() < 0.25 and plan.kinds[wall.room] in ("living", "bedroom", "kitchen")
@@ -213,49 +188,50 @@ def _sample_windows(
     width = min(rng.uniform(0.6, 2.0), slot - 0.25)
     lefts = [slot * k + (slot - width) / 2 for k in range(count)]
     return [
-        _opening(
-            "window",
-            wall,
-            span_m=(left, left + width),
-            heights_m=(sill, top),
-            depth_m=_OUTER_WALL_M,
-            rooms=rooms,
-            taken=taken,
-        )
+        holes.open("window", wall, (left, left + width), (sill, top), _OUTER_WALL_M)
         for left in lefts
-        if _is_free(taken, wall, left, left + width)
+        if holes.is_free(wall, left, left + width)
     ]
 
 
-def _opening(
-    kind: OpeningKind,
-    wall: Wall,
-    *,
-    span_m: tuple[float, float],
-    heights_m: tuple[float, float],
-    depth_m: float,
-    rooms: tuple[Room, ...],
-    taken: _Taken,
-    behind: Wall | None = None,
-    swing: float = 0.0,
-) -> Opening:
-    """Return an opening, and mark its stretch of the wall as taken."""
-    (left, right), (sill, top) = span_m, heights_m
-    taken.setdefault((wall.room, wall.edge), []).append((left, right))
-    if behind is not None:
-        taken.setdefault((behind.room, behind.edge), []).append(_seen_from(behind, wall, left, right))
-    top = min(top, rooms[wall.room].ceiling_height_m - 0.05)
-    return Opening(
-        kind=kind,
-        wall=wall,
-        behind=behind,
-        left_m=float(left),
-        right_m=float(right),
-        sill_m=float(sill),
-        top_m=float(top),
-        depth_m=float(depth_m),
-        swing=swing,
-    )
+class _Holes:
+    """Occupied stretches of the walls of a home."""
+
+    def __init__(self, rooms: Sequence[Room]) -> None:
+        self._rooms = rooms
+        self._taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
+
+    def is_free(self, wall: Wall, left: float, right: float) -> bool:
+        taken = self._taken.get((wall.room, wall.edge), [])
+        return all(right + 0.15 < low or left - 0.15 > high for low, high in taken)
+
+    def open(
+        self,
+        kind: OpeningKind,
+        wall: Wall,
+        span_m: tuple[float, float],
+        heights_m: tuple[float, float],
+        depth_m: float,
+        *,
+        behind: Wall | None = None,
+        swing: float = 0.0,
+    ) -> Opening:
+        """Return an opening, and mark its stretch of the wall as taken."""
+        (left, right), (sill, top) = span_m, heights_m
+        self._taken.setdefault((wall.room, wall.edge), []).append((left, right))
+        if behind is not None:
+            self._taken.setdefault((behind.room, behind.edge), []).append(_seen_from(behind, wall, left, right))
+        return Opening(
+            kind=kind,
+            wall=wall,
+            behind=behind,
+            left_m=float(left),
+            right_m=float(right),
+            sill_m=float(sill),
+            top_m=float(min(top, self._rooms[wall.room].ceiling_height_m - 0.05)),
+            depth_m=float(depth_m),
+            swing=swing,
+        )
 
 
 def span_behind(opening: Opening) -> tuple[float, float]:
@@ -267,10 +243,6 @@ def span_behind(opening: Opening) -> tuple[float, float]:
 def _seen_from(behind: Wall, wall: Wall, left: float, right: float) -> tuple[float, float]:
     ends = [float((wall.point_m(along_m) - behind.start_m) @ behind.along) for along_m in (right, left)]
     return ends[0], ends[1]
-
-
-def _is_free(taken: _Taken, wall: Wall, left: float, right: float) -> bool:
-    return all(right + 0.15 < low or left - 0.15 > high for low, high in taken.get((wall.room, wall.edge), []))
 
 
 def _contact(first: Wall, second: Wall) -> list[tuple[Wall, Wall, float, float, float]]:

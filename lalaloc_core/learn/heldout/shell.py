@@ -88,15 +88,13 @@ def _fill(opening: Opening, rng: np.random.Generator) -> list[Part]:
 
 def _casing(opening: Opening) -> list[Part]:
     """Return trim around the hole, in front of the wall's face."""
-    outline = _outline(opening)
-    trim = outline.buffer(0.07, join_style="mitre").difference(outline).intersection(shapely.box(-99, 0, 99, 99))
-    trim = trim.intersection(shapely.box(0.0, 0.0, opening.wall.length_m, 99.0))
-    parts = [_on_wall("frame", opening.wall, piece, -0.015) for piece in _polygons(trim)]
-    if opening.behind is not None:
-        outline = _outline(opening, span_behind(opening))
+    sides = [(opening.wall, None), *([] if opening.behind is None else [(opening.behind, span_behind(opening))])]
+    parts = []
+    for wall, span_m in sides:
+        outline = _outline(opening, span_m)
         trim = outline.buffer(0.07, join_style="mitre").difference(outline).intersection(shapely.box(-99, 0, 99, 99))
-        trim = trim.intersection(shapely.box(0.0, 0.0, opening.behind.length_m, 99.0))
-        parts += [_on_wall("frame", opening.behind, piece, -0.015) for piece in _polygons(trim)]
+        trim = trim.intersection(shapely.box(0.0, 0.0, wall.length_m, 99.0))
+        parts += [_on_wall("frame", wall, piece, -0.015) for piece in _polygons(trim)]
     return parts
 
 

@@ -36,6 +36,11 @@ class Column:
         records.rows[..., self.index] = value
 
 
+def columns(count: int) -> list[Column]:
+    """Return adjacent columns for a class of records, which names each."""
+    return [Column() for _ in range(count)]
+
+
 class Joined(Column):
     """Several adjacent columns under one more name."""
 

@@ -197,48 +197,37 @@ class TrainConfig:
                 )
         if not self.layout.log_ratio_weight and not self.layout.decode_weight:
             raise ConfigError("config.layout: log_ratio_weight and decode_weight are both 0; set one above 0")
-        image = self.image
+        image, turned = self.image, self.layout.turned_share
         if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
             raise ConfigError(
                 "config.image: l2_weight, log_ratio_weight, kd_weight and ring_weight are all 0; set one above 0"
             )
-        if len(image.supersample) != 2 or not all(1 <= rays <= _MAX_RAYS for rays in image.supersample):
-            raise ConfigError(
-                f"config.image.supersample is {image.supersample}; it must be two numbers from 1 to {_MAX_RAYS}"
-            )
+        rays = image.supersample
+        _check(
+            "image.supersample",
+            rays,
+            len(rays) == 2 and all(1 <= count <= _MAX_RAYS for count in rays),
+            f"it must be two numbers from 1 to {_MAX_RAYS}",
+        )
         for name in ("uses_per_panorama", "replay_panoramas", "photographs_per_batch"):
-            if getattr(image, name) < 1:
-                raise ConfigError(f"config.image.{name} is {getattr(image, name)}; the minimum is 1")
-        if image.hidden_share and not self.has_ring:
-            raise ConfigError(
-                f"config.image.hidden_share is {image.hidden_share:g}; architecture 'paper' supports 0 only"
-            )
+            _check(f"image.{name}", getattr(image, name), getattr(image, name) >= 1, "the minimum is 1")
+        is_possible = self.has_ring or not image.hidden_share
+        _check("image.hidden_share", image.hidden_share, is_possible, "architecture 'paper' supports 0 only")
         for name in ("photometric", "optics", "opening_balance", "hidden_share"):
-            if not 0.0 <= getattr(image, name) <= 1.0:
-                raise ConfigError(f"config.image.{name} is {getattr(image, name):g}; it must lie between 0 and 1")
-        if self.architecture != "trunk":
-            for name in _TRUNK_ONLY:
-                if getattr(image, name):
-                    raise ConfigError(
-                        f"config.image.{name} is {getattr(image, name)}; only architecture 'trunk' supports it, "
-                        f"not '{self.architecture}'"
-                    )
-        if not 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M:
-            raise ConfigError(
-                f"config.image.camera_height_error_m is {image.camera_height_error_m:g}; "
-                f"it must lie between 0 and {_MAX_HEIGHT_ERROR_M:g} m"
-            )
+            share = getattr(image, name)
+            _check(f"image.{name}", share, 0.0 <= share <= 1.0, "it must lie between 0 and 1")
+        for name in _TRUNK_ONLY:
+            is_possible = self.architecture == "trunk" or not getattr(image, name)
+            limit = f"only architecture 'trunk' supports it, not '{self.architecture}'"
+            _check(f"image.{name}", getattr(image, name), is_possible, limit)
+        height_m, limit = image.camera_height_error_m, f"it must lie between 0 and {_MAX_HEIGHT_ERROR_M:g} m"
+        _check("image.camera_height_error_m", height_m, 0.0 <= height_m <= _MAX_HEIGHT_ERROR_M, limit)
         for part in ("layout", "image"):
             optimiser = getattr(self, part).optimiser
-            if not 0.0 < optimiser.decay <= 1.0 - optimiser.warmup:
-                raise ConfigError(
-                    f"config.{part}.optimiser.decay is {optimiser.decay:g}; it must be above 0 and at most "
-                    f"1 - warmup, {1.0 - optimiser.warmup:g}"
-                )
-        if self.layout.turned_share and self.turns != "any":
-            raise ConfigError(
-                f"config.layout.turned_share is {self.layout.turned_share:g}; it must be 0 unless turns is 'any'"
-            )
+            rest = 1.0 - optimiser.warmup
+            limit = f"it must be above 0 and at most 1 - warmup, {rest:g}"
+            _check(f"{part}.optimiser.decay", optimiser.decay, 0.0 < optimiser.decay <= rest, limit)
+        _check("layout.turned_share", turned, not turned or self.turns == "any", "it must be 0 unless turns is 'any'")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for checkpoints and manifests."""
@@ -303,3 +292,9 @@ class TrainConfig:
     def image_size(self) -> tuple[int, int]:
         """(height, width) that the image encoder expects."""
         return self.image_sizes.image_height, self.image_sizes.image_width
+
+
+def _check(name: str, value: Any, is_valid: bool, limit: str) -> None:
+    if not is_valid:
+        shown = f"{value:g}" if isinstance(value, float) else value
+        raise ConfigError(f"config.{name} is {shown}; {limit}")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.layout_stage import LayoutObjective, anchors_with_neighbours
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
@@ -40,19 +40,14 @@ class EndToEndStage(TrainingStage):
                 raise ConfigError(
                     f"config.image.{name} is {getattr(config.image, name):g}; end-to-end training needs 0"
                 )
-        self.config = config
-        self.source = source
+        # The image stage's settings have schedule, batch and weight of the latent distance; `config.layout` the rest.
+        self.config, self.settings, self.source = config, config.image, source
         layout_encoder, decoder = build_layout_encoder(config), build_decoder(config)
         self.objective = LayoutObjective(config.layout, layout_encoder, decoder)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"layout_encoder": layout_encoder, "image_encoder": self.encoder}
         if decoder is not None:
             self.modules["decoder"] = decoder
-
-    @property
-    def settings(self) -> ImageStageConfig:
-        """Schedule, batch and weight of the latent distance; `config.layout` has the rest."""
-        return self.config.image
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield panorama batches with neighbours."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,11 +13,17 @@ from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, panorama_batches, sample_styles
+from lalaloc_core.learn.training.stages import (
+    TrainingStage,
+    build_image_encoder,
+    panorama_batches,
+    photograph_loss,
+    sample_styles,
+)
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
@@ -42,31 +47,12 @@ class ImageStage(TrainingStage):
         layout_encoder: LayoutEncoder,
         photographs: Photographs | None = None,
     ) -> None:
-        self.config = config
-        self.photographs = photographs
-        self.source = source
-        self._layout_encoder = layout_encoder.eval().requires_grad_(False)
+        self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
+        self.teacher: LayoutEncoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
         self._generators: dict[torch.device, torch.Generator] = {}
         self._first_step = 0
-
-    @property
-    def teacher(self) -> LayoutEncoder:
-        """Frozen layout encoder."""
-        return self._layout_encoder
-
-    @property
-    def settings(self) -> ImageStageConfig:
-        """Settings of this stage."""
-        return self.config.image
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """Description of the training data."""
-        if self.photographs is None:
-            return self.source.data
-        return {**self.source.data, "photographs": len(self.photographs.images)}
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield panorama batches."""
@@ -132,14 +118,11 @@ class ImageStage(TrainingStage):
         openings, log_distance = (
             target.to(image.device) for target in (photographs.openings, photographs.log_distance)
         )
-        photograph_rows = slice(len(image), None)
-        logits = features.structure.opening_logits[photograph_rows]
+        rows = slice(len(image), None)
+        logits = features.structure.opening_logits[rows]
         known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
-        openings_loss = losses.teacher_openings(logits[known][None], openings[known][None])
-        seen_walls = torch.where(known, log_distance, torch.nan)
-        walls_loss = losses.teacher_walls(features.walls.rows(photograph_rows), seen_walls, logits)
-        total = settings.photograph_weight * openings_loss + settings.photograph_profile_weight * walls_loss
-        return first_rows(features, len(image)), {"photographs": total}
+        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, openings, log_distance)
+        return first_rows(features, len(image)), {"photographs": loss}
 
     def _structure_losses(
         self, features: StructureFeatures, batch: Batch, known: Bool[Tensor, "b w"]

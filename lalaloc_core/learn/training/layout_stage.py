@@ -26,19 +26,13 @@ class LayoutStage(TrainingStage):
     name = "layout"
 
     def __init__(self, config: TrainConfig, source: Source) -> None:
-        self.config = config
-        self.source = source
+        self.config, self.settings, self.source = config, config.layout, source
         self.encoder = build_layout_encoder(config)
         self.decoder = build_decoder(config)
         self.objective = LayoutObjective(config.layout, self.encoder, self.decoder)
         self.modules: dict[str, nn.Module] = {"layout_encoder": self.encoder}
         if self.decoder is not None:
             self.modules["decoder"] = self.decoder
-
-    @property
-    def settings(self) -> LayoutStageConfig:
-        """Settings of this stage."""
-        return self.config.layout
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield triplet batches; a resumed run continues with homes, or parts of the epoch, it has not used."""

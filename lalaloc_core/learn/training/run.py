@@ -1,15 +1,14 @@
-"""A training run: one folder with the checkpoints and logs of its stages."""
+"""The way into training: a stage is trained in the folder of a run, which has the checkpoints and logs of stages."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.training.checkpoint import Checkpoint, Validate
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
@@ -29,13 +28,19 @@ from lalaloc_core.learn.training.warm_start import (
     load_trained_layout_encoder,
     load_warm_start,
 )
+from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
 
+StageName = Literal["layout", "image", "view", "end-to-end"]
+STAGES: tuple[StageName, ...] = get_args(StageName)
+# Added to the seed of a run, so that its stages begin with different weights.
+_SEED_OF_STAGE: dict[StageName, int] = {"layout": 0, "image": 1, "view": 2, "end-to-end": 0}
 ONLINE = TrainingData()
 
 
-def train_layout(
+def train_stage(
+    name: StageName,
     config: TrainConfig,
     folder: Path,
     *,
@@ -44,140 +49,100 @@ def train_layout(
     workers: int = 1,
     resume: bool = False,
     init_from: Path | None = None,
+    layout_from: Path | None = None,
+    teacher: Path | None = None,
 ) -> Checkpoint:
-    """Run stage 1 in `folder`, with batches from `workers` processes.
+    """Train a stage in `folder`: "layout", then "image" or "view", or the first two at once ("end-to-end").
 
-    `init_from` is a bundle or run folder that provides the first weights; it excludes `resume`.
+    Args:
+        name: stage to train.
+        config: of the run.
+        folder: of the run.
+        device: to train on.
+        data: training and validation scenes.
+        workers: number of processes that make batches.
+        resume: continue from the checkpoint in `folder`.
+        init_from: bundle or run folder that provides the first weights; it excludes `resume`. Views start from its
+            encoder of views, else from its image encoder.
+        layout_from: of the image stage: bundle or run folder whose layout encoder a `folder` without one gets
+            (default: `init_from`).
+        teacher: of the image stage: run folder of the layout encoder to train against (default: `folder`).
 
     Raises:
-        CheckpointError: initial weights or the checkpoint are missing, or have other networks.
-        DatasetError: a file of the data set cannot be used.
+        CheckpointError: initial weights, the layout encoder or the checkpoint are missing, or have other networks.
+        ConfigError: the stage does not support the architecture or the data.
+        DatasetError: a file of the data set, or a photograph, cannot be used.
     """
-    torch.manual_seed(config.seed)
-    stage = LayoutStage(config, data.source(config))
+    torch.manual_seed(config.seed + _SEED_OF_STAGE[name])
+    layout_encoder = _load_teacher(config, folder, teacher, layout_from or init_from) if name == "image" else None
+    stage = _build_stage(name, config, data, layout_encoder)
+    is_pretrained = isinstance(stage, ViewStage) or (
+        isinstance(stage, ImageStage) and isinstance(stage.encoder, TrunkImageEncoder)
+    )
+    if is_pretrained and config.image.pretrained and init_from is None and not resume:
+        load_pretrained(stage.encoder.trunk)
     begun_from = None if init_from is None else _warm_start(stage, init_from)
-    scenes = data.validation(config)
-    validate = LayoutValidation(config, scenes, device) if scenes else None
+    validate = _validation(name, config, folder, data, layout_encoder, device)
     return run_stage(
         stage, folder, device=device, workers=workers, resume=resume, validate=validate, begun_from=begun_from
     )
 
 
-def _warm_start(stage: TrainingStage, folder: Path) -> dict[str, Any]:
-    """Load trained weights into a stage; return their origin for checkpoints."""
-    start = load_warm_start(folder, stage.name, stage.config)
-    start.load_into(stage.modules)
-    return start.origin
-
-
-def train_image(
-    config: TrainConfig,
-    folder: Path,
-    *,
-    device: torch.device,
-    data: TrainingData = ONLINE,
-    teacher: Path | None = None,
-    workers: int = 1,
-    resume: bool = False,
-    init_from: Path | None = None,
-    layout_from: Path | None = None,
-) -> Checkpoint:
-    """Run stage 2 in `folder`, against the layout encoder of the run folder `teacher` (default: `folder`).
-
-    `init_from` is a bundle or run folder that provides the first image encoder; it excludes `resume`. Without
-    `teacher`, a `folder` without layout encoder gets the one of `layout_from` or `init_from`.
-
-    Raises:
-        CheckpointError: the layout encoder is missing or has other networks.
-        DatasetError: a file of the data set cannot be used.
-    """
-    torch.manual_seed(config.seed + 1)
-    origin = layout_from or init_from
+def _load_teacher(config: TrainConfig, folder: Path, teacher: Path | None, origin: Path | None) -> LayoutEncoder:
+    """Load the layout encoder that the image stage is trained against, if need be from a bundle or another run."""
     if origin is not None and teacher is None and not (folder / "layout.pt").exists():
         start = load_warm_start(origin, "layout", config)
         dataclasses.replace(start.checkpoint, stage="layout").save(folder / "layout.pt")
     teacher = teacher or folder
     check_same_networks("layout", config, find_checkpoint("layout", teacher).config, str(teacher))
-    layout_encoder = load_trained_layout_encoder(teacher)
-    stage = ImageStage(config, data.source(config), layout_encoder, data.load_photographs(config))
-    fresh = init_from is None and not resume
-    if fresh and isinstance(stage.encoder, TrunkImageEncoder) and config.image.pretrained:
-        load_pretrained(stage.encoder.trunk)
-    begun_from = None if init_from is None else _warm_start(stage, init_from)
-    scenes = data.validation(config)
-    validate = data.image_validation(config, scenes, layout_encoder, device, folder) if scenes else None
-    return run_stage(
-        stage, folder, device=device, workers=workers, resume=resume, validate=validate, begun_from=begun_from
-    )
+    return load_trained_layout_encoder(teacher)
 
 
-def train_views(
-    config: TrainConfig,
-    folder: Path,
-    *,
-    device: torch.device,
-    data: TrainingData = ONLINE,
-    workers: int = 1,
-    resume: bool = False,
-    init_from: Path | None = None,
-) -> Checkpoint:
-    """Train the encoder of views in `folder`.
+def _build_stage(
+    name: StageName, config: TrainConfig, data: TrainingData, layout_encoder: LayoutEncoder | None
+) -> TrainingStage:
+    if name == "view":
+        if data.dataset is not None:
+            raise ConfigError("views are rendered from generated homes; train them without a data set (--data)")
+        source = GeneratedSource(config, data.textures, data.deferred, view_window(config))
+        return ViewStage(config, source, data.load_photographs(config, PHOTOGRAPH_SIZE))
+    source = data.source(config)
+    if layout_encoder is not None:
+        return ImageStage(config, source, layout_encoder, data.load_photographs(config))
+    return (LayoutStage if name == "layout" else EndToEndStage)(config, source)
 
-    `init_from` is a bundle or run folder whose encoder of views, else its image encoder, provides the first weights; it
-    excludes `resume`.
 
-    Raises:
-        ConfigError: a data set is given; views are rendered from generated homes only.
-        CheckpointError: initial weights or the checkpoint are missing, or have other networks.
-        DatasetError: a photograph cannot be read.
-    """
-    if data.dataset is not None:
-        raise ConfigError("views are rendered from generated homes; train them without a data set (--data)")
-    torch.manual_seed(config.seed + 2)
-    source = GeneratedSource(config, data.textures, data.deferred, view_window(config))
-    stage = ViewStage(config, source, data.load_photographs(config, PHOTOGRAPH_SIZE))
-    begun_from = None
-    if init_from is None and not resume and config.image.pretrained:
-        load_pretrained(stage.encoder.trunk)
-    if init_from is not None and has_views(init_from):
-        begun_from = _warm_start(stage, init_from)
-    elif init_from is not None:
-        start = load_warm_start(init_from, "image", config)
-        sphere = TrunkImageEncoder(config.trunk, config.ring)
+def _warm_start(stage: TrainingStage, folder: Path) -> dict[str, Any]:
+    """Load trained weights into a stage; return their origin for checkpoints."""
+    if isinstance(stage, ViewStage) and not has_views(folder):
+        start = load_warm_start(folder, "image", stage.config)
+        sphere = TrunkImageEncoder(stage.config.trunk, stage.config.ring)
         start.load_into({"image_encoder": sphere})
         stage.encoder.start_from(sphere)
-        begun_from = start.origin
-    validate = ViewValidation(config, data.validation_scenes, data.textures, device)
-    return run_stage(
-        stage, folder, device=device, workers=workers, resume=resume, validate=validate, begun_from=begun_from
-    )
+    else:
+        start = load_warm_start(folder, stage.name, stage.config)
+        start.load_into(stage.modules)
+    return start.origin
 
 
-def train_end_to_end(
+def _validation(
+    name: StageName,
     config: TrainConfig,
     folder: Path,
-    *,
+    data: TrainingData,
+    layout_encoder: LayoutEncoder | None,
     device: torch.device,
-    data: TrainingData = ONLINE,
-    workers: int = 1,
-    resume: bool = False,
-) -> Checkpoint:
-    """Train both branches at once in `folder`.
-
-    Raises:
-        ConfigError: the architecture does not support end-to-end training.
-        DatasetError: a file of the data set cannot be used.
-    """
-    torch.manual_seed(config.seed)
-    stage = EndToEndStage(config, data.source(config))
+) -> Validate | None:
+    """Return the validation of a stage; None without validation scenes."""
+    if name == "view":
+        return ViewValidation(config, data.validation_scenes, data.textures, device)
     scenes = data.validation(config)
-    validate = _joint_validation(config, data, scenes, device, folder) if scenes else None
-    return run_stage(stage, folder, device=device, workers=workers, resume=resume, validate=validate)
-
-
-def _joint_validation(
-    config: TrainConfig, data: TrainingData, scenes: list[Scene], device: torch.device, folder: Path
-) -> Validate:
+    if not scenes:
+        return None
+    if name == "layout":
+        return LayoutValidation(config, scenes, device)
+    image = data.image_validation(config, scenes, layout_encoder, device, folder)
+    if name == "image":
+        return image
     layout = LayoutValidation(config, scenes, device)
-    image = data.image_validation(config, scenes, None, device, folder)
     return lambda modules: {**{f"layout_{key}": value for key, value in layout(modules).items()}, **image(modules)}

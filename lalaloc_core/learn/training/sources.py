@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,11 +21,11 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, sample_shots
+from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot, sample_shots
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredScene
 from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
@@ -73,51 +73,6 @@ class PanoramaSample:
         return _group_around(self, self.plan, sampling, rng)
 
 
-@runtime_checkable
-class Source(Protocol):
-    """Source of training scenes."""
-
-    @property
-    def deferred(self) -> bool:
-        """Panoramas are scenes to be rendered later."""
-        ...
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """Description for checkpoints and manifests."""
-        ...
-
-    @property
-    def patience(self) -> int:
-        """Maximum number of consecutive visits without a sample."""
-        ...
-
-    @property
-    def problems(self) -> list[DatasetError]:
-        """Errors of skipped files since this list was last emptied."""
-        ...
-
-    def rng(self, visit: int) -> np.random.Generator:
-        """Return the random generator of a visit, for everything but the scene itself."""
-        ...
-
-    def groups(self, visit: int) -> list[Group]:
-        """Return stage 1's anchors with their neighbours; empty if the scene cannot be used.
-
-        Raises:
-            DatasetError: a file cannot be used and must not be skipped.
-        """
-        ...
-
-    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used.
-
-        Raises:
-            DatasetError: a file cannot be used and must not be skipped.
-        """
-        ...
-
-
 @dataclass(eq=False)
 class GeneratedSource:
     """Source of generated homes: a new one for every visit, with anchors and cameras anywhere on the floor.
@@ -131,6 +86,7 @@ class GeneratedSource:
     deferred: bool = False
     window: Window | None = None
     _renderers: RendererCache | None = field(default=None, init=False)
+    # Maximum number of consecutive visits without a sample.
     patience = _GENERATOR_PATIENCE
 
     @property
@@ -140,7 +96,7 @@ class GeneratedSource:
 
     @property
     def problems(self) -> list[DatasetError]:
-        """Empty list; generated homes have no faults."""
+        """Errors of skipped files since this list was last emptied; generated homes have none."""
         return []
 
     def rng(self, visit: int) -> np.random.Generator:
@@ -148,7 +104,11 @@ class GeneratedSource:
         return np.random.default_rng([3, self.config.seed, visit])
 
     def groups(self, visit: int) -> list[Group]:
-        """Return stage 1's anchors with their neighbours."""
+        """Return stage 1's anchors with their neighbours; empty if the scene cannot be used.
+
+        Raises:
+            DatasetError: a file cannot be used and must not be skipped.
+        """
         stage = self.config.layout
         home, rng = home_of(TRAIN, self.config.seed, visit)
         drawn = sample_triplets(home.plan, stage.anchors_per_home, stage.triplets, rng)
@@ -169,7 +129,11 @@ class GeneratedSource:
         return groups
 
     def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Return stage 2's panoramas, `height` x `width`."""
+        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used.
+
+        Raises:
+            DatasetError: a file cannot be used and must not be skipped.
+        """
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(
@@ -192,17 +156,7 @@ class GeneratedSource:
         else:
             renderer = self._renderers.renderer(height, width, stage.supersample, self.window)
             images = list(renderer.render_scenes(scenes).numpy())
-        return [
-            PanoramaSample(
-                plan=home.plan,
-                position_m=shot.position_m,
-                room_index=shot.room_index,
-                heading=shot.heading,
-                camera_height_m=shot.camera_height_m,
-                image=image,
-            )
-            for shot, image in zip(shots, images, strict=True)
-        ]
+        return [_sample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
 
     def renderer(self, device: torch.device, height: int, width: int) -> PanoramaRenderer:
         """Create the renderer of deferred panoramas; its pixels are those of `samples`."""
@@ -282,16 +236,7 @@ class SceneSource:
             camera = scene.cameras[index]
             image = self._picture(scene, camera, rng, height, width)
             if image is not None:
-                samples.append(
-                    PanoramaSample(
-                        plan=scene.plan,
-                        position_m=camera.position_m,
-                        room_index=camera.room_index,
-                        heading=camera.heading,
-                        camera_height_m=camera.camera_height_m,
-                        image=image,
-                    )
-                )
+                samples.append(_sample(scene.plan, camera, image))
         return samples
 
     def _scene(self, visit: int) -> Scene | None:
@@ -331,6 +276,20 @@ class SceneSource:
     @cachedmethod(attrgetter("_pictures"), key=_picture_key)
     def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
         return camera.photographs[look].image(height, width)
+
+
+Source = GeneratedSource | SceneSource
+
+
+def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | DeferredScene) -> PanoramaSample:
+    return PanoramaSample(
+        plan=plan,
+        position_m=camera.position_m,
+        room_index=camera.room_index,
+        heading=camera.heading,
+        camera_height_m=camera.camera_height_m,
+        image=image,
+    )
 
 
 def _group_around(

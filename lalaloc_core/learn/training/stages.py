@@ -7,17 +7,21 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
+from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_features import WallModes
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
@@ -25,22 +29,23 @@ from lalaloc_core.nets.trunk import StyleMixing, Trunk
 
 
 class TrainingStage(ABC):
-    """Networks, data and losses of one stage, run by the training loop; `name` names its checkpoints and log."""
+    """Networks, data and losses of one stage, run by the training loop.
+
+    Attributes:
+        name: of its checkpoints and log.
+        settings: budget, optimiser and weights of the losses.
+        modules: trained networks by name.
+        teacher: frozen network used by the losses; the loop moves it to the training device.
+        photographs: unlabelled photographs, in addition to the source's panoramas.
+    """
 
     name: ClassVar[str]
     config: TrainConfig
+    settings: LayoutStageConfig | ImageStageConfig
     source: Source
     modules: dict[str, nn.Module]
-
-    @property
-    def teacher(self) -> nn.Module | None:
-        """Frozen network used by the losses; the loop moves it to the training device."""
-        return None
-
-    @property
-    @abstractmethod
-    def settings(self) -> LayoutStageConfig | ImageStageConfig:
-        """Budget and optimiser of this stage."""
+    teacher: nn.Module | None = None
+    photographs: Photographs | None = None
 
     @property
     def ema_decay(self) -> float:
@@ -50,7 +55,9 @@ class TrainingStage(ABC):
     @property
     def data(self) -> dict[str, Any]:
         """Description of the training data, stored in checkpoints and manifests."""
-        return self.source.data
+        if self.photographs is None:
+            return self.source.data
+        return {**self.source.data, "photographs": len(self.photographs.images)}
 
     @abstractmethod
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
@@ -100,6 +107,20 @@ def panorama_batches(
         renderer = source.renderer(device, sizes.image_height, sizes.image_width)
         return DeferredRenderer(renderer).render_batches(batches)
     return batches
+
+
+def photograph_loss(
+    settings: ImageStageConfig,
+    walls: WallModes,
+    opening_logits: Float[Tensor, "n w c"],
+    seen: Bool[Tensor, "n w"],
+    openings: Float[Tensor, "n w 2"],
+    log_distance: Float[Tensor, "n w"],
+) -> Tensor:
+    """Return the weighted loss of predictions for photographs, against a segmenter's walls and openings where seen."""
+    agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None])
+    distance = losses.teacher_walls(walls, torch.where(seen, log_distance, torch.nan), opening_logits)
+    return settings.photograph_weight * agreement + settings.photograph_profile_weight * distance
 
 
 def sample_styles(

@@ -20,9 +20,8 @@ from torch import Tensor, nn
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.files import replacing
-from lalaloc_core.learn.azimuth_metrics import score_classes
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
-from lalaloc_core.learn.metrics import Accuracy
+from lalaloc_core.learn.metrics import Accuracy, score_classes
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +16,10 @@ from lalaloc_core.learn.synth.rendering.panorama import Window
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, sample_styles
+from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
 
@@ -39,9 +38,7 @@ class ViewStage(TrainingStage):
     name = "view"
 
     def __init__(self, config: TrainConfig, source: Source, photographs: Photographs | None = None) -> None:
-        self.config = config
-        self.source = source
-        self.photographs = photographs
+        self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
         self.encoder = ViewEncoder(config.view, config.ring)
         self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
         self._azimuths, self._elevations = (
@@ -49,18 +46,6 @@ class ViewStage(TrainingStage):
             for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
         )
         self._generator = torch.Generator()
-
-    @property
-    def settings(self) -> ImageStageConfig:
-        """Settings of this stage."""
-        return self.config.image
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """Description of the training data."""
-        if self.photographs is None:
-            return self.source.data
-        return {**self.source.data, "photographs": len(self.photographs.images)}
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield batches of level pictures of the patch's size."""
@@ -86,7 +71,14 @@ class ViewStage(TrainingStage):
         rendered = slice(0, len(image) - count)
         terms = self._rendered_losses(features, seen, rendered, batch)
         if photographs is not None:
-            terms["photographs"] = self._photograph_losses(features, seen, slice(len(image) - count, None), photographs)
+            rows, part = slice(len(image) - count, None), middle(self.config)
+            openings, log_distance = (
+                target[:, part].to(seen.device) for target in (photographs.openings, photographs.log_distance)
+            )
+            logits = features.structure.opening_logits[rows]
+            terms["photographs"] = photograph_loss(
+                settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance
+            )
         return terms
 
     def _rendered_losses(
@@ -109,19 +101,6 @@ class ViewStage(TrainingStage):
             "ceiling": settings.ceiling_weight * ceiling,
             "room_type": settings.room_type_weight * room_type,
         }
-
-    def _photograph_losses(
-        self, features: ViewFeatures, seen: Bool[Tensor, "b w"], rows: slice, photographs: Photographs
-    ) -> Tensor:
-        settings, part, device = self.settings, middle(self.config), seen.device
-        openings, log_distance = (
-            target[:, part].to(device) for target in (photographs.openings, photographs.log_distance)
-        )
-        logits = features.structure.opening_logits[rows]
-        seen_walls = torch.where(seen[rows], log_distance, torch.nan)
-        walls = losses.teacher_walls(features.walls.rows(rows), seen_walls, logits)
-        agreement = losses.teacher_openings(logits[seen[rows]][None], openings[seen[rows]][None])
-        return settings.photograph_weight * agreement + settings.photograph_profile_weight * walls
 
     def _cut(self, images: UInt8[Tensor, "n h w 3"]) -> UInt8[Tensor, "n h2 w2 3"]:
         """Cut patches from the middle of spheres."""

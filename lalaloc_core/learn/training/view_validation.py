@@ -9,10 +9,10 @@ import torch
 from torch import nn
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.azimuth_metrics import score_classes
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
+from lalaloc_core.learn.metrics import score_classes
 from lalaloc_core.learn.synth.augmentation.framing import seen_by
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds

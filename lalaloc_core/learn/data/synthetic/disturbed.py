@@ -12,10 +12,10 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene
+from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene, WithoutDepth
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched_images
@@ -45,8 +45,8 @@ def _disturbed(camera: Camera) -> Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class DisturbedPhotograph:
-    """DatasetPhotograph with small length errors and the effects of a real camera."""
+class DisturbedPhotograph(WithoutDepth):
+    """Photograph with small length errors and the effects of a real camera."""
 
     photograph: DatasetPhotograph
     seed: int
@@ -58,7 +58,3 @@ class DisturbedPhotograph:
         image = stretched_images(torch.from_numpy(self.photograph.image(height, width))[None], factors)
         image = optics(jittered(image, _STRENGTH, generator), _STRENGTH, generator)
         return image[0].round().to(torch.uint8).numpy()
-
-    def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Raise an error: there is no depth."""
-        raise DatasetError("disturbed photographs have no depth")

@@ -14,9 +14,8 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
-from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.learn.data.dataset import Appearance, Camera, HomeScenes, Scene, Split
+from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
@@ -28,17 +27,13 @@ SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "te
 
 
 @dataclass(frozen=True, kw_only=True)
-class GeneratedScenes:
-    """Homes of the generator with a few cameras each, at any heading and camera heights of 1.0 to 1.9 m.
+class GeneratedScenes(HomeScenes):
+    """Homes of the generator with cameras at any heading, 1.0 to 1.9 m high.
 
-    `homes` are per split. With `furniture` None each camera has its own level, which its photograph does not state;
-    with `textures` None all materials are procedural.
+    With `textures` None all materials are procedural.
     """
 
-    homes: int
-    shots_per_home: int = 4
-    seed: int = 0
-    furniture: FurnitureLevel | None = "full"
+    split_numbers = SPLIT_NUMBERS
     textures: Path | None = None
 
     @property
@@ -46,22 +41,10 @@ class GeneratedScenes:
         """Name of the data set in results."""
         return f"generated homes (seed {self.seed})"
 
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance, with the configured furniture level."""
-        return (Appearance(self.furniture),)
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        """Return the names of a split's scenes."""
-        return [f"{split}-{index:05d}" for index in range(self.homes)]
-
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Generate a scene from its name."""
-        split, _, index = name.partition("-")
-        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
-        if number is None or not index.isdecimal():
-            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
-        home, rng = home_of(number, self.seed, int(index))
+        number, index = self.home_number(name)
+        home, rng = home_of(number, self.seed, index)
         renderers = split_renderer_cache(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
         cameras = tuple(

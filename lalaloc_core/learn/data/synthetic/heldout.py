@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError, InvalidInputError
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.heldout.furnish import LEVELS, Level
+from lalaloc_core.learn.data.dataset import Camera, HomeScenes, Scene, Split
+from lalaloc_core.learn.heldout.furnish import LEVELS
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of, stands_of
 from lalaloc_core.learn.heldout.photograph import HeldoutShot, depth_m, render
 
 _DEPTH_HEIGHT = 256
 _LEVEL_SHARES = (0.2, 0.25, 0.55)
-# There is no training split.
-SPLIT_NUMBERS: dict[Split, int] = {"validation": 1, "test": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldoutScenes:
-    """Homes of the out-of-distribution generator with a few cameras each, at any heading, 1.1 to 1.8 m high.
+class HeldoutScenes(HomeScenes):
+    """Homes of the out-of-distribution generator with cameras at any heading, 1.1 to 1.8 m high.
 
-    `homes` are per split. Camera positions are free at every furniture level. With `furniture` None each camera has its
-    own level, which its photograph does not state.
+    Camera positions are free at every furniture level. There is no training split.
     """
 
-    homes: int
-    shots_per_home: int = 4
-    seed: int = 0
-    furniture: Level | None = "full"
+    split_numbers: ClassVar[dict[Split, int]] = {"validation": 1, "test": 2}
 
     def __post_init__(self) -> None:
         for name, minimum in (("homes", 0), ("shots_per_home", 1), ("seed", 0)):
@@ -45,22 +39,10 @@ class HeldoutScenes:
         """Name of the data set in results."""
         return f"out-of-family homes (seed {self.seed})"
 
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance, with the configured furniture level."""
-        return (Appearance(self.furniture),)
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        """Return the names of a split's scenes; the training split has none."""
-        return [f"{split}-{index:05d}" for index in range(self.homes)] if split in SPLIT_NUMBERS else []
-
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Generate a scene from its name."""
-        split, _, index = name.partition("-")
-        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
-        if number is None or not index.isdecimal():
-            raise DatasetError("unknown out-of-distribution scene; names have the form 'test-00042'", scene=name)
-        key = HomeKey(number, self.seed, int(index))
+        number, index = self.home_number(name)
+        key = HomeKey(number, self.seed, index)
         levels = key.rng(5).choice(len(LEVELS), self.shots_per_home, p=_LEVEL_SHARES)
         cameras = tuple(
             Camera(

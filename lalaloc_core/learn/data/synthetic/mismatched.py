@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, WithoutDepth
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
 
 # One of this many photographs shows no room, one is upside down, and in every second home one is cropped.
@@ -73,7 +73,7 @@ class UpsideDown:
 
 
 @dataclass(frozen=True, eq=False)
-class Cropped:
+class Cropped(WithoutDepth):
     """View of an ordinary camera, stretched to the size of a panorama."""
 
     photograph: DatasetPhotograph
@@ -87,13 +87,9 @@ class Cropped:
         )
         return np.ascontiguousarray(whole[rows][:, columns])
 
-    def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Raise an error: there is no depth."""
-        raise DatasetError("cropped photographs have no depth")
-
 
 @dataclass(frozen=True)
-class OutdoorPhotograph:
+class OutdoorPhotograph(WithoutDepth):
     """Ground under a sky in random colours, sometimes the same colour, like a lens against a wall."""
 
     seed: int
@@ -109,7 +105,3 @@ class OutdoorPhotograph:
         colour = np.where(up > 0.0, sky, ground) * (1.0 - haze * np.abs(up))
         grain = rng.normal(0.0, rng.uniform(0.0, 10.0), (height, width, 3))
         return np.clip(colour + grain, 0.0, 255.0).astype(np.uint8)
-
-    def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Raise an error: there is no depth."""
-        raise DatasetError("outdoor photographs have no depth")

@@ -31,8 +31,14 @@ from tqdm import tqdm
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.files import PART_SUFFIX, atomic_write
 from lalaloc_core.learn.data.dataset import SPLITS, Split
-from lalaloc_core.learn.data.structured3d import RENDERING_FOLDER, SYNTHETIC_FILE, Structured3D, Synthetic, scene_name
-from lalaloc_core.learn.data.structured3d_splits import scene_numbers
+from lalaloc_core.learn.data.structured3d import (
+    RENDERING_FOLDER,
+    SYNTHETIC_FILE,
+    Structured3D,
+    Synthetic,
+    scene_name,
+    scene_numbers,
+)
 from lalaloc_core.learn.data.structured3d_writer import (
     room_id,
     write_annotation,
@@ -42,7 +48,7 @@ from lalaloc_core.learn.data.structured3d_writer import (
 )
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.lighting import MOODS
 from lalaloc_core.learn.synth.scene.materials import CATEGORIES

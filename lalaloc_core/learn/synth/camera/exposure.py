@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lalaloc_core.learn.synth.records import Column, Records
+from lalaloc_core.learn.synth.records import Records, columns
 
 DISC, BLURRED, LOGO, MIRROR_BALL, TRIPOD, PERSON = range(6)
 _NADIR_SHARES = (0.4, 0.15, 0.15, 0.08, 0.12, 0.1)
@@ -37,30 +37,10 @@ class Exposure(Records):
         zenith, zenith_tone: radius (radians, 0 for none) and tone of the patch over the zenith.
     """
 
-    target = Column()
-    red_gain = Column()
-    blue_gain = Column()
-    contrast = Column()
-    saturation = Column()
-    noise = Column()
-    blur = Column()
-    nadir = Column()
-    nadir_tone = Column()
-    noise_seed = Column()
-    shoulder = Column()
-    tint = Column()
-    flatness = Column()
-    vignette = Column()
-    seam = Column()
-    seam_step = Column()
-    seam_shift = Column()
-    roll = Column()
-    pitch = Column()
-    jpeg = Column()
-    nadir_kind = Column()
-    nadir_turn = Column()
-    zenith = Column()
-    zenith_tone = Column()
+    target, red_gain, blue_gain, contrast, saturation, noise, blur = columns(7)
+    nadir, nadir_tone, noise_seed, shoulder, tint, flatness, vignette = columns(7)
+    seam, seam_step, seam_shift, roll, pitch, jpeg = columns(6)
+    nadir_kind, nadir_turn, zenith, zenith_tone = columns(4)
 
 
 def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:

@@ -59,6 +59,23 @@ class Prism(NamedTuple):
     is_round: bool
     label: Label = ""
 
+    @classmethod
+    def upright(
+        cls,
+        centre_m: Sequence[float] | np.ndarray,
+        axis: Sequence[float] | np.ndarray,
+        half_m: tuple[float, float],
+        z_m: tuple[float, float],
+        *,
+        finish: Finish,
+        piece: int,
+        is_round: bool = False,
+        label: Label = "",
+    ) -> Prism:
+        """Return a prism: its centre, its first axis, half extents along it and across, lower and upper end."""
+        (x, y), (ax, ay) = centre_m, axis
+        return cls(float(x), float(y), float(ax), float(ay), *half_m, *z_m, finish, piece, is_round, label)
+
 
 class _Floor:
     """Free floor of a room while it is furnished."""
@@ -219,18 +236,13 @@ def _build_in(floor: _Floor, room: Room, rng: np.random.Generator, *, fitted: bo
 
 def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray, "2"], number: int) -> list[Prism]:
     """Return the parts of a piece whose width lies along the unit vector `axis`, its back to the right of it."""
-    ax, ay = float(axis[0]), float(axis[1])
-    cx, cy = float(centre_m[0]), float(centre_m[1])
+    (ax, ay), (cx, cy) = map(float, axis), map(float, centre_m)
     return [
-        Prism(
-            x=cx + ax * part.x - ay * part.y,
-            y=cy + ay * part.x + ax * part.y,
-            axis_x=ax,
-            axis_y=ay,
-            half_a=part.half_x,
-            half_b=part.half_y,
-            z0=part.z0,
-            z1=part.z1,
+        Prism.upright(
+            (cx + ax * part.x - ay * part.y, cy + ay * part.x + ax * part.y),
+            axis,
+            (part.half_x, part.half_y),
+            (part.z0, part.z1),
             finish=part.finish,
             piece=number,
             is_round=part.is_round,

@@ -1,7 +1,7 @@
 """Procedural homes: rooms, doors, windows, and large buildings made of them.
 
 Begin with `plans.py`, which draws a home: `partition.py` divides it into rooms, `openings.py` connects them.
-`splits.py` numbers homes for training, validation and test. Needs no torch.
+Homes are numbered by split. Needs no torch.
 """
 
 from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind

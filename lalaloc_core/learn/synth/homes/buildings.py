@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.homes.plans import Home, home_of
 
 # Between what stands side by side (m).
 _GAP_M = 0.3
@@ -46,7 +45,7 @@ class Building:
 def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
     """Return a building with at least this floor area.
 
-    `split` and `seed` are those of its homes, see `synth.homes.splits`; `hall_share` is the share of the floor in
+    `split` and `seed` are those of its homes, see `plans.home_of`; `hall_share` is the share of the floor in
     halls.
     """
     return _Builder(split, seed, area_m2, hall_share).build()

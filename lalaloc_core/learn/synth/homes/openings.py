@@ -76,8 +76,27 @@ class _Walls:
     def is_free(self, wall: tuple[int, int], start: float, end: float) -> bool:
         return all(end + 0.12 < taken[0] or start - 0.12 > taken[1] for taken in self._taken.get(wall, []))
 
-    def take(self, wall: tuple[int, int], start: float, end: float) -> None:
-        self._taken.setdefault(wall, []).append((start, end))
+    def open(
+        self,
+        wall: tuple[int, int],
+        span_m: tuple[float, float],
+        heights_m: tuple[float, float],
+        kind: OpeningKind,
+        neighbour: int = -1,
+    ) -> Opening:
+        """Return an opening of a wall, whose stretch is then occupied; heights are those of sill and head."""
+        self._taken.setdefault(wall, []).append(span_m)
+        (room, edge), (start, end), (sill, head) = wall, span_m, heights_m
+        return Opening(
+            room=room,
+            wall=edge,
+            start_m=start,
+            end_m=end,
+            sill_m=float(sill),
+            head_m=float(head),
+            kind=kind,
+            neighbour=neighbour,
+        )
 
     def facing(self, max_gap_m: float) -> list[_Facing]:
         """Return all pairs of walls of different rooms that face each other over at least the width of a door."""
@@ -170,22 +189,10 @@ def _door_or_opening(
     second = (facing.second_interval[1] - shift - width, facing.second_interval[1] - shift)
     if not (walls.is_free(facing.first, *first) and walls.is_free(facing.second, *second)):
         return []
-    pair = []
-    for wall, interval, other in ((facing.first, first, facing.second), (facing.second, second, facing.first)):
-        walls.take(wall, *interval)
-        pair.append(
-            Opening(
-                room=wall[0],
-                wall=wall[1],
-                start_m=interval[0],
-                end_m=interval[1],
-                sill_m=0.0,
-                head_m=float(head),
-                kind=kind,
-                neighbour=other[0],
-            )
-        )
-    return pair
+    return [
+        walls.open(wall, span, (0.0, head), kind, other[0])
+        for wall, span, other in ((facing.first, first, facing.second), (facing.second, second, facing.first))
+    ]
 
 
 def _windows(
@@ -215,21 +222,9 @@ def _windows(
             start = rng.uniform(0.12, length - width - 0.12)
             if not walls.is_free((room, edge), start, start + width):
                 continue
-            walls.take((room, edge), start, start + width)
             sill = rng.uniform(0.0, 0.08) if rng.random() < french_share else rng.uniform(0.5, 1.2)
             head = rng.uniform(max(sill + 0.5, 1.8), ceilings_m[room] - 0.08)
-            openings.append(
-                Opening(
-                    room=room,
-                    wall=edge,
-                    start_m=start,
-                    end_m=start + width,
-                    sill_m=float(sill),
-                    head_m=float(head),
-                    kind="window",
-                    neighbour=-1,
-                )
-            )
+            openings.append(walls.open((room, edge), (start, start + width), (sill, head), "window"))
     return openings
 
 
@@ -247,18 +242,7 @@ def _blind_doors(walls: _Walls, connected: set[int], rng: np.random.Generator) -
         start = rng.uniform(0.06, length - width - 0.06)
         if not walls.is_free((room, edge), start, start + width):
             continue
-        walls.take((room, edge), start, start + width)
         without_door.discard(room)
-        openings.append(
-            Opening(
-                room=room,
-                wall=edge,
-                start_m=start,
-                end_m=start + width,
-                sill_m=0.0,
-                head_m=float(rng.uniform(1.95, 2.12)),
-                kind="door_shut",
-                neighbour=-1,
-            )
-        )
+        head = rng.uniform(1.95, 2.12)
+        openings.append(walls.open((room, edge), (start, start + width), (0.0, head), "door_shut"))
     return openings

@@ -1,4 +1,7 @@
-"""Procedural homes: a floor plan, and the doors and windows that its photographs need."""
+"""Procedural homes: a floor plan, and the doors and windows that its photographs need.
+
+Home number i of a split is drawn by `default_rng([split, seed, i])`. Training homes are `VARIED_HOMES`.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
-from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind, place_openings
+from lalaloc_core.learn.synth.homes.openings import Opening, place_openings
 from lalaloc_core.learn.synth.homes.partition import Cell, inner_outline, partition, reshape_room, with_wing_wall
-
-__all__ = ["VARIED_HOMES", "Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]
-
 
 # Plans do not say which doors are open.
 _PLAN_KINDS = {"door_open": "door", "door_shut": "door", "opening": "passage", "window": "window"}
@@ -195,3 +195,13 @@ def _line(opening: Opening, polygon_m: Float[np.ndarray, "n 2"]) -> list[list[fl
     along = polygon_m[(opening.wall + 1) % len(polygon_m)] - start
     along = along / np.linalg.norm(along)
     return [(start + distance * along).tolist() for distance in (opening.start_m, opening.end_m)]
+
+
+# Two splits never share a home.
+TRAIN, VALIDATION, TEST = 0, 1, 2
+
+
+def home_of(split: int, seed: int, index: int) -> tuple[Home, np.random.Generator]:
+    """Return home number `index` of a split, and the generator for everything else that is drawn for it."""
+    rng = np.random.default_rng([split, seed, index])
+    return generate_home(rng, VARIED_HOMES if split == TRAIN else HomeConfig()), rng

@@ -21,8 +21,7 @@ from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.synth.records import Row
 from lalaloc_core.learn.synth.rendering.cast import Hits, SceneBatch, trace
-from lalaloc_core.learn.synth.rendering.outdoors import Outdoors
-from lalaloc_core.learn.synth.rendering.shading import Atlas, shade
+from lalaloc_core.learn.synth.rendering.shading import Atlas, Outdoors, shade
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.lighting import Mood, relit
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

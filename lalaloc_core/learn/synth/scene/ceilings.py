@@ -94,17 +94,6 @@ def _box(
     across = np.array([-along[1], along[0]])
     low, high = (np.array([function(corners @ along), function(corners @ across)]) for function in (np.min, np.max))
     centre = 0.5 * (low + high)
-    x, y = along * centre[0] + across * centre[1]
-    return Prism(
-        x=float(x),
-        y=float(y),
-        axis_x=float(along[0]),
-        axis_y=float(along[1]),
-        half_a=float(0.5 * (high[0] - low[0])),
-        half_b=float(0.5 * (high[1] - low[1])),
-        z0=bottom_m,
-        z1=room.ceiling_height_m,
-        finish=finish,
-        piece=-1,
-        is_round=False,
-    )
+    middle = along * centre[0] + across * centre[1]
+    half_a, half_b = (0.5 * (high - low)).tolist()
+    return Prism.upright(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish=finish, piece=-1)

@@ -172,18 +172,8 @@ def _hanging(
     spot_m: np.ndarray, radius_m: float, z_m: tuple[float, float], finish: Finish, *, is_round: bool = True
 ) -> Prism:
     """Return a part of a lamp below the ceiling."""
-    return Prism(
-        x=float(spot_m[0]),
-        y=float(spot_m[1]),
-        axis_x=1.0,
-        axis_y=0.0,
-        half_a=radius_m,
-        half_b=radius_m,
-        z0=z_m[0],
-        z1=z_m[1],
-        finish=finish,
-        piece=_NO_PIECE,
-        is_round=is_round,
+    return Prism.upright(
+        spot_m, (1.0, 0.0), (radius_m, radius_m), z_m, finish=finish, piece=_NO_PIECE, is_round=is_round
     )
 
 
@@ -207,19 +197,7 @@ def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.ran
     at, z = foot + inwards * 0.06, rng.uniform(1.6, 1.95)
     power = math.exp(rng.uniform(math.log(0.15), math.log(0.8)))
     light = Lights.row(xy_m=foot + inwards * 0.2 - origin_m, z_m=z, colour=power * lighting.lamp_colour)
-    lamp = Prism(
-        x=float(at[0]),
-        y=float(at[1]),
-        axis_x=float(along[0]),
-        axis_y=float(along[1]),
-        half_a=0.06,
-        half_b=0.04,
-        z0=z - 0.1,
-        z1=z + 0.1,
-        finish="glow",
-        piece=_NO_PIECE,
-        is_round=False,
-    )
+    lamp = Prism.upright(at, along, (0.06, 0.04), (z - 0.1, z + 0.1), finish="glow", piece=_NO_PIECE)
     return light, lamp
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.learn.synth.camera.exposure import Exposure
-from lalaloc_core.learn.synth.records import Column, Joined, Records
+from lalaloc_core.learn.synth.records import Column, Joined, Records, columns
 from lalaloc_core.learn.synth.scene.surfaces import Surfaces
 
 Fact = Literal[
@@ -45,14 +45,7 @@ class Decals(Records):
         depth_m: depth of a hole.
     """
 
-    wall = Column()
-    s0_m = Column()
-    s1_m = Column()
-    z0_m = Column()
-    z1_m = Column()
-    surface = Column()
-    slot = Column()
-    depth_m = Column()
+    wall, s0_m, s1_m, z0_m, z1_m, surface, slot, depth_m = columns(8)
 
 
 class Prisms(Records):
@@ -66,17 +59,8 @@ class Prisms(Records):
         is_opaque: 1 for prisms that cast shadows.
     """
 
-    x_m = Column()
-    y_m = Column()
-    axis_x = Column()
-    axis_y = Column()
-    half_a_m = Column()
-    half_b_m = Column()
-    z0_m = Column()
-    z1_m = Column()
-    is_round = Column()
-    surface = Column()
-    is_opaque = Column()
+    x_m, y_m, axis_x, axis_y, half_a_m, half_b_m = columns(6)
+    z0_m, z1_m, is_round, surface, is_opaque = columns(5)
     centre_m = Joined(x_m, y_m)
     axis = Joined(axis_x, axis_y)
 
@@ -88,9 +72,7 @@ class VisibleRooms(Records):
         light_m, light_colour: position, and colour times power, of the one lamp of a room seen through a door.
     """
 
-    ceiling_m = Column()
-    floor_surface = Column()
-    ceiling_surface = Column()
+    ceiling_m, floor_surface, ceiling_surface = columns(3)
     light_m = Column(3)
     light_colour = Column(3)
     ambient = Column(3)
@@ -124,10 +106,7 @@ class Sun(Records):
     direction = Column(3)
     wall_start_m = Column(2)
     wall_along = Column(2)
-    s0_m = Column()
-    s1_m = Column()
-    z0_m = Column()
-    z1_m = Column()
+    s0_m, s1_m, z0_m, z1_m = columns(4)
     colour = Column(3)
 
 
@@ -142,10 +121,7 @@ class Backdrop(Records):
 
     sky = Column(3)
     ground = Column(3)
-    horizon = Column()
-    ruggedness = Column()
-    turn = Column()
-    lift = Column()
+    horizon, ruggedness, turn, lift = columns(4)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.learn.synth.furniture.pieces import Finish
-from lalaloc_core.learn.synth.records import Column, Records, Row
+from lalaloc_core.learn.synth.records import Column, Records, Row, columns
 from lalaloc_core.learn.synth.scene.materials import MaterialCategory, MaterialLibrary
 
 Colour = Float[np.ndarray, "3"]
@@ -28,16 +28,9 @@ class Surfaces(Records):
         shift_u, shift_v: translation of the picture, as shares of it.
     """
 
-    picture = Column()
-    scale = Column()
-    cosine = Column()
-    sine = Column()
+    picture, scale, cosine, sine = columns(4)
     tint = Column(3)
-    gloss = Column()
-    glow = Column()
-    is_outdoors = Column()
-    shift_u = Column()
-    shift_v = Column()
+    gloss, glow, is_outdoors, shift_u, shift_v = columns(5)
 
 
 class SurfaceTable:

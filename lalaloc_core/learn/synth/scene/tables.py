@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -95,32 +95,28 @@ class SceneTables:
 
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """Add a box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
-        x, y = self.camera_m
-        row = Prisms.row(
-            x_m=prism.x - x,
-            y_m=prism.y - y,
-            axis_x=prism.axis_x,
-            axis_y=prism.axis_y,
-            half_a_m=prism.half_a,
-            half_b_m=prism.half_b,
-            z0_m=prism.z0,
-            z1_m=prism.z1,
-            is_round=prism.is_round,
+        self.add_box(
+            np.array([prism.x, prism.y]),
+            (prism.axis_x, prism.axis_y),
+            half_m=(prism.half_a, prism.half_b),
+            z_m=(prism.z0, prism.z1),
             surface=surface,
-            is_opaque=opaque,
+            is_round=prism.is_round,
+            opaque=opaque,
         )
-        self.prisms.append(row)
 
     def add_box(
         self,
         centre_m: Float[np.ndarray, "2"],
-        axis: Float[np.ndarray, "2"],
+        axis: Sequence[float] | np.ndarray,
         *,
         half_m: tuple[float, float],
         z_m: tuple[float, float],
         surface: int,
+        is_round: bool = False,
+        opaque: bool = True,
     ) -> None:
-        """Add a box that casts shadows; centre in the plan frame, half extents along `axis` and across it."""
+        """Add a box or cylinder; centre in the plan frame, half extents along `axis` and across it."""
         row = Prisms.row(
             centre_m=centre_m - self.camera_m,
             axis=axis,
@@ -128,8 +124,9 @@ class SceneTables:
             half_b_m=half_m[1],
             z0_m=z_m[0],
             z1_m=z_m[1],
+            is_round=is_round,
             surface=surface,
-            is_opaque=True,
+            is_opaque=opaque,
         )
         self.prisms.append(row)
 

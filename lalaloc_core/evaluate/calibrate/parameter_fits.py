@@ -1,9 +1,8 @@
-"""Calibration on validation queries: weights of the matching cost, and confidence.
+"""Fits on validation queries: weights of the matching cost, and confidence.
 
 * `fit_matching_weights` fits the weight of each term and the temperature of the posterior, so that the right candidates
   are the most probable.
 * `with_heading_doubt` adds how well a right heading usually fits, and how much better the best of all headings does.
-* `store_cohort` stores the matching costs of unknown places (`localise.match.cohort`), from training homes.
 * `fit_confidence` fits the covariance and the probability that a photograph belongs to its plan, which turns the
   posterior into the probability of "within 1 m". Its queries are photographs of the plan's home, disturbed photographs,
   because real cameras and plans are worse than rendered ones, and photographs of unknown places.
@@ -13,28 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-from lalaloc_core.bundle import (
-    COHORT,
-    Bundle,
-    ConfidenceModel,
-    LogisticModel,
-    Manifest,
-    MatchingWeights,
-    write_manifest,
-)
+from lalaloc_core.bundle import ConfidenceModel, LogisticModel, MatchingWeights
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
-from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
-from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.metrics import Accuracy
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.predictions import Prediction
+from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M, marginal_information
-from lalaloc_core.localise.match import Cohort
 
 # Weight of unknown places in the fit, chosen on annotated photographs among 0.25, 0.4, 0.5 and 0.6: the lowest with
 # which at most 2 % of them have a confidence above 0.5 in plans of other buildings.
@@ -179,36 +167,6 @@ def _own(answers: Answers) -> list[tuple[Prediction, str]]:
 def _grid_cost(answer: Prediction) -> float | None:
     """Return the cost of the best grid pose; None without an answer."""
     return answer.signals["retrieval"]["cost"] if "retrieval" in answer.signals else None
-
-
-def store_cohort(bundle: Bundle, cohort: Cohort) -> Bundle:
-    """Store the cohort in the bundle."""
-    atomic_write(bundle.folder / COHORT, cohort.to_bytes())
-    return write_manifest(bundle.folder, bundle.manifest)
-
-
-def store_matching_weights(bundle: Bundle, weights: MatchingWeights, *, views: bool = False) -> Bundle:
-    """Store fitted weights of spheres or of views in the bundle's manifest."""
-    return write_manifest(bundle.folder, _with_calibration(bundle.manifest, views, evidence=weights))
-
-
-def _with_calibration(manifest: Manifest, views: bool, **fitted: Any) -> Manifest:
-    """Return a manifest with fitted values for spheres or for views."""
-    if not views:
-        return replace(manifest, **fitted)
-    assert manifest.view is not None
-    return replace(manifest, view=replace(manifest.view, **fitted))
-
-
-def calibrate(bundle: Bundle, known: Answers, searched: Answers, description: str, *, views: bool = False) -> Bundle:
-    """Store the fitted confidence and the validation figures of spheres or of views in the manifest."""
-    prefix = "view_validation" if views else "validation"
-    metrics = {**bundle.manifest.metrics, f"{prefix}_queries": description}
-    for name, answers in ((prefix, known), (f"{prefix}_heading_searched", searched)):
-        metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
-        metrics[f"{name}_confidence"] = cross_validate(answers)
-    manifest = _with_calibration(bundle.manifest, views, confidence=fit_confidence(known, searched))
-    return write_manifest(bundle.folder, replace(manifest, metrics=metrics))
 
 
 def cross_validate(answers: Answers) -> dict[str, float]:

@@ -20,22 +20,20 @@ from lalaloc_core.bundle import Bundle, Manifest, PredictionErrors, write_manife
 from lalaloc_core.bundle.prediction_errors import LEVELS
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.methods.lalaloc import GRID_STEP_M, LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Split
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
-from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches
+from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches, errors_of
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, Query
-from lalaloc_core.localise.search.pipeline import Refiner, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet
 
 _FIELD_DEG, _VIEWS = 80.0, 3
-GRID_STEP_M = 0.5
 # Spreads that are tried, and draws of each photograph: in the fit, and in comparisons.
 _SPREADS, _FIT_DRAWS, DRAWS = (0.5, 0.6, 0.7, 0.8, 1.0), 1, 2
 
@@ -45,6 +43,11 @@ class Spot(NamedTuple):
 
     plan: FloorPlan
     views: Sequence[Camera]
+
+    @property
+    def turns(self) -> list[float]:
+        """Angles (radians) from the first view to each."""
+        return [float(wrap_angle(view.heading - self.views[0].heading)) for view in self.views]
 
     @property
     def place(self) -> PoseSet:
@@ -65,11 +68,9 @@ def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:
     """Return the queries of a spot by photograph and heading, as `localisability.CONDITIONS` names them."""
     manifest, views = encoder.networks.manifest, spot.views
     height = CameraHeight(views[0].camera_height_m)
-    photograph = _photograph(views[0])
-    pixels = photograph.sphere.photograph.image(manifest.image_height, manifest.image_width)
-    opened = [_photograph(view).open(patch_size(manifest)) for view in views]
-    turns = [float(wrap_angle(view.heading - views[0].heading)) for view in views[1:]]
-    others = list(zip(opened[1:], turns, strict=True))
+    pixels = photograph_of(views[0]).sphere.photograph.image(manifest.image_height, manifest.image_width)
+    opened = [photograph_of(view).open(patch_size(manifest)) for view in views]
+    others = list(zip(opened[1:], spot.turns[1:], strict=True))
     queries: dict[str, Query] = {}
     for name, heading in (("known_heading", views[0].heading), ("unknown_heading", None)):
         queries[f"sphere_{name}"] = encoder.networks.query(pixels, heading, height)
@@ -86,13 +87,12 @@ class Outcome(NamedTuple):
     found: dict[str, bool]
 
 
-def outcome_of(spot: Spot, encoder: PhotographEncoder, refiner: Refiner) -> Outcome:
+def outcome_of(spot: Spot, model: LocalModel) -> Outcome:
     """Localise the photographs of a spot."""
-    height_m = spot.views[0].camera_height_m
-    grid = build_grid(spot.plan, encoder.networks, step_m=GRID_STEP_M, camera_height_m=height_m, latents=False)
-    queries, found = queries_of(spot, encoder), dict[str, bool]()
+    grid = model.grid(spot.plan, spot.views[0].camera_height_m)
+    queries, found = queries_of(spot, model.encoder), dict[str, bool]()
     for name, query in queries.items():
-        answer = localise(spot.plan, grid, encoder.networks, query, refiner=refiner).candidates[0]
+        answer = model.localise(spot.plan, grid, query).candidates[0]
         found[name] = bool(np.linalg.norm(answer.position_m - spot.views[0].position_m) < RIGHT_WITHIN_M)
     compared = {name: _compared(spot, queries[f"{name}_known_heading"]) for name in ("sphere", "phone")}
     return Outcome(spot, compared, found)
@@ -100,8 +100,8 @@ def outcome_of(spot: Spot, encoder: PhotographEncoder, refiner: Refiner) -> Outc
 
 def outcomes_of(bundle: Bundle, homes: int, split: Split, textures: Path | None) -> list[Outcome]:
     """Localise the photographs of generated homes, 4 spots in each."""
-    encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    return [outcome_of(spot, encoder, refiner) for spot in spots(homes, split, textures)]
+    model = LocalModel(bundle)
+    return [outcome_of(spot, model) for spot in spots(homes, split, textures)]
 
 
 def predicted_shares(
@@ -115,6 +115,18 @@ def predicted_shares(
             (outcomes,) = search.draws(spot.place, name, draws, rng)
             found[name].append(float(np.mean([outcome.found for outcome in outcomes])))
     return {name: np.array(values) for name, values in found.items()}
+
+
+def calibrate_errors(folder: Path, homes: int) -> Errors:
+    """Measure the errors of a bundle's predictions on generated validation homes, and store them in the bundle.
+
+    Raises:
+        InvalidInputError: the bundle has no encoder of views.
+    """
+    bundle = Bundle.open(folder)
+    if bundle.manifest.view is None:
+        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --errors")
+    return errors_of(measure_errors(bundle, outcomes_of(bundle, homes, "validation", None)).manifest)
 
 
 def measure_errors(bundle: Bundle, outcomes: Sequence[Outcome]) -> Bundle:
@@ -165,7 +177,8 @@ def _compared(spot: Spot, query: Query) -> tuple[np.ndarray, ...]:
     )
 
 
-def _photograph(camera: Camera) -> ViewPhotograph:
+def photograph_of(camera: Camera) -> ViewPhotograph:
+    """Return the only photograph of a camera of `ViewScenes`."""
     (photograph,) = camera.photographs.values()
     assert isinstance(photograph, ViewPhotograph)
     return photograph

@@ -1,0 +1,59 @@
+"""Options that several commands have, and types of option values with range checks."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lalaloc_core.bundle import default_bundle
+
+_Number = TypeVar("_Number", int, float)
+
+
+def _within(
+    name: str, kind: Callable[[str], _Number], limits: str, holds: Callable[[_Number], bool]
+) -> Callable[[str], _Number]:
+    """Return the type of numbers for which `holds`; argparse's errors have its `name`."""
+
+    def parse(text: str) -> _Number:
+        value = kind(text)
+        if not holds(value):
+            raise argparse.ArgumentTypeError(f"{text} is out of range; it must be {limits}")
+        return value
+
+    parse.__name__ = name
+    return parse
+
+
+count = _within("count", int, "at least 1", lambda value: value >= 1)
+positive = _within("positive", float, "positive", lambda value: 0.0 < value < math.inf)
+# Number of worker processes; 0 runs everything in this process.
+processes = _within("processes", int, "at least 0", lambda value: value >= 0)
+heading = _within("heading", float, "between -360 and 360 degrees", lambda value: -360.0 <= value <= 360.0)
+tolerance = _within("tolerance", float, "between 0 and 45 degrees", lambda value: 0.0 <= value <= 45.0)
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "--bundle": {"type": Path, "default": default_bundle(), "help": "model bundle (default: the shipped one)"},
+    "--camera-height": {
+        "type": positive,
+        "metavar": "M",
+        "help": "metres above the floor (default: the plan's, otherwise estimated)",
+    },
+    "--seed": {"type": int, "default": 0, "help": "random seed of generated homes (default: %(default)s)"},
+    "--skip-bad": {"action": "store_true", "help": "skip unusable files and samples, and list them"},
+    "--textures": {
+        "type": Path,
+        "metavar": "DIR",
+        "help": "material pictures for generated homes (default: procedural materials)",
+    },
+    "--workers": {"type": processes, "metavar": "N", "help": "worker processes (default: one per core)"},
+}
+
+
+def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add shared options by name, such as "--bundle"."""
+    for name in names:
+        parser.add_argument(name, **_OPTIONS[name])

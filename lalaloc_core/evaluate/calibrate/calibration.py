@@ -1,0 +1,195 @@
+"""Calibration of a model bundle: its matching weights and its confidence, fitted on generated validation homes.
+
+The homes' photographs are localised with the bundle. In this order the bundle gets
+
+1. the cohort (`localise.match.cohort`): the layouts of unknown places, from training homes;
+2. the appearance of openings, and the weights of the matching cost;
+3. the confidence and covariance, fitted on predictions made with these weights: for the home's own photographs, for
+   disturbed ones, because real cameras and plans are worse than rendered ones, and for photographs of unknown places.
+
+The weights and the confidence of views are fitted separately; views share cohort and appearance with spheres.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.bundle import COHORT, Bundle, Manifest, MatchingWeights, write_manifest
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.calibrate.opening_appearance import fit_appearance
+from lalaloc_core.evaluate.calibrate.parameter_fits import (
+    Answers,
+    cross_validate,
+    fit_confidence,
+    fit_matching_weights,
+    with_heading_doubt,
+)
+from lalaloc_core.evaluate.runs.factories import build_dataset, describe_model
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.data.synthetic import training_plans
+from lalaloc_core.learn.metrics import Accuracy
+from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.match import Cohort, cohort_of
+
+_LOG = logging.getLogger(__name__)
+# Views of each camera, at equal angles.
+_VIEWS_PER_CAMERA = 2
+# Ratio of calibration homes to homes that are also asked for in plans without openings.
+_PER_UNOPENED_HOME = 4
+# Homes of the cohort.
+_COHORT_HOMES = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationConfig:
+    """Settings of a calibration.
+
+    Attributes:
+        homes: number of generated homes, 4 queries each.
+        seed: of the homes.
+        textures: folder of material pictures; None makes all materials procedural.
+        views: calibrate the encoder of views instead of that of spheres.
+        keep_evidence: keep the bundle's matching weights and fit only the confidence.
+        openings_weight: weight of openings relative to walls; None fits it.
+        tail: scale of the errors of walls over the predicted one; None keeps the bundle's.
+        out: folder of the predictions, from which an interrupted calibration continues; None keeps none.
+    """
+
+    homes: int = 100
+    seed: int = 0
+    textures: Path | None = None
+    views: bool = False
+    keep_evidence: bool = False
+    openings_weight: float | None = None
+    tail: float | None = None
+    out: Path | None = None
+
+
+def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
+    """Calibrate the bundle in a folder and return it.
+
+    Raises:
+        BundleError: there is no bundle, or it is damaged.
+        InvalidInputError: views are to be calibrated and the bundle has no encoder of views.
+        RunError: `config.out` holds predictions of another calibration.
+    """
+    bundle, views = Bundle.open(folder), config.views
+    if views and bundle.manifest.view is None:
+        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --views")
+    if not views:
+        plans = training_plans(_COHORT_HOMES, config.seed)
+        bundle = store_cohort(bundle, cohort_of(plans, bundle.manifest.profile_columns, config.seed))
+    queries = _Queries(folder, config)
+    # Weights first: confidence is fitted on predictions made with them.
+    weights = bundle.manifest.evidence_for(view=views)
+    weights = replace(weights, tail=config.tail or weights.tail)
+    if not config.keep_evidence:
+        appearance = bundle.manifest.evidence.appearance
+        encoders = Encoders(bundle, threads=1)
+        if encoders.predicts_structure and not views:
+            appearance = queries.appearance(encoders)
+        bundle = store_matching_weights(bundle, replace(weights, appearance=appearance), views=views)
+        unweighed = [query for known in (True, False) for query in queries.localise("unweighed", known)]
+        weights = fit_matching_weights(unweighed, MatchingWeights(appearance=appearance, tail=weights.tail))
+    if config.openings_weight is not None:
+        weights = replace(weights, openings=config.openings_weight)
+    bundle = store_matching_weights(bundle, weights, views=views)
+    _LOG.info("matching weights: %s", asdict(weights))
+    known, searched = queries.answers(known=True), queries.answers(known=False)
+    if not config.keep_evidence:
+        bundle = store_matching_weights(bundle, with_heading_doubt(weights, known, searched), views=views)
+    description = (
+        f"{len(known.own)} {'views' if views else 'panoramas'} of {config.homes} generated validation homes, all "
+        "furniture levels; confidence besides on the same disturbed, and on "
+        f"{len(known.mismatched)} photographs of others or of no room"
+    )
+    return store_confidence(bundle, known, searched, description, views=views)
+
+
+class _Queries:
+    """Photographs of generated homes, localised with the bundle as it is stored at that moment."""
+
+    def __init__(self, bundle: Path, config: CalibrationConfig) -> None:
+        self._bundle, self._config = bundle, config
+        textures = None if config.textures is None else str(config.textures)
+        own = {"homes": config.homes, "seed": config.seed, "furniture": None, "textures": textures}
+        # Arguments of the generator by the name of the photographs.
+        self._generated: dict[str, dict[str, Any]] = {
+            "own": own,
+            "unweighed": own,
+            "disturbed": own | {"generator": "disturbed"},
+            "unopened": own | {"generator": "unopened", "homes": max(config.homes // _PER_UNOPENED_HOME, 1)},
+            "mismatched": own | {"generator": "mismatched"},
+            "foreign": own | {"generator": "foreign"},
+        }
+
+    def localise(self, name: str, known: bool) -> list[Prediction]:
+        """Return the predictions for photographs, with a known or with a searched heading."""
+        info = self._run_info(name, known)
+        if self._config.out is not None:
+            return run_evaluation(RunFolder(self._config.out / f"{name}-{'known' if known else 'searched'}"), info)
+        with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
+            return run_evaluation(RunFolder(Path(folder)), info)
+
+    def answers(self, *, known: bool) -> Answers:
+        """Return the predictions to fit the confidence on."""
+        own, disturbed, unopened, mismatched, foreign = (
+            self.localise(name, known) for name in ("own", "disturbed", "unopened", "mismatched", "foreign")
+        )
+        return Answers(own=own, disturbed=[*disturbed, *unopened], mismatched=[*mismatched, *foreign])
+
+    def appearance(self, encoders: Encoders) -> tuple[tuple[float, ...], ...]:
+        """Fit `MatchingWeights.appearance` on the own and the disturbed photographs."""
+        datasets = [build_dataset(self._run_info(name, True)) for name in ("own", "disturbed")]
+        return fit_appearance(encoders, (data.load(name) for data in datasets for name in data.scenes("validation")))
+
+    def _run_info(self, name: str, known: bool) -> RunInfo:
+        return RunInfo(
+            label=f"calibration, {name} homes, heading {'known' if known else 'searched'}",
+            dataset="generated homes",
+            split="validation",
+            generated=self._generated[name],
+            views={"per_camera": _VIEWS_PER_CAMERA} if self._config.views else None,
+            heading_known=known,
+            bundle=str(self._bundle),
+            model=describe_model(self._bundle),
+        )
+
+
+def store_cohort(bundle: Bundle, cohort: Cohort) -> Bundle:
+    """Store the cohort in the bundle."""
+    atomic_write(bundle.folder / COHORT, cohort.to_bytes())
+    return write_manifest(bundle.folder, bundle.manifest)
+
+
+def store_matching_weights(bundle: Bundle, weights: MatchingWeights, *, views: bool = False) -> Bundle:
+    """Store fitted weights of spheres or of views in the bundle's manifest."""
+    return write_manifest(bundle.folder, _with_calibration(bundle.manifest, views, evidence=weights))
+
+
+def store_confidence(
+    bundle: Bundle, known: Answers, searched: Answers, description: str, *, views: bool = False
+) -> Bundle:
+    """Fit the confidence of spheres or of views, and store it with the validation figures in the manifest."""
+    prefix = "view_validation" if views else "validation"
+    metrics = {**bundle.manifest.metrics, f"{prefix}_queries": description}
+    for name, answers in ((prefix, known), (f"{prefix}_heading_searched", searched)):
+        metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
+        metrics[f"{name}_confidence"] = cross_validate(answers)
+    manifest = _with_calibration(bundle.manifest, views, confidence=fit_confidence(known, searched))
+    return write_manifest(bundle.folder, replace(manifest, metrics=metrics))
+
+
+def _with_calibration(manifest: Manifest, views: bool, **fitted: Any) -> Manifest:
+    """Return a manifest with fitted values for spheres or for views."""
+    if not views:
+        return replace(manifest, **fitted)
+    assert manifest.view is not None
+    return replace(manifest, view=replace(manifest.view, **fitted))
