@@ -292,7 +292,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluate.runs.run import run_evaluation
     from lalaloc_core.learn.data.synthetic import training_plans
-    from lalaloc_core.localise.encode.encoders import Encoders
+    from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
     from lalaloc_core.localise.match import cohort_of
 
     def run_info(generated: dict[str, Any], known: bool, source: str) -> RunInfo:
@@ -332,8 +332,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     if not arguments.keep_evidence:
         # Views are of the same plans, so they share the appearance that was fitted on spheres.
         appearance = bundle.manifest.evidence.appearance
-        encoders = Encoders(Bundle.open(arguments.bundle), threads=1)
-        if encoders.predicts_structure and not arguments.views:
+        encoders = PhotographEncoder(Bundle.open(arguments.bundle), threads=1)
+        if encoders.spheres.predicts_structure and not arguments.views:
             datasets = [build_dataset(run_info(source, True, "appearance")) for source in (own, disturbed)]
             scenes = (dataset.load(name) for dataset in datasets for name in dataset.scenes("validation"))
             appearance = fit_appearance(encoders, scenes)

@@ -145,15 +145,15 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
     from lalaloc_core.localise.belief import advice_for, information_bits
     from lalaloc_core.localise.encode.features import is_features, read_features
+    from lalaloc_core.localise.encode.layout_encoder import build_grid
     from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import localise
-    from lalaloc_core.localise.search.retrieval import build_grid
     from lalaloc_core.photograph import StatedCamera, open_photograph
 
     bundle = Bundle.open(arguments.bundle)
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    encoders, manifest = encoder.networks, bundle.manifest
+    encoders, manifest = encoder, bundle.manifest
     height = stated_height(plan, arguments.camera_height)
     # Models that compare only latents need a pose grid per camera height.
     grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
@@ -263,8 +263,8 @@ def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
         return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
     view = open_photograph(content, sphere_size=(height, width), stated=stated)
-    assert view.panorama is not None
-    return view.panorama.pixels
+    assert view.sphere is not None
+    return view.sphere
 
 
 def _check_height(height_m: float | None, plan: FloorPlan) -> None:

@@ -125,10 +125,10 @@ def _followed(
     from tqdm import tqdm
 
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+    from lalaloc_core.localise.encode.layout_encoder import build_grid
     from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
-    from lalaloc_core.localise.search.retrieval import build_grid
     from lalaloc_core.localise.tracking import TrackState
     from lalaloc_core.localise.tracking.filter import track_steps
     from lalaloc_core.localise.tracking.ground import Ground
@@ -137,7 +137,7 @@ def _followed(
 
     bundle = Bundle.open(arguments.bundle)
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    encoders, manifest = encoder.networks, bundle.manifest
+    encoders, manifest = encoder, bundle.manifest
     sphere, patch = sphere_size(manifest), patch_size(manifest)
     height = stated_height(plan, arguments.camera_height)
     grid = build_grid(

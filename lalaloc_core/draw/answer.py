@@ -138,7 +138,7 @@ def draw_answer(
 ) -> str:
     """Draw an answer as an SVG document, 1600 pixels wide.
 
-    The photograph is a levelled full sphere from `photograph.spheres.open_sphere`, or that of `answer.view` from
+    The photograph is a levelled full sphere from `photograph.spheres.read_sphere`, or that of `answer.view` from
     `photograph.photograph.open_picture`; it is required unless `picture` is "plan".
     The default title is the room. `rooms` is a cached result of `draw_rooms` for the plan.
     """

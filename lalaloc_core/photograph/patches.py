@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.photograph.cameras import Camera
-from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.photograph.cameras import Camera, camera_axes
 
 # Colour of pixels that the photograph does not show.
 UNSEEN = 127
@@ -111,14 +110,8 @@ def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
 
 
 def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float, size: PatchSize) -> Patch:
-    turn = np.array(
-        [
-            [math.cos(azimuth), math.sin(azimuth), 0.0],
-            [-math.sin(azimuth), math.cos(azimuth), 0.0],
-            [0.0, 0.0, 1.0],
-        ],
-        np.float32,
-    )
+    cosine, sine = math.cos(azimuth), math.sin(azimuth)
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
     rays = _level_rays(size) @ (axes @ turn).T
     pixels, seen = camera.pixels(rays)
     where = (np.where(seen[..., None], pixels, 0.0) - _HALF_PIXEL).astype(np.float32)

@@ -149,7 +149,7 @@ class Localiser:
         steps = localise_steps(
             record.plan,
             grid,
-            self._encoder.networks,
+            self._encoder,
             encoded[0],
             refine=form.refine,
             top_k=form.top_k,
@@ -185,7 +185,7 @@ class Localiser:
     async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline."""
         with context.clock.stage("grid"):
-            height_m = grid_height_m(record, height.height_m, latents_alone=not self._encoder.networks.predicts_profile)
+            height_m = grid_height_m(record, height.height_m, latents_alone=not self._encoder.predicts_profile)
             key = self._grids.key(record.revision_id, height_m)
             grid = self._grids.cached(key)
             if grid is None:

@@ -100,7 +100,7 @@ class SequenceSearch:
             LaLaLocError: see `Decoder.decode`.
         """
         form, context = query.form, query.context
-        if form.camera_heights_m is not None and not self._encoder.networks.predicts_profile:
+        if form.camera_heights_m is not None and not self._encoder.predicts_profile:
             raise InvalidPoseError(
                 "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
                 "give camera_height_m"
@@ -186,7 +186,7 @@ class SequenceSearch:
         steps = localise_sequence_steps(
             ground.plan,
             ground.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded,
             form.steps(len(views)),
             refine=form.refine,
@@ -222,7 +222,7 @@ class SequenceSearch:
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded[0],
             refine=form.refine,
             top_k=form.top_k,

@@ -118,7 +118,7 @@ class SessionTracker:
                 found = await self._grounds.of_plan(place, query)
             steps = track_steps(
                 found.ground,
-                self._encoder.networks,
+                self._encoder,
                 state or TrackState.first(len(encoded.roll)),
                 encoded,
                 odometry,

@@ -175,7 +175,7 @@ class VenueLocaliser:
         steps = localise_steps(
             searched.merged.plan,
             searched.merged.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded,
             refine=form.refine,
             top_k=form.top_k,

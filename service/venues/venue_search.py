@@ -168,7 +168,7 @@ class VenueSearch:
             # Another query may be making the index, in the time that it has itself.
             async with context.bounded():
                 known, plan_index = await self._indices.index(venue.tenant, possible, compute, venue_id=whole_venue)
-            manifest = self._encoder.networks.manifest
+            manifest = self._encoder.manifest
             choosing = [(one, manifest.evidence_for(view=one.is_view)) for one in queries]
             log_prior = hints.log_prior(known, shares)
             preferred = None if favour is None else favour(known)

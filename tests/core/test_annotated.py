@@ -34,7 +34,7 @@ from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of
@@ -376,11 +376,11 @@ class TestGalleryScores:
 
 
 class TestEvaluating:
-    def test_reading_compares_encoder_predictions(self, root: Path, encoders: Encoders) -> None:
+    def test_reading_compares_encoder_predictions(self, root: Path, encoders: PhotographEncoder) -> None:
         photographs = AnnotatedPhotographs(root).photographs
         for read, photograph in zip(read_photographs(encoders, photographs), photographs, strict=True):
             image = photograph.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
-            profile_m, left_over = encoders.profile(image, 0.0, CAMERA_HEIGHT_M)
+            profile_m, left_over = encoders.spheres.profile(image, 0.0, CAMERA_HEIGHT_M)
             assert left_over == 0.0
             azimuth = column_azimuths(len(profile_m))
             polygon = photograph.outlines[read.measures.outline].polygon_m

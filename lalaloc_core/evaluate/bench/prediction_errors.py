@@ -26,12 +26,12 @@ from lalaloc_core.learn.data.dataset import Camera, Split
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import Refiner, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet
 
 _FIELD_DEG, _VIEWS = 80.0, 3
@@ -63,7 +63,7 @@ def spots(homes: int, split: Split, textures: Path | None) -> Iterator[Spot]:
 
 def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:
     """Return the queries of a spot by photograph and heading, as `localisability.CONDITIONS` names them."""
-    manifest, views = encoder.networks.manifest, spot.views
+    manifest, views = encoder.manifest, spot.views
     height = CameraHeight(views[0].camera_height_m)
     photograph = _photograph(views[0])
     pixels = photograph.sphere.photograph.image(manifest.image_height, manifest.image_width)
@@ -72,7 +72,7 @@ def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:
     others = list(zip(opened[1:], turns, strict=True))
     queries: dict[str, Query] = {}
     for name, heading in (("known_heading", views[0].heading), ("unknown_heading", None)):
-        queries[f"sphere_{name}"] = encoder.networks.query(pixels, heading, height)
+        queries[f"sphere_{name}"] = encoder.spheres.query(pixels, heading, height)
         queries[f"phone_{name}"] = encoder.query(opened[0], heading, height)
         queries[f"three_phone_{name}"] = encoder.query(opened[0], heading, height, others=others)
     return queries
@@ -89,10 +89,10 @@ class Outcome(NamedTuple):
 def outcome_of(spot: Spot, encoder: PhotographEncoder, refiner: Refiner) -> Outcome:
     """Localise the photographs of a spot."""
     height_m = spot.views[0].camera_height_m
-    grid = build_grid(spot.plan, encoder.networks, step_m=GRID_STEP_M, camera_height_m=height_m, latents=False)
+    grid = build_grid(spot.plan, encoder, step_m=GRID_STEP_M, camera_height_m=height_m, latents=False)
     queries, found = queries_of(spot, encoder), dict[str, bool]()
     for name, query in queries.items():
-        answer = localise(spot.plan, grid, encoder.networks, query, refiner=refiner).candidates[0]
+        answer = localise(spot.plan, grid, encoder, query, refiner=refiner).candidates[0]
         found[name] = bool(np.linalg.norm(answer.position_m - spot.views[0].position_m) < RIGHT_WITHIN_M)
     compared = {name: _compared(spot, queries[f"{name}_known_heading"]) for name in ("sphere", "phone")}
     return Outcome(spot, compared, found)

@@ -15,10 +15,10 @@ from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import StageClock, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 
 _GRID_STEP_M = 0.5
 _FUNCTIONS = 20
@@ -33,7 +33,7 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
     home = home_of_area(100.0)
     shots = sample_shots(home, queries, np.random.default_rng(1), "full")
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    encoders, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
     images = renderers.renderer(height, width).render(shots).cpu().numpy()
     camera_m = home.plan.camera_height_m
@@ -44,7 +44,7 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
         clock, shot = StageClock(), shots[index]
         with clock.stage("encode"):
             heading = shot.heading if known else None
-            query = encoders.query(images[index], heading, CameraHeight(shot.camera_height_m))
+            query = encoders.spheres.query(images[index], heading, CameraHeight(shot.camera_height_m))
         localise(home.plan, grid, encoders, query, refiner=refiner, clock=clock)
         return clock.timings_ms
 

@@ -17,10 +17,10 @@ from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.motion import Motion
 from lalaloc_core.localise.sequence.search import localise_sequence
@@ -62,19 +62,19 @@ def _at_spot(
     plan: FloorPlan, views: Sequence[Camera], encoder: PhotographEncoder, refiner: Refiner
 ) -> dict[str, _Answer]:
     """Localise the views of one spot with known and with unknown angles between them."""
-    manifest, height = encoder.networks.manifest, CameraHeight(views[0].camera_height_m)
+    manifest, height = encoder.manifest, CameraHeight(views[0].camera_height_m)
     opened = [_opened(view, encoder) for view in views]
-    grid = build_grid(plan, encoder.networks, step_m=GRID_STEP_M, camera_height_m=height.height_m, latents=False)
+    grid = build_grid(plan, encoder, step_m=GRID_STEP_M, camera_height_m=height.height_m, latents=False)
 
     def as_one(turns: Sequence[float]) -> Localisation:
         query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
-        return localise(plan, grid, encoder.networks, query, refiner=refiner)
+        return localise(plan, grid, encoder, query, refiner=refiner)
 
     known = as_one([float(wrap_angle(view.heading - views[0].heading)) for view in views])
     believed = known.confidence(manifest.confidence_for(view=True))
     motions = [Motion(distance_m=0.0, distance_std_m=_TURNED_STD_M)] * (len(views) - 1)
     queries = [encoder.query(view, None, height) for view in opened]
-    unknown = localise_sequence(plan, grid, encoder.networks, queries, motions, refiner=refine_sequence)
+    unknown = localise_sequence(plan, grid, encoder, queries, motions, refiner=refine_sequence)
     unknown = judged_turn(unknown, as_one(found_turns(unknown)))
     return {
         "known_angles": _answer(known, views[0], None if believed is None else believed.position),
@@ -85,7 +85,7 @@ def _at_spot(
 def _opened(camera: Camera, encoder: PhotographEncoder) -> Photograph:
     (photograph,) = camera.photographs.values()
     assert isinstance(photograph, ViewPhotograph)
-    return photograph.open(patch_size(encoder.networks.manifest))
+    return photograph.open(patch_size(encoder.manifest))
 
 
 def _answer(found: Localisation, camera: Camera, confidence: float | None) -> _Answer:

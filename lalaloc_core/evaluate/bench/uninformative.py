@@ -20,11 +20,11 @@ from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.localise.belief import CONFIDENT
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.photograph import Photograph, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.stated_camera import StatedCamera
@@ -47,7 +47,7 @@ def bench_uninformative(bundle: Bundle, homes: int, textures: Path | None) -> di
     confidence: dict[str, list[float]] = {"blank_wall": [], "ceiling": [], "landscape": []}
     for name in scenes.scenes("test"):
         scene = scenes.load(name)
-        networks = encoder.networks
+        networks = encoder
         for number, camera in enumerate(scene.cameras):
             height = CameraHeight(camera.camera_height_m)
             grid = build_grid(scene.plan, networks, step_m=GRID_STEP_M, camera_height_m=height.height_m, latents=False)

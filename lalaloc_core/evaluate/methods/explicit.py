@@ -20,7 +20,7 @@ from lalaloc_core.evaluate.methods.alignment import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import read_image
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.refine import RefinementJob
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock
 from lalaloc_core.localise.search.vogel import disc_poses
@@ -33,7 +33,7 @@ _ROWS = 32
 class ExplicitLayout:
     """Method with the wall profile that a `ring` bundle predicts; layout queries use the true one."""
 
-    def __init__(self, encoders: Encoders) -> None:
+    def __init__(self, encoders: PhotographEncoder) -> None:
         self._encoders = encoders
         self._config = LocaliseConfig()
         self._columns = encoders.manifest.profile_columns
@@ -75,7 +75,7 @@ class ExplicitLayout:
         """Return the query's wall profile (m) and the heading of the layouts to compare with it."""
         if image is None:
             return question.true_profile(self._columns), 0.0
-        return self._encoders.profile(image, question.camera.heading, question.camera.camera_height_m)
+        return self._encoders.spheres.profile(image, question.camera.heading, question.camera.camera_height_m)
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def _grid(self, question: Question) -> _RenderedPoses:

@@ -20,7 +20,6 @@ from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCand
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
@@ -60,7 +59,7 @@ class LaLaLoc:
 
     def __init__(
         self,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         *,
         refine: Refine = "lpo",
         refiner: Refiner | None = None,
@@ -148,7 +147,7 @@ def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
     return PoseRefiner.from_bundle(bundle, config).refine
 
 
-def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
+def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return the photograph of a panorama query at the encoder's size; None for layout queries.
 
     Raises:
@@ -160,7 +159,7 @@ def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w
 
 
 def encode(
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     question: Question,
     image: UInt8[np.ndarray, "h w 3"] | None,
     stated: StatedHeight = StatedHeight(),
@@ -168,7 +167,7 @@ def encode(
     """Return the query of a question: the encoded photograph, or the true layout for layout queries."""
     camera = question.camera
     if image is not None:
-        return encoders.query(image, camera.heading if question.heading_known else None, stated.of(question))
+        return encoders.spheres.query(image, camera.heading if question.heading_known else None, stated.of(question))
     rolls = np.array([camera.heading])
     if not question.heading_known:
         sectors = encoders.manifest.ring_sectors or _HEADINGS

@@ -9,13 +9,13 @@ from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.runs.factories import require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.sampling import pose_grid
 
 _SAME_PLACE_M = 1e-3
 
 
-def open_model(info: RunInfo) -> Encoders:
+def open_model(info: RunInfo) -> PhotographEncoder:
     """Return the model of a run.
 
     Raises:
@@ -25,7 +25,7 @@ def open_model(info: RunInfo) -> Encoders:
     bundle = require_bundle(info)
     if info.model is not None and info.model.get("sha256") not in (None, bundle.sha256):
         raise BundleError(f"'{info.bundle}' holds another model than the run used: its SHA-256 is {bundle.sha256}")
-    return Encoders(bundle)
+    return PhotographEncoder(bundle)
 
 
 def find_camera(dataset: Dataset, prediction: Prediction) -> tuple[Scene, Camera]:

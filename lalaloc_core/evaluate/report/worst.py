@@ -32,7 +32,7 @@ from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, 
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import PoseSet
@@ -242,7 +242,7 @@ class _QueryAnalyser:
         )
         return worst, draw_strokes(image, strokes)
 
-    def _encode(self, encoders: Encoders, scene: Scene, camera: Camera) -> Query:
+    def _encode(self, encoders: PhotographEncoder, scene: Scene, camera: Camera) -> Query:
         question = repeat_question(self._info, scene, camera, self._appearance)
         return encode(encoders, question, read_image(encoders, question))
 

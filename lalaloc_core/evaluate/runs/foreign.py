@@ -12,10 +12,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
 
 # Five homes and five offices, each with and without openings; the fit of the confidence has other ones.
 _EACH, _HOMES, _OFFICES = 5, (2, 0), 77
@@ -40,7 +40,7 @@ def foreign_confidences(
     """
     if bundle.manifest.confidence is None:
         return []
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    encoders, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
     height, size = CameraHeight(CAMERA_HEIGHT_M), (bundle.manifest.image_height, bundle.manifest.image_width)
     images = [photograph.photograph.image(*size) for photograph in photographs]
     found = []
@@ -49,7 +49,7 @@ def foreign_confidences(
         grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=CAMERA_HEIGHT_M, latents=latents)
         for photograph, image in zip(photographs, images, strict=True):
             heading = photograph.outlines[0].main_direction if heading_known else None
-            answer = localise(plan, grid, encoders, encoders.query(image, heading, height), refiner=refiner)
+            answer = localise(plan, grid, encoders, encoders.spheres.query(image, heading, height), refiner=refiner)
             confidence = answer.confidence(bundle.manifest.confidence)
             if confidence is not None:
                 found.append(confidence.position)

@@ -19,10 +19,10 @@ from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, ch
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, panorama_batches, sample_styles
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 
 # Part of the horizon, in turns, that is seen in pictures with hidden sectors.
 _SEEN_TURNS = (0.15, 0.6)
@@ -39,7 +39,7 @@ class ImageStage(TrainingStage):
         self,
         config: TrainConfig,
         source: Source,
-        layout_encoder: LayoutEncoder,
+        layout_encoder: LayoutNetwork,
         photographs: Photographs | None = None,
     ) -> None:
         self.config = config
@@ -52,7 +52,7 @@ class ImageStage(TrainingStage):
         self._first_step = 0
 
     @property
-    def teacher(self) -> LayoutEncoder:
+    def teacher(self) -> LayoutNetwork:
         """Frozen layout encoder."""
         return self._layout_encoder
 

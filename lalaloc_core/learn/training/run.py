@@ -29,7 +29,7 @@ from lalaloc_core.learn.training.warm_start import (
     load_trained_layout_encoder,
     load_warm_start,
 )
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
 
 ONLINE = TrainingData()

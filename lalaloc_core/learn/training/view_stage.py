@@ -22,7 +22,7 @@ from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, sample_styles
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
-from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
+from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 
 # Size of the spheres from which views of photographs are cut, about as fine as the views.
 PHOTOGRAPH_SIZE = (384, 768)
@@ -42,7 +42,7 @@ class ViewStage(TrainingStage):
         self.config = config
         self.source = source
         self.photographs = photographs
-        self.encoder = ViewEncoder(config.view, config.ring)
+        self.encoder = ViewNetwork(config.view, config.ring)
         self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
         self._azimuths, self._elevations = (
             torch.from_numpy(angles).float()

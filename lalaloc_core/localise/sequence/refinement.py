@@ -14,7 +14,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
@@ -116,7 +116,7 @@ def height_apart(pictures: Sequence[Observation]) -> float:
 
 def ended_paths(
     plan: FloorPlan,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     pictures: list[Observation],
     motions: Sequence[Motion],
     paths: list[Path],
@@ -129,7 +129,7 @@ def ended_paths(
         starts = [path.starts[t] for path in paths]
         poses = PoseSet(result.position_m[:, t], np.array([start.room_index for start in starts]))
         height_m = picture.query.camera_height.height_m
-        latents, _ = encoders.poses(plan, poses, result.heading[:, t], height_m)
+        latents, _ = encoder.poses(plan, poses, result.heading[:, t], height_m)
         targets = picture.query.latents[[start.hypothesis for start in starts]]
         distance = np.linalg.norm(latents - targets, axis=1)
         alone = RefinementResult(
@@ -142,7 +142,7 @@ def ended_paths(
             evaluations=np.zeros(len(paths), int),
             height_offset=result.height_offset + result.height_own[:, t],
         )
-        ends.append(refined_candidates(plan, encoders, picture.query, starts, alone, config.matching))
+        ends.append(refined_candidates(plan, encoder, picture.query, starts, alone, config.matching))
     moved = [replace(path, ends=tuple(candidates[m] for candidates in ends)) for m, path in enumerate(paths)]
     log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
     found = []

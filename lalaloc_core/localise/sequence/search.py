@@ -23,7 +23,7 @@ from lalaloc_core.localise.belief import (
     signals_of,
     suppress,
 )
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingCost, PoseGrid, cost_by_chance, grid_candidate
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import CameraHeight, Candidate, Query
@@ -87,7 +87,7 @@ SequenceSteps = Generator[SequenceJob | None, SequenceResult | None, SequenceLoc
 def localise_sequence(
     plan: FloorPlan,
     grid: PoseGrid,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     queries: Sequence[Query],
     motions: Sequence[Motion],
     *,
@@ -105,14 +105,14 @@ def localise_sequence(
         InvalidMotionError: the number of motions is not one less than that of the pictures.
     """
     refine: SequenceRefine = "none" if refiner is None else "lpo"
-    steps = localise_sequence_steps(plan, grid, encoders, queries, motions, refine=refine, top_k=top_k, config=config)
+    steps = localise_sequence_steps(plan, grid, encoder, queries, motions, refine=refine, top_k=top_k, config=config)
     return run_steps(steps, refiner)
 
 
 def localise_sequence_steps(
     plan: FloorPlan,
     grid: PoseGrid,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     queries: Sequence[Query],
     motions: Sequence[Motion],
     *,
@@ -130,7 +130,7 @@ def localise_sequence_steps(
         max_states = _MAX_STATES * _FULL_PICTURES // max(len(queries), _FULL_PICTURES)
         pictures: list[Observation] = []
         for query in queries:
-            weights = encoders.manifest.evidence_for(view=query.is_view)
+            weights = encoder.manifest.evidence_for(view=query.is_view)
             pictures.append(_picture(plan, grid, query, weights, config, max_states))
             yield None
         transitions = [
@@ -149,7 +149,7 @@ def localise_sequence_steps(
             job = sequence_job(parts, pictures, paths, transitions, motions)
             result = yield job
             if result is not None:
-                paths = ended_paths(plan, encoders, pictures, motions, paths, result, config)
+                paths = ended_paths(plan, encoder, pictures, motions, paths, result, config)
                 stage = "lpo"
     candidates = [
         distinct([path.ends[t] for path in paths], picture.query, config.separation_m, top_k)
@@ -167,17 +167,17 @@ def localise_sequence_steps(
     )
     if stage == "retrieval" and config.matching.compares_profiles(pictures[0].query):
         candidates = [
-            with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
+            with_latents(plan, encoder, picture.query, answers, grid.camera_height_m)
             for picture, answers in zip(pictures, candidates, strict=True)
         ]
     localisations = [
         _localisation(
-            picture, answers, posterior, stage, _signals(plan, grid, encoders, picture, answers[0], posterior, config)
+            picture, answers, posterior, stage, _signals(plan, grid, encoder, picture, answers[0], posterior, config)
         )
         for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
     ]
     missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
-    localisations = linked(localisations, motions, missed, encoders.manifest)
+    localisations = linked(localisations, motions, missed, encoder.manifest)
     # Paths that differ by less than counts as right are right as well, so Boole's inequality can say more.
     wrong = sum(1.0 - picture.position for picture in found.pictures)
     return SequenceLocalisation(localisations, max(float(found.path[0]), 1.0 - wrong), stage, missed, clock.timings_ms)
@@ -246,7 +246,7 @@ def _contradicted_motions(
 def _signals(
     plan: FloorPlan,
     grid: PoseGrid,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     picture: Observation,
     answer: Candidate,
     posterior: Posterior,
@@ -257,7 +257,7 @@ def _signals(
     penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
     grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
     reach_m = config.matching.grid_reach * grid.step_m
-    by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, config.matching)
+    by_chance = cost_by_chance(encoder.cohort, plan, query, reach_m, weights, config.matching)
     return signals_of(query, answer, posterior, grid_cost, by_chance)
 
 

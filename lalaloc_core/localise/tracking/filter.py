@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.belief import area_shares, confidence_of, signals_of
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingCost, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, KnownHeading, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
@@ -98,7 +98,7 @@ TrackSteps = Generator[RefinementJob, RefinementResult | None, Tracked]
 
 def track_steps(
     ground: Ground,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     state: TrackState,
     query: Query,
     odometry: Odometry | None,
@@ -113,7 +113,7 @@ def track_steps(
 
     Args:
         ground: the plans that the camera can be in.
-        encoders: the networks.
+        encoder: the networks.
         state: state after the photographs before.
         query: the photograph, encoded with an unknown heading.
         odometry: motion since the photograph before; None if it is unknown.
@@ -128,13 +128,13 @@ def track_steps(
         InvalidHintError: see `Hints.check`.
     """
     config, clock = config or LocaliseConfig(), clock or StageClock()
-    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
     plan, grid = ground.plan, ground.grid
     state = ground.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):
         prediction = _predict(ground, state, odometry, known_heading, hints)
     with clock.stage("retrieve"):
-        everything, grid_cost = _compare(ground, encoders, query, prediction, config)
+        everything, grid_cost = _compare(ground, encoder, query, prediction, config)
         compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
     starts = modes_of(grid, query, compared, config)
     refined = ends = starts
@@ -143,7 +143,7 @@ def track_steps(
         job = refinement_job(plan, query, starts, grid.camera_height_m, weights, matching)
         result = yield job
         if result is not None:
-            refined = refined_candidates(plan, encoders, query, starts, result, matching)
+            refined = refined_candidates(plan, encoder, query, starts, result, matching)
             # The photograph is rather an outlier at modes that fit worse than this.
             followed = relative_likelihood(refined, weights.temperature, compared.outlier) >= 2.0 * compared.outlier
             ends = [
@@ -153,16 +153,16 @@ def track_steps(
     with clock.stage("rank"):
         compared = regained(grid, query, compared, starts, refined, weights.temperature, config.separation_m)
         candidates, posterior = ranked_modes(grid, query, compared, starts, ends, config, top_k)
-        candidates = with_latents(plan, encoders, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        by_chance = cost_by_chance(encoders.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
-        model = encoders.manifest.confidence_for(view=query.is_view)
+        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
+        by_chance = cost_by_chance(encoder.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
+        model = encoder.manifest.confidence_for(view=query.is_view)
         signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
         confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
     fit = None if confidence is None else confidence.fit
     in_plan = _in_plan(state.in_plan, fit)
     probability = in_plan * posterior.position
     mode = _mode(in_plan, probability)
-    measured = measured_pose(plan, encoders, query, candidates[0])
+    measured = measured_pose(plan, encoder, query, candidates[0])
     own_plan = ground.plan_of_room(candidates[0].room_index)
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
@@ -236,10 +236,10 @@ def _predict(
 
 
 def _compare(
-    ground: Ground, encoders: Encoders, query: Query, prediction: _Prediction, config: LocaliseConfig
+    ground: Ground, encoder: LayoutEncoder, query: Query, prediction: _Prediction, config: LocaliseConfig
 ) -> tuple[Compared, float]:
     """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
-    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
     plan, grid, sectors = ground.plan, ground.grid, len(query.roll)
     costs = grid_costs(plan, grid, query, weights, matching)
     number = costs.pose * sectors + sector_of(query, costs.hypothesis)
