@@ -31,8 +31,8 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation, localise
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.joint import refine_sequence
-from lalaloc_core.localise.sequence.search import localise_sequence
+from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
+from lalaloc_core.localise.sequence.sequence_search import localise_sequence
 
 # Places that a walk chooses from, and the distance between its neighbours.
 _PLACES, _STRIDE_M = 80, (0.8, 3.5)

@@ -48,8 +48,8 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, p
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import Refiner, run_steps
 from lalaloc_core.localise.tracking import Odometry, TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.ground import Ground
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.render.sampling import pose_grid
 
 # Lattice of the ways (m), distance of walkers from walls, and of the nodes on both sides of a doorway.
@@ -209,7 +209,7 @@ class Follower:
     def __init__(self, plan: FloorPlan, encoders: PhotographEncoder, refiner: Refiner) -> None:
         self._encoders, self._refiner = encoders, refiner
         grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5, latents=False)
-        self._ground = Ground.of_plan(plan, grid)
+        self._ground = TrackedPlans.of_plan(plan, grid)
         self.milliseconds: list[float] = []
 
     def follow(

@@ -18,7 +18,7 @@ from lalaloc_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.localise.tracking.filter import Tracked
+    from lalaloc_core.localise.tracking.tracking_filter import Tracked
     from lalaloc_core.localise.tracking.trajectories import Trajectory
     from lalaloc_core.photograph import StatedCamera
 
@@ -130,8 +130,8 @@ def _followed(
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
     from lalaloc_core.localise.tracking import TrackState
-    from lalaloc_core.localise.tracking.filter import track_steps
-    from lalaloc_core.localise.tracking.ground import Ground
+    from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+    from lalaloc_core.localise.tracking.tracking_filter import track_steps
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
     from lalaloc_core.photograph import open_photograph
 
@@ -147,7 +147,7 @@ def _followed(
         camera_height_m=height.height_m,
         latents=not encoders.predicts_profile,
     )
-    ground, errors, mount = Ground.of_plan(plan, grid), OdometryErrors(), arguments.mount
+    ground, errors, mount = TrackedPlans.of_plan(plan, grid), OdometryErrors(), arguments.mount
     state, before_s = None, None
     found: list[_Found] = []
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):

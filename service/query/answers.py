@@ -15,7 +15,7 @@ from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.search import SequenceLocalisation
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from service.query.geopose import geopose_at
 from service.query.stated_pose import heading_warnings
 from service.schemas import (

@@ -15,9 +15,9 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
 from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.ground import Ground, LeftOut
-from lalaloc_core.localise.tracking.motion import WalkGraph
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
+from lalaloc_core.localise.tracking.tracked_plans import LeftOut, TrackedPlans
+from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError, VenueUnsearchableError
 from service.query.answers import Place
@@ -54,7 +54,7 @@ class SessionGround:
         warnings: warnings about plans that are not searched.
     """
 
-    ground: Ground
+    ground: TrackedPlans
     records: Sequence[PlanRecord]
     levels: Sequence[float | None]
     anchors: Sequence[Anchor | None]
@@ -106,7 +106,7 @@ class Grounds:
         grid = await self._localiser.grid(record, stated_height(query.document, record), query.context)
         graph = await compute(partial(self._graph, record, grid))
         hints = NO_HINTS if query.state is not None else stated_hints(query.document, record.plan)
-        ground = Ground.of_plan(record.plan, grid, graph)
+        ground = TrackedPlans.of_plan(record.plan, grid, graph)
         return SessionGround(ground, [record], [None], [record.plan.anchor], hints)
 
     async def ready(self, venue: VenueRecord, query: TrackQuery) -> ReadyPlans:
@@ -169,7 +169,7 @@ class Grounds:
         if searched.log_mass is not None:
             left_out = LeftOut(searched.area_share, searched.log_mass, np.array(searched.index))
         keys = [row.revision_id for row in searched.rows]
-        ground = Ground.of_levels(searched.merged, entries, graphs, keys, levels, left_out)
+        ground = TrackedPlans.of_levels(searched.merged, entries, graphs, keys, levels, left_out)
         return SessionGround(
             ground, searched.records, [row.level for row in searched.rows], anchors, searched.hints, searched.warnings
         )

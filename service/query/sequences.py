@@ -15,8 +15,8 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence_steps
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn, localised_turn
 from lalaloc_core.photograph import Photograph
 from service.decoding.decoder import Decoder
 from service.query.answers import Locate, compose_answer, compose_sequence_answer

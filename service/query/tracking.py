@@ -16,7 +16,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import StageClock
 from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.photograph import Photograph
 from service.capacity.admission_control import Slots
 from service.decoding.decoder import Decoder

@@ -26,11 +26,16 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
 from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
-from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
-from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, SequenceRefiner, linked, localise_sequence
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
+from lalaloc_core.localise.sequence.chain_inference import best_paths, forward_backward
+from lalaloc_core.localise.sequence.joint_refinement import motion_residuals, refine_sequence
+from lalaloc_core.localise.sequence.measured_motion import FLOOR, Motion, States, Transition, transition
+from lalaloc_core.localise.sequence.sequence_search import (
+    SequenceLocalisation,
+    SequenceRefiner,
+    linked,
+    localise_sequence,
+)
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, present, rectangle
 
@@ -348,7 +353,7 @@ class TestSearch:
     def test_number_of_places_is_limited(
         self, search: Search, walk_queries: list[Query], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("lalaloc_core.localise.sequence.search._MAX_PLACES", 60)
+        monkeypatch.setattr("lalaloc_core.localise.sequence.sequence_search._MAX_PLACES", 60)
         found = search(walk_queries, motions_along(WALK), refiner=refine_sequence)
         assert [picture.candidates[0].room_index for picture in found.pictures] == [1, 2, 2]
 

@@ -23,11 +23,11 @@ from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import run_steps
 from lalaloc_core.localise.tracking import Odometry, TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.ground import Ground
-from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
-from lalaloc_core.localise.tracking.state import MAX_STATES, StatePlan
+from lalaloc_core.localise.tracking.track_state import MAX_STATES, StatePlan
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.walk_motion import States, WalkGraph, moved
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
 from tests.strategies import l_shape, plan_of, present, rectangle
@@ -66,8 +66,8 @@ def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
 
 
 @pytest.fixture(scope="module")
-def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> Ground:
-    return Ground.of_plan(plan, grid, graph)
+def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> TrackedPlans:
+    return TrackedPlans.of_plan(plan, grid, graph)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ class TestMotion:
 
 
 def follow(
-    ground: Ground, encoders: PhotographEncoder, queries: list[Query], moves: list[Odometry | None]
+    ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query], moves: list[Odometry | None]
 ) -> list[Tracked]:
     """Follow a walk, with the state in bytes between photographs."""
     state, found = TrackState.first(len(queries[0].roll)), []
@@ -161,7 +161,7 @@ def follow(
 
 class TestFilter:
     def test_walk_is_followed_through_a_door(
-        self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         found = follow(ground, encoders, queries, odometry_along(WALK))
         for (place, room, heading), answer in list(zip(WALK, found, strict=True))[1:]:
@@ -173,7 +173,7 @@ class TestFilter:
         assert np.linalg.eigvalsh(last.pose.covariance).min() > 0.0
 
     def test_camera_carried_elsewhere_is_found_again(
-        self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         still = Odometry.of_stds(0.0, 0.0, 0.0, EXACT)
         carried = [*queries[:3], *queries[5:], *queries[5:], *queries[5:]]
@@ -183,7 +183,7 @@ class TestFilter:
     @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
     def test_known_heading_is_right_within_its_tolerance(
         self,
-        ground: Ground,
+        ground: TrackedPlans,
         encoders: PhotographEncoder,
         queries: list[Query],
         off_deg: float,
@@ -199,20 +199,20 @@ class TestFilter:
         # As probable as with the exact heading; far less probable beyond the tolerance.
         assert (beliefs[1] > 0.5 * beliefs[0]) == right
 
-    def test_other_grid_is_refused(self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]) -> None:
+    def test_other_grid_is_refused(self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]) -> None:
         other = (StatePlan("", len(ground.grid.poses) + 1),)
         state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
             run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
 
 
-def building(encoders: PhotographEncoder, plans: Sequence[FloorPlan]) -> Ground:
+def building(encoders: PhotographEncoder, plans: Sequence[FloorPlan]) -> TrackedPlans:
     """Return the ground of a building with one plan per level."""
     grids = [build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
     graphs = [WalkGraph.of(grid.poses, grid.layouts(plan), STEP_M) for plan, grid in zip(plans, grids, strict=True)]
     entries = [PlanOnLevel(plan, float(level)) for level, plan in enumerate(plans)]
     levels, keys = [entry.level for entry in entries], [f"plan {level}" for level in range(len(plans))]
-    return Ground.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
+    return TrackedPlans.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
 
 
 def level_of(*polygons: list[list[float]], stairs: str | None) -> FloorPlan:
@@ -296,13 +296,13 @@ class TestLevels:
         again = turned.left(turned.entered(state))
         assert again.by_plan == pytest.approx(state.by_plan)
         assert present(again.pose).position_m == pytest.approx(present(state.pose).position_m)
-        alone = replace(Ground.of_plan(plans[0], ground.grid), keys=("another",))
+        alone = replace(TrackedPlans.of_plan(plans[0], ground.grid), keys=("another",))
         assert alone.entered(state).pose is None
         assert not len(alone.entered(state).belief.pose)
 
 
 class TestState:
-    def test_size_does_not_grow(self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]) -> None:
+    def test_size_does_not_grow(self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]) -> None:
         state = follow(ground, encoders, queries[:1], [None])[0].state
         many = np.random.default_rng(0).integers(0, 100, 4096)
         full = replace(state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)))
@@ -329,7 +329,7 @@ class TestState:
 
     @pytest.mark.slow
     def test_long_session_does_not_grow(
-        self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(260)]
@@ -346,7 +346,7 @@ class TestState:
 
     @pytest.mark.slow
     def test_session_of_10_000_photographs_does_not_grow(
-        self, ground: Ground, encoders: PhotographEncoder, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(10_000)]

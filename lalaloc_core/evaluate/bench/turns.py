@@ -21,10 +21,10 @@ from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise
-from lalaloc_core.localise.sequence.joint import refine_sequence
-from lalaloc_core.localise.sequence.motion import Motion
-from lalaloc_core.localise.sequence.search import localise_sequence
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
+from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
+from lalaloc_core.localise.sequence.measured_motion import Motion
+from lalaloc_core.localise.sequence.sequence_search import localise_sequence
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn
 from lalaloc_core.photograph import Photograph
 
 _FIELD_DEG, _VIEWS = 80.0, 3

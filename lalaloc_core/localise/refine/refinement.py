@@ -10,7 +10,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.floorplan import FloorPlan
@@ -143,6 +143,20 @@ def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[
     )
 
 
+def latent_distances_at(
+    plan: FloorPlan,
+    encoder: LayoutEncoder,
+    query: Query,
+    poses: PoseSet,
+    heading: Float[np.ndarray, "k"],
+    hypotheses: list[int],
+    camera_height_m: float,
+) -> Float[np.ndarray, "k"]:
+    """Return the distances of the latents at poses to those of the query's hypotheses."""
+    latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
+    return np.linalg.norm(latents - query.latents[hypotheses], axis=1)
+
+
 def with_latents(
     plan: FloorPlan, encoder: LayoutEncoder, query: Query, candidates: list[Candidate], camera_height_m: float
 ) -> list[Candidate]:
@@ -160,10 +174,11 @@ def with_latents(
     poses = PoseSet(
         np.stack([candidates[k].position_m for k in moved]), np.array([candidates[k].room_index for k in moved])
     )
-    heading = np.array([candidates[k].frame_heading for k in moved])
-    latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
-    targets = query.latents[[candidates[k].hypothesis for k in moved]]
-    distance = np.linalg.norm(latents - targets, axis=1)
+    heading, hypotheses = (
+        np.array([candidates[k].frame_heading for k in moved]),
+        [candidates[k].hypothesis for k in moved],
+    )
+    distance = latent_distances_at(plan, encoder, query, poses, heading, hypotheses, camera_height_m)
     completed = list(candidates)
     for row, k in enumerate(moved):
         completed[k] = replace(candidates[k], latent_distance=float(distance[row]))

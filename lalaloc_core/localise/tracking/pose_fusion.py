@@ -12,8 +12,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import photograph_heading, pose_uncertainty
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.query import Candidate, Query
-from lalaloc_core.localise.tracking.motion import Odometry, axes
-from lalaloc_core.localise.tracking.state import COMPONENTS, Component, TrackedPose
+from lalaloc_core.localise.tracking.track_state import COMPONENTS, Component, TrackedPose
+from lalaloc_core.localise.tracking.walk_motion import Odometry, axes
 
 # Deviations (m, m, radians) that the residual of a motion has beside the stated ones, and the number of deviations from
 # which it is contradicted.
