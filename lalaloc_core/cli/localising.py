@@ -185,7 +185,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         query = encoder.query(view, known.heading, height, heading_tolerance=known.tolerance)
         found = localise(plan, grid, encoders, query, refiner=refiner)
         model = manifest.confidence_for(view=query.is_view)
-        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source], view=view)
+        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source], photograph=view)
         confidence = found.confidence(model)
         sure = found.posterior.position if confidence is None else confidence.position
         advice = advice_for([view.azimuths], sure)
@@ -259,7 +259,7 @@ def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
     from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
     from lalaloc_core.photograph.photograph import open_photograph, open_picture
 
-    if drawn.view is not None:
+    if drawn.photograph is not None:
         return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
     view = open_photograph(content, sphere_size=(height, width), stated=stated)

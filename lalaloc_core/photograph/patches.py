@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import TWO_PI, unit_rays
 from lalaloc_core.photograph.cameras import Camera, camera_axes
 
 # Colour of pixels that the photograph does not show.
@@ -126,10 +126,7 @@ def _level_rays(size: PatchSize) -> Float[np.ndarray, "h w 3"]:
     azimuth = ((np.arange(size.width) + 0.5) / size.width - 0.5) * size.hfov
     share = (np.arange(size.height) + 0.5) / size.height
     elevation = np.radians(size.top_deg + (size.bottom_deg - size.top_deg) * share)[:, None]
-    rays = np.broadcast_arrays(
-        np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
-    )
-    return np.stack(rays, axis=-1).astype(np.float32)
+    return unit_rays(azimuth, elevation).astype(np.float32)
 
 
 def _reduced(picture: np.ndarray, camera: Camera, resolution: float) -> tuple[np.ndarray, Camera]:

@@ -224,7 +224,7 @@ class Localiser:
         def draw() -> str:
             model = self._bundle.manifest.confidence_for(view=outcome.found.query.is_view)
             source = _SOURCES[outcome.answer.heading_source]
-            drawn = drawn_answer(record.plan, outcome.grid, outcome.found, model, source, view=view)
+            drawn = drawn_answer(record.plan, outcome.grid, outcome.found, model, source, photograph=view)
             return draw_answer(drawn, photograph, request.picture, rooms=request.rooms)
 
         svg = await self.compute(context, draw)

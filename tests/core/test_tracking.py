@@ -199,7 +199,9 @@ class TestFilter:
         # As probable as with the exact heading; far less probable beyond the tolerance.
         assert (beliefs[1] > 0.5 * beliefs[0]) == right
 
-    def test_other_grid_is_refused(self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]) -> None:
+    def test_other_grid_is_refused(
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
+    ) -> None:
         other = (StatePlan("", len(ground.grid.poses) + 1),)
         state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
