@@ -25,7 +25,7 @@ from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.encode.sphere_network import SphereNetwork
+from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 
 _ROWS = 32
 # Sectors on each side of a column whose features the decoder sees.
@@ -43,7 +43,7 @@ def photographs(
     bundle: Bundle, split: Split, homes: int, seed: int
 ) -> tuple[Float[np.ndarray, "n s f"], Float[np.ndarray, "n s r 3"], int]:
     """Return features by sector, with the channels of the ring first, small pictures by column, and ring channels."""
-    network, renderers = SphereNetwork(bundle, threads=1), split_renderer_cache(SPLIT_NUMBERS[split], seed, None)
+    network, renderers = SphereEncoder(bundle, threads=1), split_renderer_cache(SPLIT_NUMBERS[split], seed, None)
     size = bundle.manifest.image_height, bundle.manifest.image_width
     features, pictures, channels = [], [], 0
     for number in range(homes):

@@ -27,7 +27,7 @@ from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import localise
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int, *, oracle: bool) -> _Row:
-    encoders = Encoders(bundle, threads=1)
+    encoders = PhotographEncoder(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
     read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
     grids: list[PoseGrid] = []
@@ -132,8 +132,8 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms, same)
 
 
-def _encoded(encoders: Encoders, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
-    return encoders.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
+def _encoded(encoders: PhotographEncoder, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
+    return encoders.spheres.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
 
 
 def _timed(work: Callable[[], _T]) -> tuple[float, _T]:

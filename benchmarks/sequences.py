@@ -25,13 +25,13 @@ from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedP
 from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.joint import refine_sequence
-from lalaloc_core.localise.sequence.search import localise_sequence
+from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
+from lalaloc_core.localise.sequence.sequence_search import localise_sequence
 
 # Places that a walk chooses from, and the distance between its neighbours.
 _PLACES, _STRIDE_M = 80, (0.8, 3.5)
@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     bundle = Bundle.open(options.bundle)
-    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    encoders, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
     renderers = split_renderer_cache(SPLIT_NUMBERS["test"], options.seed, None)
     ways = {"alone": None, "distance and turn": False, "distance, turn and direction": True}
     tallies = {name: Tally([], [], [], []) for name in ways}
@@ -138,7 +138,9 @@ def main() -> None:
         height = CameraHeight(shots[0].camera_height_m)
         grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=height.height_m)
         size = bundle.manifest.image_height, bundle.manifest.image_width
-        queries = [encoders.query(RenderedPhotograph(shot, renderers).image(*size), None, height) for shot in shots]
+        queries = [
+            encoders.spheres.query(RenderedPhotograph(shot, renderers).image(*size), None, height) for shot in shots
+        ]
         for name, directed in ways.items():
             begin = time.perf_counter()
             if directed is None:

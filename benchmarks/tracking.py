@@ -42,14 +42,13 @@ from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph, tilt_by_
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import Refiner, run_steps
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.tracking import Odometry, TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.ground import Ground
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.render.sampling import pose_grid
 
 # Lattice of the ways (m), distance of walkers from walls, and of the nodes on both sides of a doorway.
@@ -180,7 +179,7 @@ def walk_through(
     lowest_m = min(home.plan.rooms[pose.room].ceiling_height_m for pose in poses)
     height_m = float(min(rng.uniform(1.3, 1.7), lowest_m - CEILING_CLEARANCE_M))
     seed = int(rng.integers(1 << 62))
-    manifest, queries = encoder.networks.manifest, []
+    manifest, queries = encoder.manifest, []
     height = CameraHeight(height_m)
     for pose in poses:
         shot = Shot(
@@ -195,7 +194,7 @@ def walk_through(
         photograph = RenderedPhotograph(shot, renderers)
         if field_deg is None:
             image = photograph.image(manifest.image_height, manifest.image_width)
-            queries.append(encoder.networks.query(image, None, height))
+            queries.append(encoder.spheres.query(image, None, height))
             continue
         pitch, roll = tilt_by_hand(rng)
         view = ViewPhotograph(sphere=CachedSphere(photograph), azimuth=0.0, field_deg=field_deg, pitch=pitch, roll=roll)
@@ -206,10 +205,10 @@ def walk_through(
 class Follower:
     """Follows walks through one plan."""
 
-    def __init__(self, plan: FloorPlan, encoders: Encoders, refiner: Refiner) -> None:
+    def __init__(self, plan: FloorPlan, encoders: PhotographEncoder, refiner: Refiner) -> None:
         self._encoders, self._refiner = encoders, refiner
         grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5, latents=False)
-        self._ground = Ground.of_plan(plan, grid)
+        self._ground = TrackedPlans.of_plan(plan, grid)
         self.milliseconds: list[float] = []
 
     def follow(
@@ -276,7 +275,7 @@ def main() -> None:
     options = parser.parse_args()
     bundle, split = Bundle.open(options.bundle), SPLIT_NUMBERS[options.split]
     encoder, refiner = PhotographEncoder(bundle, threads=1), local_refiner(bundle)
-    encoders = encoder.networks
+    encoders = encoder
     renderers = split_renderer_cache(split, options.seed, None)
     ways: dict[str, list[list[float]]] = {"odometry": [], "none": []}
     again, spent, walk = list[int](), list[float](), None
@@ -320,7 +319,7 @@ def _office(
 ) -> None:
     """Print the figures of walks through homes of a large building, searched in all of it."""
     building = building_of(split, options.seed, area_m2)
-    follower, errors = Follower(building.plan, encoder.networks, refiner), []
+    follower, errors = Follower(building.plan, encoder, refiner), []
     for index, (home, shift_m) in enumerate(zip(building.homes, building.shift_m, strict=True)):
         rng = np.random.default_rng([split, options.seed, index, 9])
         walk = walk_through(home, options.photographs, rng, encoder, renderers, options.view)

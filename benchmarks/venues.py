@@ -36,7 +36,7 @@ from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import localise
@@ -124,16 +124,16 @@ def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
     """Yield queries with a photograph of each home: its number, the known values, the query."""
-    encoders, renderers = Encoders(bundle, threads=1), split_renderer_cache(_TEST, seed, None)
+    encoders, renderers = PhotographEncoder(bundle, threads=1), split_renderer_cache(_TEST, seed, None)
     size = bundle.manifest.image_height, bundle.manifest.image_width
     for number in homes:
         home, rng = home_of(_TEST, seed, number)
         shot = sample_shots(home, 1, rng, "full")[0]
         image = RenderedPhotograph(shot, renderers).image(*size)
         known, unknown = CameraHeight(shot.camera_height_m), CameraHeight(1.5, float("inf"))
-        yield number, "heading known", encoders.query(image, shot.heading, known)
-        yield number, "heading unknown", encoders.query(image, None, known)
-        yield number, "heading and height unknown", encoders.query(image, None, unknown)
+        yield number, "heading known", encoders.spheres.query(image, shot.heading, known)
+        yield number, "heading unknown", encoders.spheres.query(image, None, known)
+        yield number, "heading and height unknown", encoders.spheres.query(image, None, unknown)
 
 
 def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[str, dict[str, float]]:
@@ -231,7 +231,11 @@ def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
 
 def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
     """Print shares of right plans and times of the full search."""
-    limit, encoders, refiner = Settings.load().grids.max_grid_poses, Encoders(bundle, threads=1), local_refiner(bundle)
+    limit, encoders, refiner = (
+        Settings.load().grids.max_grid_poses,
+        PhotographEncoder(bundle, threads=1),
+        local_refiner(bundle),
+    )
     homes = [home_of(_TEST, options.seed, number)[0] for number in range(options.plans)]
     plans, grids = [home.plan for home in homes], [grid_without_latents(home) for home in homes]
     parts = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from examples.truth import FOLDER
-from lalaloc_core.photograph.sphere_levelling import level
+from lalaloc_core.photograph.spheres import level
 
 OUT = FOLDER.parent / "docs" / "images"
 _WIDTH, _HEIGHT = 768, 384

@@ -57,6 +57,13 @@ def row_elevations(rows: int) -> Float[np.ndarray, "rows"]:
     return (0.5 - (np.arange(rows) + 0.5) / rows) * math.pi
 
 
+def unit_rays(azimuth: Float[np.ndarray, "*#n"], elevation: Float[np.ndarray, "*#n"]) -> Float[np.ndarray, "*n 3"]:
+    """Return unit vectors (right, forward, up) in the directions of azimuths and elevations (radians)."""
+    level = np.cos(elevation)
+    rays = np.broadcast_arrays(level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation))
+    return np.stack(rays, axis=-1)
+
+
 def wrap_angle(angle: Array) -> Array:
     """Wrap an angle (radians) to [-π, π)."""
     return (angle + math.pi) % TWO_PI - math.pi

@@ -262,8 +262,8 @@ class _QueryComponents:
         decoder.start()
         encoder = backends.encoder(bundle, settings)
         idle_cores = _closing(cleanup, IdleCores(usable_cores(), telemetry.cpu_accounts, permits))
-        encoder.networks.images.helper = idle_cores.if_any
-        by_latents = not encoder.networks.predicts_profile
+        encoder.use_helper(idle_cores.if_any)
+        by_latents = not encoder.predicts_profile
         optimiser = backends.optimiser(bundle, settings, telemetry, permits, by_latents)
         _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         return cls(
@@ -272,7 +272,7 @@ class _QueryComponents:
             bundle=bundle,
             store=store,
             encoder=encoder,
-            grids=_closing(cleanup, GridProvider(store, encoder.networks, bundle.sha256, settings, telemetry, permits)),
+            grids=_closing(cleanup, GridProvider(store, encoder, bundle.sha256, settings, telemetry, permits)),
             optimiser=optimiser,
             decoder=decoder,
             admission=_admission(settings, telemetry, store),

@@ -59,7 +59,7 @@ def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
     from lalaloc_core.bundle import Bundle, default_bundle, write_manifest
     from lalaloc_core.learn.export.bundle_export import add_view_encoder
     from lalaloc_core.learn.training.presets import PRESETS
-    from lalaloc_core.nets.view_encoder import ViewEncoder
+    from lalaloc_core.nets.view_network import ViewNetwork
 
     origin = Bundle.open(tiny_bundle)
     folder = tmp_path_factory.mktemp("tiny-views")
@@ -67,7 +67,7 @@ def tiny_view_bundle(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
         (folder / name).write_bytes(origin.read(name))
     config = PRESETS["tiny"]
     torch.manual_seed(0)
-    encoder = ViewEncoder(config.view, config.ring)
+    encoder = ViewNetwork(config.view, config.ring)
     bundle = add_view_encoder(dataclasses.replace(origin, folder=folder), config, encoder, {})
     measured = Bundle.open(default_bundle()).manifest
     assert bundle.manifest.view is not None

@@ -65,7 +65,7 @@ def write_files(
     Raises:
         InvalidInputError: a file cannot be written.
     """
-    from lalaloc_core.draw.places import draw_places
+    from lalaloc_core.draw.plan_overlays import draw_places
 
     if arguments.csv is not None:
         write_text(arguments.csv, _csv(answers))

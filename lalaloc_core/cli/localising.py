@@ -240,8 +240,8 @@ def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
         return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
     view = open_photograph(content, sphere_size=(height, width), stated=stated)
-    assert view.panorama is not None
-    return view.panorama.pixels
+    assert view.sphere is not None
+    return view.sphere.pixels
 
 
 def _check_height(height_m: float | None, plan: FloorPlan) -> None:

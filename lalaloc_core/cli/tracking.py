@@ -18,7 +18,7 @@ from lalaloc_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.localise.tracking.filter import Tracked
+    from lalaloc_core.localise.tracking.tracking_filter import Tracked
     from lalaloc_core.localise.tracking.trajectories import Trajectory
     from lalaloc_core.photograph import StatedCamera
 
@@ -132,8 +132,8 @@ def _followed(
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
     from lalaloc_core.localise.tracking import TrackState
-    from lalaloc_core.localise.tracking.filter import track_steps
-    from lalaloc_core.localise.tracking.ground import Ground
+    from lalaloc_core.localise.tracking.tracking_filter import track_steps
+    from lalaloc_core.localise.tracking.tracked_plans import Ground
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
 
     model = LocalModel(Bundle.open(arguments.bundle))

@@ -14,7 +14,7 @@ from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
-from lalaloc_core.draw.outline import LayoutOutline, ViewOutline, layout_outline, outline_in_view
+from lalaloc_core.draw.outline import Outline, layout_outline
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
@@ -58,7 +58,7 @@ class DrawnAnswer:
         heading_source: origin of the heading, one or two words.
         confidence: probability that the position is correct; None if unknown.
         heat: map of the posterior; None leaves the floors white.
-        view: the photograph; None for a full sphere.
+        photograph: the decoded photograph; None for a full sphere.
     """
 
     plan: FloorPlan
@@ -69,15 +69,15 @@ class DrawnAnswer:
     confidence: float | None
     rivals: tuple[DrawnCandidate, ...] = ()
     heat: HeatMap | None = None
-    view: Photograph | None = None
+    photograph: Photograph | None = None
 
     @property
-    def outline(self) -> LayoutOutline | ViewOutline:
+    def outline(self) -> Outline:
         """The layout as seen from the predicted pose."""
         position_m = np.array([self.camera.x_m, self.camera.y_m])
         heading = heading_from_degrees(self.camera.heading_deg or 0.0)
         outline = layout_outline(self.plan, position_m, self.room_index, heading, self.camera_height_m)
-        return outline if self.view is None else outline_in_view(outline, self.view)
+        return outline if self.photograph is None else outline.seen_in(self.photograph)
 
 
 def drawn_answer(
@@ -87,12 +87,12 @@ def drawn_answer(
     model: ConfidenceModel | None,
     heading_source: str,
     *,
-    view: Photograph | None = None,
+    photograph: Photograph | None = None,
 ) -> DrawnAnswer:
     """Collect the contents of the picture of a localisation.
 
     `heading_source` states the origin of the heading in one or two words. Without a model, probabilities are left out.
-    `view` is the decoded photograph; None stands for a full sphere.
+    `photograph` is the decoded one; None stands for a full sphere.
     """
     confidence = found.confidence(model)
     best, *rival_candidates = found.candidates
@@ -124,7 +124,7 @@ def drawn_answer(
         confidence=None if confidence is None else confidence.position,
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
-        view=None if view is None or view.is_sphere else view,
+        photograph=None if photograph is None or photograph.is_sphere else photograph,
     )
 
 
@@ -138,7 +138,7 @@ def draw_answer(
 ) -> str:
     """Draw an answer as an SVG document, 1600 pixels wide.
 
-    The photograph is a levelled full sphere from `photograph.spheres.open_sphere`, or that of `answer.view` from
+    The photograph is a levelled full sphere from `photograph.spheres.read_sphere`, or that of `answer.photograph` from
     `photograph.photograph.open_picture`; it is required unless `picture` is "plan".
     The default title is the room. `rooms` is a cached result of `draw_rooms` for the plan.
     """
@@ -148,7 +148,7 @@ def draw_answer(
     if picture != "plan":
         if photograph is None:
             raise ValueError(f"photograph is None; picture='{picture}' needs it")
-        shown, outline = _sized(photograph, is_sphere=answer.view is None), answer.outline
+        shown, outline = _sized(photograph, is_sphere=answer.photograph is None), answer.outline
         height, width = shown.shape[:2]
         x = _PAD + 0.5 * (PHOTOGRAPH_SIZE[0] - width)
         parts.append(photograph_part(jpeg(shown), "jpeg", outline, (x, y, width, height)))

@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import resvg_py
@@ -16,6 +17,11 @@ from PIL import Image
 INK, MUTED, RULE, PAPER = "#20242c", "#5a6472", "#d5dbe1", "#ffffff"
 # Predicted and true poses: vermilion and sky blue of Okabe and Ito's palette, distinct for colour-blind readers.
 FOUND, TRUE = "#d55e00", "#56b4e9"
+# Walls and openings: the same colours in plans, over photographs (with a dark edge) and on the page, whose style sheet
+# repeats them, with lighter ones for plans on a dark ground. Readers with protanopia and deuteranopia can tell them
+# apart, and the importer of pictures reads brown doors and blue windows.
+ON_PAPER: Final = {"wall": "#20242c", "door": "#b5651d", "window": "#2b7fc9", "passage": "#8c939c"}
+ON_PHOTOGRAPH: Final = {"wall": "#ffe14d", "door": "#e8702a", "window": "#4aa8ff", "passage": "#ffffff"}
 # A length or coordinate of a drawing.
 Number = int | float
 Box = tuple[Number, Number, Number, Number]

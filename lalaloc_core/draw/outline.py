@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
+from lalaloc_core.conventions import TWO_PI, column_azimuths, unit_rays, wrap_angle
 from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.profile import nearest_walls
@@ -29,7 +29,7 @@ _POINTS_PER_OPENING = 33
 # A point farther than the wall by this share is hidden.
 _HIDDEN = 2e-3
 
-# Largest angle (radians) between points of a line in a view.
+# Largest angle (radians) between points of a line in a photograph.
 _VIEW_STEP = math.radians(0.5)
 
 Line = Float[np.ndarray, "_ 2"]
@@ -44,71 +44,48 @@ class OpeningOutline:
 
 
 @dataclass(frozen=True, eq=False)
-class LayoutOutline:
-    """Lines of a layout in a panorama, as shares (x, y) of its width and height, y pointing down.
+class Outline:
+    """Lines of a layout in a photograph, as shares (x, y) of its width and height, y pointing down.
 
     Attributes:
-        floor, ceiling: lower and upper edges of the walls, from the left edge of the panorama to the right.
-        corners: (k, 2, 2) edges between walls, from the floor to the ceiling.
+        edges: lines of the walls; in a sphere, the lower and the upper edge from left to right, then the edges between
+            walls from the floor to the ceiling.
+        openings: lines around openings, of which other photographs show parts that need not be closed.
     """
 
-    floor: Line
-    ceiling: Line
-    corners: Float[np.ndarray, "k 2 2"]
+    edges: tuple[Line, ...]
     openings: tuple[OpeningOutline, ...]
 
-    @property
-    def edges(self) -> list[Line]:
-        """All lines of the walls."""
-        return [self.floor, self.ceiling, *self.corners]
+    def seen_in(self, photograph: Photograph) -> Outline:
+        """Return the parts of an outline in a sphere that a photograph with a camera shows."""
+        return Outline(
+            tuple(part for line in self.edges for part in _seen_parts(line, photograph)),
+            tuple(
+                OpeningOutline(opening.kind, part)
+                for opening in self.openings
+                for part in _seen_parts(opening.line, photograph)
+            ),
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class ViewOutline:
-    """Lines of a layout in a view, as shares (x, y) of the picture's width and height, y pointing down.
-
-    Attributes:
-        edges: visible parts of the walls' lines.
-        openings: visible parts of the lines around openings, which need not be closed.
-    """
-
-    edges: list[Line]
-    openings: tuple[OpeningOutline, ...]
-
-
-def outline_in_view(outline: LayoutOutline, view: Photograph) -> ViewOutline:
-    """Return the parts of an outline that a photograph with a camera shows."""
-    return ViewOutline(
-        [part for line in outline.edges for part in _seen_parts(line, view)],
-        tuple(
-            OpeningOutline(opening.kind, part)
-            for opening in outline.openings
-            for part in _seen_parts(opening.line, view)
-        ),
-    )
-
-
-def _seen_parts(line: Line, view: Photograph) -> list[Line]:
-    """Return the visible parts of a line in a panorama, as lines in a view."""
+def _seen_parts(line: Line, photograph: Photograph) -> list[Line]:
+    """Return the visible parts of a line in a sphere, as lines in a photograph."""
     direction = (line - 0.5) * (TWO_PI, -math.pi)
     steps = np.ceil(np.abs(np.diff(direction, axis=0)).max(axis=1) / _VIEW_STEP).clip(1).astype(int)
     place = np.append(np.concatenate([start + np.arange(n) / n for start, n in enumerate(steps)]), len(steps))
     whole = np.arange(len(direction))
     azimuth, elevation = (np.interp(place, whole, values) for values in direction.T)
-    rays = np.stack(
-        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
-    )
-    shares, seen = view.project(rays)
+    shares, seen = photograph.project(unit_rays(azimuth, elevation))
     runs = np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen)) + 1)
     return [shares[run] for run in runs if len(run) > 1 and seen[run[0]]]
 
 
 def layout_outline(
     plan: FloorPlan, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, camera_height_m: float
-) -> LayoutOutline:
-    """Return the outline of a room as seen by a camera in it.
+) -> Outline:
+    """Return the outline of a room as seen by a sphere's camera in it.
 
-    `heading` is the azimuth (radians) of the panorama's centre column. A camera above the ceiling is drawn just below
+    `heading` is the azimuth (radians) of the sphere's centre column. A camera above the ceiling is drawn just below
     it.
     """
     walls_m = plan.rooms[room_index].walls_m
@@ -126,24 +103,19 @@ def layout_outline(
     near_m = np.minimum(distance_m[:-1], distance_m[1:])[turns]
     bends = azimuth[:-1][turns]
     low, high = (project_points(bends, near_m, rise_m) for rise_m in (-camera_height_m, above_m))
-    corners = np.stack([low, high], axis=1)
     openings = [
         drawn
         for face in plan.room_faces[room_index]
         for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
     ]
-    return LayoutOutline(
-        project_points(azimuth, distance_m, -camera_height_m),
-        project_points(azimuth, distance_m, above_m),
-        corners,
-        tuple(openings),
-    )
+    borders = (project_points(azimuth, distance_m, rise_m) for rise_m in (-camera_height_m, above_m))
+    return Outline((*borders, *np.stack([low, high], axis=1)), tuple(openings))
 
 
 def project_points(
     azimuth: Float[np.ndarray, "n"], distance_m: Float[np.ndarray, "n"], rise_m: Float[np.ndarray, "n"] | float
 ) -> Line:
-    """Project points into a panorama, as shares (x, y) of its width and height.
+    """Project points into a sphere, as shares (x, y) of its width and height.
 
     Azimuths are radians relative to the heading, in [-π, π]; distances are horizontal, and `rise_m` is above the
     camera.
@@ -194,7 +166,7 @@ def _opening(
     met_m, _ = _met(position_m, azimuth, walls_m)
     visible = (distance_m > 0.0) & (distance_m <= met_m * (1.0 + _HIDDEN) + 1e-3)
     relative = wrap_angle(azimuth - heading)
-    # Split openings that cross the panorama's edge.
+    # Split openings that cross the sphere's edge.
     parts = np.split(np.arange(len(relative)), np.flatnonzero(np.abs(np.diff(relative)) > math.pi) + 1)
     drawn = []
     for part in parts:

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from lalaloc_core.draw.canvas import INK, Box, Number, document, image, path, pixels, png, words
-from lalaloc_core.draw.outline import LayoutOutline, ViewOutline
-from lalaloc_core.draw.palette import ON_PHOTOGRAPH
+from lalaloc_core.draw.canvas import INK, ON_PHOTOGRAPH, Box, Number, document, image, path, pixels, png, words
+from lalaloc_core.draw.outline import Outline
 
 WALL_COLOUR = ON_PHOTOGRAPH["wall"]
 # In the order of the legend.
@@ -36,13 +35,13 @@ def draw_strokes(photograph: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Strok
 
 
 def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
-    """Return the line at `rise_m` above the camera on the walls of a profile, as pixels (x, y) of a panorama."""
+    """Return the line at `rise_m` above the camera on the walls of a profile, as pixels (x, y) of a sphere."""
     x = np.arange(len(profile_m)) + 0.5
     return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
 
 
 def wall_stroke(
-    outline: LayoutOutline | ViewOutline,
+    outline: Outline,
     size: tuple[int, int],
     colour: str = WALL_COLOUR,
     width: float = 2.0,
@@ -52,7 +51,7 @@ def wall_stroke(
     return Stroke([line * size for line in outline.edges], colour, width, edge_width)
 
 
-def photograph_part(content: bytes, kind: str, outline: LayoutOutline | ViewOutline, box: Box) -> str:
+def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> str:
     """Draw a photograph with a layout over it as a part of a larger drawing.
 
     `content` is the encoded picture, of kind "jpeg" or "png", with as many pixels as the box; `box` is x, y, width and
@@ -75,7 +74,7 @@ def photograph_part(content: bytes, kind: str, outline: LayoutOutline | ViewOutl
     return f'<g class="photograph" transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
 
 
-def photograph_key(outline: LayoutOutline | ViewOutline, x: Number, y: Number) -> str:
+def photograph_key(outline: Outline, x: Number, y: Number) -> str:
     """Draw the legend of the lines in a photograph; `y` is the base line of its text."""
     kinds = sorted({opening.kind for opening in outline.openings}, key=_KINDS.index)
     parts = []

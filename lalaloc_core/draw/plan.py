@@ -10,8 +10,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, PAPER, Box, xml_text
-from lalaloc_core.draw.palette import ON_PAPER
+from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, ON_PAPER, PAPER, Box, xml_text
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.floorplan.rooms import interior_point
 
@@ -62,6 +61,12 @@ def plan_svg(
     """
     head, tail = svg_around(plan.name, bounds_with(plan.bounds_m, no_room), marker)
     return head + (draw_rooms(plan, no_room) if rooms is None else rooms).replace(HEAT_PLACE, "") + tail
+
+
+def plan_with(plan: FloorPlan, over: str, marker: Marker | None = None) -> str:
+    """Draw a plan as `plan_svg` does, with SVG in metres, y pointing down, over the rooms."""
+    head, tail = svg_around(plan.name, plan.bounds_m, marker)
+    return head + draw_rooms(plan).replace(HEAT_PLACE, "") + over + tail
 
 
 def bounds_with(bounds_m: Bounds, no_room: Sequence[Sequence[Sequence[float]]]) -> Bounds:
@@ -208,7 +213,7 @@ def _outline(room: Room, fill: str, extent_m: float) -> str:
 
 def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
     """Draw an opening on its wall and, once for both rooms, the gap through the wall's thickness."""
-    own = _piece_m(plan.rooms[face.room], face.wall, face.start, face.end)
+    own = plan.rooms[face.room].wall_part(face.wall, face.start, face.end)
     kind = plan.openings[face.opening].kind
     parts = []
     sides = [own]
@@ -233,15 +238,10 @@ def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
 def _beyond_m(plan: FloorPlan, face: OpeningFace, own_m: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
     """Return the opening on the other side of the wall: that of the room behind, or a wall's thickness outwards."""
     if face.behind >= 0:
-        return _piece_m(plan.rooms[face.behind], face.exit_wall, face.exit_start, face.exit_end)
+        return plan.rooms[face.behind].wall_part(face.exit_wall, face.exit_start, face.exit_end)
     (along_x, along_y) = own_m[1] - own_m[0]
     outwards = np.array([along_y, -along_x]) / max(math.hypot(along_x, along_y), 1e-9)
     return own_m[::-1] + _WALL_M * outwards
-
-
-def _piece_m(room: Room, wall: int, start: float, end: float) -> Float[np.ndarray, "2 2"]:
-    ends = room.walls_m[wall].reshape(2, 2)
-    return ends[0] + np.array([[start], [end]]) * (ends[1] - ends[0])
 
 
 def _mark_no_room(outline_m: Float[np.ndarray, "n 2"], extent_m: float) -> str:

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, column_azimuths
-from lalaloc_core.draw.canvas import INK, MUTED, document, path, words
-from lalaloc_core.draw.palette import ON_PAPER
+from lalaloc_core.draw.canvas import INK, MUTED, ON_PAPER, document, path, words
 from lalaloc_core.localise.query import Query
 
 _SIZE, _PAD, _FOOT = 800.0, 40.0, 150.0

@@ -9,30 +9,18 @@ from lalaloc_core.draw.canvas import INK, document, path, words
 from lalaloc_core.importers.common.trace import Trace, TracePart
 
 _SIZE, _MARGIN, _LEGEND, _LINE = 1600.0, 20.0, 190.0, 22.0
-# Colour of lines, fill and width (pixels) by part, in the order of drawing; Okabe and Ito's palette.
-_STYLES: dict[TracePart, tuple[str, str, float]] = {
-    "room": ("none", "#cfe8d5", 0.0),
-    "no room": ("#cc79a7", "#f3d9e7", 1.0),
-    "wall": ("none", "#b9bfc7", 0.0),
-    "gap": ("none", "#f0e442", 0.0),
-    "other": ("#c3c8cf", "none", 0.8),
-    "line": ("#8c939c", "none", 1.2),
-    "wall line": (INK, "none", 1.2),
-    "door": ("#b5651d", "none", 1.6),
-    "window": ("#2b7fc9", "none", 1.6),
-    "passage": ("#009e73", "none", 1.6),
-}
-_MEANINGS: dict[TracePart, str] = {
-    "room": "room",
-    "no room": "inside, but no room",
-    "wall": "wall",
-    "gap": "gap that was closed",
-    "other": "ignored",
-    "line": "line of no known kind",
-    "wall line": "line of a wall",
-    "door": "door",
-    "window": "window",
-    "passage": "passage",
+# Colour of lines, fill, width (pixels) and meaning by part, in the order of drawing; Okabe and Ito's palette.
+_STYLES: dict[TracePart, tuple[str, str, float, str]] = {
+    "room": ("none", "#cfe8d5", 0.0, "room"),
+    "no room": ("#cc79a7", "#f3d9e7", 1.0, "inside, but no room"),
+    "wall": ("none", "#b9bfc7", 0.0, "wall"),
+    "gap": ("none", "#f0e442", 0.0, "gap that was closed"),
+    "other": ("#c3c8cf", "none", 0.8, "ignored"),
+    "line": ("#8c939c", "none", 1.2, "line of no known kind"),
+    "wall line": (INK, "none", 1.2, "line of a wall"),
+    "door": ("#b5651d", "none", 1.6, "door"),
+    "window": ("#2b7fc9", "none", 1.6, "window"),
+    "passage": ("#009e73", "none", 1.6, "passage"),
 }
 
 
@@ -45,7 +33,7 @@ def trace_svg(trace: Trace, title: str) -> str:
     height = max(scale * (y1 - y0), _LINE * len(_STYLES)) + 2.0 * _MARGIN
     origin = np.array([_MARGIN + _LEGEND - scale * x0, _MARGIN + scale * y1])
     parts, row = [], 0
-    for part, (stroke, fill, width) in _STYLES.items():
+    for part, (stroke, fill, width, meaning) in _STYLES.items():
         shapes = [shape for kind, shape in trace.shapes if kind == part]
         if not shapes:
             continue
@@ -55,7 +43,7 @@ def trace_svg(trace: Trace, title: str) -> str:
         parts.append(f'<path d="{d}" {style}/>')
         y = _MARGIN + _LINE * row
         parts.append(f'<rect x="{_MARGIN:g}" y="{y:g}" width="16" height="14" {style}/>')
-        parts.append(words(_MARGIN + 24, y + 12, _MEANINGS[part], 13))
+        parts.append(words(_MARGIN + 24, y + 12, meaning, 13))
         row += 1
     return document(_SIZE, height, title, parts)
 

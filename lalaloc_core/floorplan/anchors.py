@@ -12,7 +12,7 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.floorplan.rooms import Room
-from lalaloc_core.floorplan.values import check_keys, is_number, json_kind, read_number_between
+from lalaloc_core.floorplan.values import check_keys, is_number, json_kind, read_number_between, read_optional
 
 _ORIGIN_KEYS = {"latitude", "longitude", "altitude_m", "north_deg"}
 _CONTROL_KEYS = {"control_points", "altitude_m"}
@@ -44,9 +44,7 @@ def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anc
             f"the plan reaches {reach_m:.0f} m from its origin; the limit of anchored plans is "
             f"{MAX_FROM_ORIGIN_M:.0f} m; move it near its origin"
         )
-    altitude_m = raw.get("altitude_m")
-    if altitude_m is not None:
-        altitude_m = read_number_between(altitude_m, "altitude_m of the anchor", *_ALTITUDE_M, " m")
+    altitude_m = read_optional(raw.get("altitude_m"), "altitude_m of the anchor", *_ALTITUDE_M, " m")
     if "control_points" in raw:
         check_keys(raw, _CONTROL_KEYS, where="anchor: ")
         anchor = _from_control_points(raw["control_points"], altitude_m)
@@ -57,9 +55,8 @@ def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anc
             )
         return anchor
     check_keys(raw, _ORIGIN_KEYS, where="anchor: ")
-    own_deg = raw.get("north_deg")
+    own_deg = read_optional(raw.get("north_deg"), "north_deg of the anchor", -360.0, 360.0, "")
     if own_deg is not None:
-        own_deg = read_number_between(own_deg, "north_deg of the anchor", -360.0, 360.0, "")
         if north_deg is not None and _apart_deg(north_deg, own_deg) > _SAME_NORTH_DEG:
             raise InvalidFloorPlanError(
                 f"north_deg is {north_deg:g}, but that of the anchor is {own_deg:g}; give one of them"

@@ -84,10 +84,10 @@ def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Se
             sill_m[cell] = -np.inf if source.sill_m is None else source.sill_m
             head_m[cell] = np.inf if source.head_m is None else source.head_m
             share[cell] = face.start, face.end
-            opening_m[cell] = _piece(rooms[room].walls_m[face.wall], face.start, face.end)
+            opening_m[cell] = rooms[room].wall_part(face.wall, face.start, face.end).ravel()
             exit_m[cell] = opening_m[cell]
             if face.behind >= 0:
-                exit_m[cell] = _piece(rooms[face.behind].walls_m[face.exit_wall], face.exit_start, face.exit_end)
+                exit_m[cell] = rooms[face.behind].wall_part(face.exit_wall, face.exit_start, face.exit_end).ravel()
     return PlanGeometry(
         walls_m=frozen(walls_m),
         wall_count=frozen(np.array([len(room.walls_m) for room in rooms])),
@@ -106,11 +106,6 @@ def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Se
 def pad_walls(walls_m: Float[np.ndarray, "n 4"], length: int) -> Float[np.ndarray, "length 4"]:
     """Pad wall segments to `length` rows by repeating the first, which changes no ray's distance."""
     return np.concatenate([walls_m, np.repeat(walls_m[:1], length - len(walls_m), axis=0)])
-
-
-def _piece(wall_m: Float[np.ndarray, "4"], start: float, end: float) -> Float[np.ndarray, "4"]:
-    edge = wall_m[2:] - wall_m[:2]
-    return np.concatenate([wall_m[:2] + start * edge, wall_m[:2] + end * edge])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -25,19 +25,16 @@ from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
 from lalaloc_core.floorplan.reading import (
     DEFAULT_CAMERA_HEIGHT_M,
+    MAX_CAMERA_HEIGHT_STD_M,
+    TOLERANCES_M,
     read_camera_height,
-    read_camera_height_std,
     read_ceiling,
-    read_north,
     read_opening_kinds,
     read_openings,
     read_rooms,
-    read_tolerance,
 )
 from lalaloc_core.floorplan.rooms import Room, frozen
-from lalaloc_core.floorplan.values import check_keys, json_kind, read_name
-
-__all__ = ["DEFAULT_CAMERA_HEIGHT_M", "FloorPlan"]
+from lalaloc_core.floorplan.values import check_keys, json_kind, read_name, read_optional
 
 # Plans with more rooms use a spatial index to find the room of a position.
 _FEW_ROOMS = 32
@@ -123,14 +120,16 @@ class FloorPlan:
         rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)
         check_size(rooms, limits)
         openings = read_openings(document.get("openings"), rooms, limits)
-        tolerance_m = read_tolerance(document.get("opening_tolerance_m"))
+        tolerance_m = read_optional(document.get("opening_tolerance_m"), "opening_tolerance_m", *TOLERANCES_M, " m")
+        tolerance_m = DEFAULT_OPENING_TOLERANCE_M if tolerance_m is None else tolerance_m
         faces, unplaced = place_openings(openings, rooms, tolerance_m, limits)
         if openings and not faces:
             raise InvalidFloorPlanError(
                 f"all openings are more than {tolerance_m:g} m from every wall (opening_tolerance_m); check that "
                 "openings and rooms are in the same units"
             )
-        north = read_north(document.get("north_deg"))
+        stated_deg = read_optional(document.get("north_deg"), "north_deg", -360.0, 360.0, "")
+        north = None if stated_deg is None else heading_from_degrees(stated_deg)
         # Rounding restores degrees that were converted to radians.
         north_deg = None if north is None else round(heading_to_degrees(north), 9)
         anchor = read_anchor(document.get("anchor"), north_deg, rooms)
@@ -149,7 +148,9 @@ class FloorPlan:
             opening_kinds=read_opening_kinds(document.get("opening_kinds"), openings),
             opening_tolerance_m=tolerance_m,
             opening_faces=faces,
-            camera_height_std_m=read_camera_height_std(document.get("camera_height_std_m")),
+            camera_height_std_m=read_optional(
+                document.get("camera_height_std_m"), "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m"
+            ),
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
         )

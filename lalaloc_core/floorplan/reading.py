@@ -12,10 +12,10 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_from_degrees
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.limits import PlanLimits
-from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening
+from lalaloc_core.floorplan.openings import Opening
 from lalaloc_core.floorplan.rooms import Room, frozen
 from lalaloc_core.floorplan.values import (
     check_keys,
@@ -25,6 +25,7 @@ from lalaloc_core.floorplan.values import (
     read_name,
     read_number,
     read_number_between,
+    read_optional,
     read_points,
     read_segment,
 )
@@ -36,8 +37,8 @@ _ROOM_KEYS = {"id", "name", "type", "polygon", "holes", "walls", "ceiling_height
 _WALL_OVERSHOOT_M = 0.01
 _KINDS = OPENING_CLASSES[1:]
 _OPENING_KEYS = {"kind", "line", "sill_m", "head_m", "name", "rooms"}
-# From the rounding of drawings to the thickest walls.
-_TOLERANCES_M = (0.01, 1.5)
+# Distances of openings from their walls, from the rounding of drawings to the thickest walls.
+TOLERANCES_M = (0.01, 1.5)
 
 
 def read_rooms(raw_rooms: Any, default_ceiling_m: float | None, limits: PlanLimits) -> tuple[Room, ...]:
@@ -209,13 +210,6 @@ def read_opening_kinds(raw: Any, openings: Sequence[Opening]) -> frozenset[str]:
     return frozenset(read_choice(kind, _KINDS, "an entry of opening_kinds") for kind in kinds)
 
 
-def read_tolerance(raw: Any) -> float:
-    """Read the largest distance (m) between an opening and its wall."""
-    if raw is None:
-        return DEFAULT_OPENING_TOLERANCE_M
-    return read_number_between(raw, "opening_tolerance_m", *_TOLERANCES_M, " m")
-
-
 def _read_opening(raw: Any, where: str, room_ids: set[str], limits: PlanLimits) -> Opening:
     if not isinstance(raw, Mapping):
         raise InvalidFloorPlanError(f"{where} must be an object, not {json_kind(raw)}")
@@ -224,8 +218,8 @@ def _read_opening(raw: Any, where: str, room_ids: set[str], limits: PlanLimits) 
     line_m = read_segment(raw.get("line"), f"{where}: the line", limits, None)
     name = None if raw.get("name") is None else read_name(raw["name"], limits, f"{where}: the name")
     sill_m, head_m = (
-        None if raw.get(key) is None else read_number_between(raw[key], f"{where}: {key}", 0.0, highest, " m")
-        for key, highest in (("sill_m", limits.max_ceiling_height_m), ("head_m", limits.max_ceiling_height_m))
+        read_optional(raw.get(key), f"{where}: {key}", 0.0, limits.max_ceiling_height_m, " m")
+        for key in ("sill_m", "head_m")
     )
     if sill_m is not None and head_m is not None and sill_m >= head_m:
         raise InvalidFloorPlanError(f"{where}: sill_m is {sill_m:g} m; it must be below head_m ({head_m:g} m)")
@@ -252,17 +246,3 @@ def read_camera_height(value: Any, rooms: Sequence[Room], limits: PlanLimits) ->
             f"camera_height_m is {height_m:g} m; it must be below the lowest ceiling ({lowest_ceiling_m:g} m)"
         )
     return height_m
-
-
-def read_camera_height_std(value: Any) -> float | None:
-    """Read the standard deviation of the camera height (m), None if the plan does not give one."""
-    if value is None:
-        return None
-    return read_number_between(value, "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m")
-
-
-def read_north(degrees: Any) -> float | None:
-    """Read the azimuth of true north (radians), None if the plan does not give one."""
-    if degrees is None:
-        return None
-    return heading_from_degrees(read_number_between(degrees, "north_deg", -360.0, 360.0, ""))

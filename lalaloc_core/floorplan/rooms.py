@@ -72,6 +72,11 @@ class Room:
         edges = [np.concatenate([ring, np.concatenate([ring[1:], ring[:1]])], axis=1) for ring in rings]
         return frozen(np.concatenate([*edges, self.inner_walls_m]))
 
+    def wall_part(self, wall: int, start: float, end: float) -> Float[np.ndarray, "2 2"]:
+        """Return the ends of the part of a wall between two shares of its length."""
+        first, last = self.walls_m[wall].reshape(2, 2)
+        return first + np.array([[start], [end]]) * (last - first)
+
     def free_floor(self, margin_m: float) -> BaseGeometry:
         """Return the floor at least `margin_m` from all walls, free-standing ones included; it can be empty."""
         floor = self.shape.buffer(-margin_m)

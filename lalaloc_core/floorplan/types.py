@@ -3,53 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 
 from lalaloc_core.conventions import ROOM_TYPES
 
-_WORDS: Mapping[str, str] = {
-    "bath": "bathroom",
-    "shower": "bathroom",
-    "toilet": "bathroom",
-    "wc": "bathroom",
-    "restroom": "bathroom",
-    "washroom": "bathroom",
-    "hall": "corridor",
-    "hallway": "corridor",
-    "passage": "corridor",
-    "landing": "corridor",
-    "foyer": "entrance",
-    "entry": "entrance",
-    "vestibule": "entrance",
-    "lobby": "entrance",
-    "lounge": "living",
-    "family": "living",
-    "studio": "living",
-    "den": "office",
-    "study": "office",
-    "workspace": "office",
-    "wardrobe": "closet",
-    "pantry": "storage",
-    "store": "storage",
-    "basement": "storage",
-    "attic": "storage",
-    "utility": "laundry",
-    "staircase": "stairs",
-    "stairwell": "stairs",
-    "stair": "stairs",
-    "terrace": "balcony",
-    "patio": "balcony",
-    "porch": "balcony",
-    "deck": "balcony",
-    "garden": "balcony",
-    "outdoor": "balcony",
-    "conference": "meeting",
-    "auditorium": "meeting",
-    "classroom": "meeting",
-    "breakfast": "dining",
-    "kitchenette": "kitchen",
-    "nursery": "bedroom",
-} | {name: name for name in ROOM_TYPES}
+# Further words for each room type, besides its name.
+_SYNONYMS = {
+    "bathroom": ("bath", "shower", "toilet", "wc", "restroom", "washroom"),
+    "corridor": ("hall", "hallway", "passage", "landing"),
+    "entrance": ("foyer", "entry", "vestibule", "lobby"),
+    "living": ("lounge", "family", "studio"),
+    "office": ("den", "study", "workspace"),
+    "closet": ("wardrobe",),
+    "storage": ("pantry", "store", "basement", "attic"),
+    "laundry": ("utility",),
+    "stairs": ("staircase", "stairwell", "stair"),
+    "balcony": ("terrace", "patio", "porch", "deck", "garden", "outdoor"),
+    "meeting": ("conference", "auditorium", "classroom"),
+    "dining": ("breakfast",),
+    "kitchen": ("kitchenette",),
+    "bedroom": ("nursery",),
+}
+_TYPES = {word: kind for kind, words in _SYNONYMS.items() for word in words} | {name: name for name in ROOM_TYPES}
 
 
 def room_type_from_label(label: str) -> str:
@@ -58,4 +32,4 @@ def room_type_from_label(label: str) -> str:
     The first known word decides.
     """
     words = re.findall(r"[a-z]+", label.casefold())
-    return next((_WORDS[word] for word in words if word in _WORDS), ROOM_TYPES[0])
+    return next((_TYPES[word] for word in words if word in _TYPES), ROOM_TYPES[0])

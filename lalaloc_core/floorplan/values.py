@@ -89,6 +89,11 @@ def read_number_between(value: Any, label: str, low: float, high: float, unit: s
     return number
 
 
+def read_optional(value: Any, label: str, low: float, high: float, unit: str) -> float | None:
+    """Read a number in a closed range; None if there is none."""
+    return None if value is None else read_number_between(value, label, low, high, unit)
+
+
 def read_list(value: Any, label: str, limit: int, limit_name: str, room: str | None = None) -> list[Any]:
     """Read a list of at most `limit` entries."""
     if not isinstance(value, list | tuple):

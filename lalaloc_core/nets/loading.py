@@ -11,13 +11,13 @@ from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingConfig, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperLayoutEncoder
 
-LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
+LayoutNetwork = RingLayoutEncoder | PaperLayoutEncoder
 
 
-def load_layout_encoder(architecture: str, config: dict[str, Any], weights: bytes) -> LayoutEncoder:
+def load_layout_encoder(architecture: str, config: dict[str, Any], weights: bytes) -> LayoutNetwork:
     """Rebuild a layout encoder from the configuration and the safetensors of a bundle.
 
     Raises:
@@ -25,7 +25,7 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
         RuntimeError: the weights do not fit.
     """
     if architecture in ("ring", "trunk"):
-        encoder: LayoutEncoder = RingLayoutEncoder(build_config(RingConfig, config))
+        encoder: LayoutNetwork = RingLayoutEncoder(build_config(RingConfig, config))
     elif architecture == "paper":
         encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
     else:

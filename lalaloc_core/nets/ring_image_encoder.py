@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from lalaloc_core.nets.horizon_attention import HorizonAttention
 from lalaloc_core.nets.image_features import ImageFeatures, WallModes
-from lalaloc_core.nets.layout_encoder import RingConfig, pad_around
+from lalaloc_core.nets.layout_network import RingConfig, pad_around
 
 IMAGE_MEAN = (0.5, 0.5, 0.5)
 IMAGE_STD = (0.25, 0.25, 0.25)

@@ -1,8 +1,9 @@
 """Photographs of any projection: camera, tilt, and level patches for the network.
 
 Begin with `photograph.py`, which reads a file. `projection.py` decides what a picture is, from the caller's statements
-(`stated_camera.py`), metadata (`exif.py`, `photograph/photo_sphere.py`) and its pixels; `levelling.py` estimates tilt
-and field of view from the segments of `lines.py`; `patches.py` samples through the models of `cameras.py`.
+(`stated_camera.py`), metadata (`exif.py`, `photo_sphere.py`) and its pixels. `spheres.py` reads full spheres; of other
+photographs, `levelling.py` estimates tilt and field of view from straight lines, and `patches.py` samples through the
+models of `cameras.py`. `picture_files.py` opens files.
 """
 
 from lalaloc_core.photograph.patches import Patch, PatchSize

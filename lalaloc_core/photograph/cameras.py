@@ -2,7 +2,7 @@
 
 Rays are in the camera's frame (right, forward, up). Pixel coordinates are continuous: x to the right and y down from
 the picture's top left corner, so the centre of pixel (row i, column j) is (j + 0.5, i + 0.5). OpenCV counts from the
-centre of that pixel instead; `stated.py` converts.
+centre of that pixel instead; `stated_camera.py` converts.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,17 +21,17 @@ _TINY = 1e-12
 # Angle from the optical axis within which a perspective camera sees.
 _MAX_PERSPECTIVE = math.radians(85.0)
 
+LensT = TypeVar("LensT", bound="_Lens")
+
 
 @dataclass(frozen=True, kw_only=True)
-class Perspective:
-    """Pinhole camera with OpenCV's radial and tangential distortion.
+class _Lens:
+    """Camera with a lens.
 
     Attributes:
         width, height: size of the picture, pixels.
-        fx, fy: focal lengths, pixels.
+        fx, fy: focal lengths, pixels; of a fisheye, pixels per radian.
         cx, cy: optical centre, pixels from the top left corner.
-        radial: coefficients k1, k2, k3.
-        tangential: coefficients p1, p2.
     """
 
     width: int
@@ -39,9 +40,32 @@ class Perspective:
     fy: float
     cx: float
     cy: float
+    _limit: float = field(init=False, repr=False)
+
+    @property
+    def resolution(self) -> float:
+        """Pixels per radian at the optical axis."""
+        return self.fx
+
+    def scaled(self: LensT, width: int, height: int) -> LensT:
+        """Return the camera of the picture scaled to another size."""
+        across, down = width / self.width, height / self.height
+        size = {"width": width, "height": height}
+        focal = {"fx": self.fx * across, "fy": self.fy * down}
+        return dataclasses.replace(self, **size, **focal, cx=self.cx * across, cy=self.cy * down)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Perspective(_Lens):
+    """Pinhole camera with OpenCV's radial and tangential distortion.
+
+    Attributes:
+        radial: coefficients k1, k2, k3.
+        tangential: coefficients p1, p2.
+    """
+
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
-    _limit: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         k1, k2, k3 = self.radial
@@ -60,11 +84,6 @@ class Perspective:
         sides = self.rays(np.array([[0.0, self.cy], [float(self.width), self.cy]]))
         left, right = np.arctan2(sides[:, 0], sides[:, 1])
         return float(right - left)
-
-    @property
-    def resolution(self) -> float:
-        """Pixels per radian at the optical axis."""
-        return self.fx
 
     def pixels(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
         """Return the pixel coordinates (x, y) of rays of any length, and which of them the picture shows."""
@@ -91,19 +110,6 @@ class Perspective:
             y = y - (xx * error_y - xy * error_x) / determinant
         return _unit(x, np.ones_like(x), -y)
 
-    def scaled(self, width: int, height: int) -> Perspective:
-        """Return the camera of the picture scaled to another size."""
-        across, down = width / self.width, height / self.height
-        return dataclasses.replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * across,
-            cx=self.cx * across,
-            fy=self.fy * down,
-            cy=self.cy * down,
-        )
-
     @property
     def _distorted(self) -> bool:
         return any((*self.radial, *self.tangential))
@@ -124,26 +130,16 @@ class Perspective:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fisheye:
+class Fisheye(_Lens):
     """OpenCV's fisheye camera: the angle θ from the axis lies at f θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸).
 
     Attributes:
-        width, height: size of the picture, pixels.
-        fx, fy: focal lengths, pixels per radian.
-        cx, cy: optical centre, pixels from the top left corner.
         radial: coefficients k1 to k4.
         max_angle: largest angle from the axis that the lens shows, radians.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     max_angle: float = math.pi
-    _limit: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         k1, k2, k3, k4 = self.radial
@@ -158,26 +154,14 @@ class Fisheye:
         """
         focal = width / hfov
         circular = abs(width / height - 1.0) < 0.1
-        return cls(
-            width=width,
-            height=height,
-            fx=focal,
-            fy=focal,
-            cx=0.5 * width,
-            cy=0.5 * height,
-            max_angle=0.5 * hfov if circular else math.pi,
-        )
+        angle, cx, cy = 0.5 * hfov if circular else math.pi, 0.5 * width, 0.5 * height
+        return cls(width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy, max_angle=angle)
 
     @property
     def hfov(self) -> float:
         """Horizontal field of view, radians: between the ends of the row of the optical axis."""
         sides = np.array([[0.0, self.cy], [self.width, self.cy]])
         return float(np.minimum(self._angles(sides)[0], self._limit).sum())
-
-    @property
-    def resolution(self) -> float:
-        """Pixels per radian at the optical axis."""
-        return self.fx
 
     def pixels(self, rays: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
         """Return the pixel coordinates (x, y) of rays of any length, and which of them the picture shows."""
@@ -193,19 +177,6 @@ class Fisheye:
         angle, x, y = self._angles(pixels)
         share = np.sin(angle) / np.maximum(np.hypot(x, y), _TINY)
         return _unit(x * share, np.cos(angle), -y * share)
-
-    def scaled(self, width: int, height: int) -> Fisheye:
-        """Return the camera of the picture scaled to another size."""
-        across, down = width / self.width, height / self.height
-        return dataclasses.replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * across,
-            cx=self.cx * across,
-            fy=self.fy * down,
-            cy=self.cy * down,
-        )
 
     def _angles(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return angles from the axis, and the normalised coordinates that they were computed from."""
@@ -293,3 +264,12 @@ def _inside(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 def _unit(right: np.ndarray, forward: np.ndarray, up: np.ndarray) -> np.ndarray:
     rays = np.stack([right, forward, up], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
+    """Return the camera's right, forward and up as rows, in a level frame with the same heading."""
+    forward = [0.0, math.cos(pitch), math.sin(pitch)]
+    unrolled_right, unrolled_up = np.array([1.0, 0.0, 0.0]), np.array([0.0, -math.sin(pitch), math.cos(pitch)])
+    right = math.cos(roll) * unrolled_right - math.sin(roll) * unrolled_up
+    up = math.sin(roll) * unrolled_right + math.cos(roll) * unrolled_up
+    return np.stack([right, np.array(forward), up])

@@ -91,9 +91,11 @@ def _film_side_mm(ratio: float) -> float:
 
 def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, warnings: list[str]) -> float | None:
     """Return the longer side of the sensor, from the pixels per unit on it or the model."""
-    density = _number(tags.get(ExifTags.Base.FocalPlaneXResolution))
+    density = finite_number(tags.get(ExifTags.Base.FocalPlaneXResolution))
     unit_mm = _UNITS_MM.get(_integer(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)))
-    sides = [_number(tags.get(tag)) or 0.0 for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    sides = [
+        finite_number(tags.get(tag)) or 0.0 for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)
+    ]
     if density and unit_mm and max(sides) > 0.0:
         side_mm = max(sides) / density * unit_mm
         if _SENSOR_RANGE_MM[0] <= side_mm <= _SENSOR_RANGE_MM[1]:
@@ -109,7 +111,7 @@ def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, w
 
 
 def _is_cropped(tags: dict[int, object], width: int, height: int) -> bool:
-    sides = [_number(tags.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    sides = [finite_number(tags.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
     if not sides[0] or not sides[1] or min(sides[0], sides[1]) < 1.0:
         return False
     taken = max(sides[0], sides[1]) / min(sides[0], sides[1])
@@ -122,7 +124,7 @@ def _in_range(
     """Return a tag's value; None if it is missing, zero (unknown) or out of range (with a warning)."""
     if tags.get(tag) is None:
         return None
-    value = _number(tags[tag])
+    value = finite_number(tags[tag])
     if value == 0.0:
         return None
     if value is None or not limits[0] <= value <= limits[1]:
@@ -134,7 +136,7 @@ def _in_range(
     return value
 
 
-def _number(value: object) -> float | None:
+def finite_number(value: object) -> float | None:
     """Return a finite number; None for text, several values and fractions with a denominator of zero."""
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
@@ -144,5 +146,5 @@ def _number(value: object) -> float | None:
 
 
 def _integer(value: object) -> int:
-    number = _number(value)
+    number = finite_number(value)
     return 0 if number is None else round(number)

@@ -11,13 +11,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.lines import Lines, lines_of
-from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.photograph.cameras import Camera, Perspective, camera_axes
 
+# Shorter segments, as a share of the picture's longer side, are mostly texture.
+_MIN_LENGTH = 0.025
+_MAX_SEGMENTS = 150
+# OpenCV counts from the centre of the first pixel.
+_HALF_PIXEL = 0.5
 # Angular error of a segment: modelling, and of its ends in pixels.
 _SIGMA = math.radians(0.6)
 _SIGMA_PIXELS = 0.6
@@ -43,13 +47,28 @@ _DELTA = 1e-5
 _TEMPERATURE = 0.15
 # Errors that lines do not show: lenses, edges that are not quite upright. Fitted on views cut from spheres.
 _FLOOR = np.radians([0.5, 0.4])
-
-
 # Field of view of the longer side, if unknown: values to try, and the prior of log focal length of phones.
 _LONG_FOVS = np.radians([44.0, 48.0, 52.0, 57.0, 62.0, 67.0, 73.0, 79.0, 86.0, 93.0, 100.0, 108.0, 116.0])
 _USUAL_FOV, _FOV_SD = math.radians(72.0), 0.35
 # Steps between values, lenses.
 _FOCAL_FLOOR = 0.03
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lines:
+    """Segments seen from the camera, in its frame (right, forward, up).
+
+    Attributes:
+        normal: (n, 3) unit normals of the planes through the camera and each segment.
+        middle: (n, 3) unit rays to the middles.
+        length: (n,) angles (radians) between the ends.
+        pixel: angle (radians) of one pixel at the optical axis.
+    """
+
+    normal: Float[np.ndarray, "n 3"]
+    middle: Float[np.ndarray, "n 3"]
+    length: Float[np.ndarray, "n"]
+    pixel: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +102,34 @@ class Calibration:
     attitude: Attitude
 
 
+def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
+    """Return the longest segments (x, y, x, y; pixels from the top left corner) found by OpenCV's LSD."""
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
+    if found is None:
+        return np.zeros((0, 4))
+    segments = found.reshape(-1, 4).astype(float) + _HALF_PIXEL
+    length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+    order = np.argsort(-length, kind="stable")[:_MAX_SEGMENTS]
+    return segments[order[length[order] > _MIN_LENGTH * max(grey.shape)]]
+
+
+def lines_of(segments: Float[np.ndarray, "n 4"], camera: Camera) -> Lines:
+    """Return the segments as a camera sees them."""
+    rays = camera.rays(segments.reshape(-1, 2, 2))
+    cross = np.cross(rays[:, 0], rays[:, 1])
+    sine = np.linalg.norm(cross, axis=-1)
+    middle = rays.sum(axis=1)
+    middle_norm = np.linalg.norm(middle, axis=-1)
+    usable = (sine > 1e-4) & (middle_norm > 1e-4)
+    return Lines(
+        normal=cross[usable] / sine[usable, None],
+        middle=middle[usable] / middle_norm[usable, None],
+        length=np.arctan2(sine, (rays[:, 0] * rays[:, 1]).sum(axis=-1))[usable],
+        pixel=1.0 / camera.resolution,
+    )
+
+
 def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
     if not len(lines.length):
@@ -94,7 +141,7 @@ def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, heig
     """Return the most probable field of view and tilt of a perspective camera without distortion.
 
     Args:
-        segments: segments of `lines.find_segments`.
+        segments: segments of `find_segments`.
         width: columns of the picture.
         height: rows of the picture.
     """

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.photograph.cameras import Camera
-from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.conventions import TWO_PI, unit_rays
+from lalaloc_core.photograph.cameras import Camera, camera_axes
 
 # Colour of pixels that the photograph does not show.
 UNSEEN = 127
@@ -111,14 +110,8 @@ def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
 
 
 def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float, size: PatchSize) -> Patch:
-    turn = np.array(
-        [
-            [math.cos(azimuth), math.sin(azimuth), 0.0],
-            [-math.sin(azimuth), math.cos(azimuth), 0.0],
-            [0.0, 0.0, 1.0],
-        ],
-        np.float32,
-    )
+    cosine, sine = math.cos(azimuth), math.sin(azimuth)
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
     rays = _level_rays(size) @ (axes @ turn).T
     pixels, seen = camera.pixels(rays)
     where = (np.where(seen[..., None], pixels, 0.0) - _HALF_PIXEL).astype(np.float32)
@@ -133,10 +126,7 @@ def _level_rays(size: PatchSize) -> Float[np.ndarray, "h w 3"]:
     azimuth = ((np.arange(size.width) + 0.5) / size.width - 0.5) * size.hfov
     share = (np.arange(size.height) + 0.5) / size.height
     elevation = np.radians(size.top_deg + (size.bottom_deg - size.top_deg) * share)[:, None]
-    rays = np.broadcast_arrays(
-        np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
-    )
-    return np.stack(rays, axis=-1).astype(np.float32)
+    return unit_rays(azimuth, elevation).astype(np.float32)
 
 
 def _reduced(picture: np.ndarray, camera: Camera, resolution: float) -> tuple[np.ndarray, Camera]:

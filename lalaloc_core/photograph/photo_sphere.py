@@ -13,6 +13,8 @@ from xml.etree.ElementTree import ParseError
 from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
+from lalaloc_core.photograph.exif import finite_number
+
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 # A packet of a JPEG fits into one segment of 64 KiB.
 _MAX_XMP_BYTES = 256 * 1024
@@ -109,23 +111,14 @@ def _properties(xmp: bytes | str | None) -> dict[str, str]:
     return found
 
 
-def _number(text: str | None) -> float | None:
-    """Parse a finite number; return None for anything else."""
-    try:
-        value = float(text or "")
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
 def _angle(values: dict[str, str], name: str, low_deg: float, high_deg: float) -> float | None:
-    degrees = _number(values.get(name))
+    degrees = finite_number(values.get(name))
     return math.radians(degrees) if degrees is not None and low_deg <= degrees <= high_deg else None
 
 
 def _cylinder(values: dict[str, str]) -> float | None:
     """Return the angle that a part of a cylinder shows."""
-    full, part = (_number(values.get(name)) for name in ("FullPanoWidthPixels", "CroppedAreaImageWidthPixels"))
+    full, part = (finite_number(values.get(name)) for name in ("FullPanoWidthPixels", "CroppedAreaImageWidthPixels"))
     return math.tau * part / full if full and part and 0.0 < part <= full else None
 
 
@@ -133,7 +126,7 @@ def _part(values: dict[str, str], width: int, height: int) -> tuple[SpherePart |
     """Return the visible part of the sphere, or the problem with its metadata."""
     if not any(name in values for name in _CROP):
         return None, None
-    numbers = {name: _number(values.get(name)) for name in _CROP}
+    numbers = {name: finite_number(values.get(name)) for name in _CROP}
     for name, number in numbers.items():
         if number is None or not 0.0 <= number <= _MAX_SIDE:
             return None, f"{name} is '{values.get(name, '')[:50]}'; it must be between 0 and {_MAX_SIDE}"

@@ -13,16 +13,20 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.photograph.cameras import Around, Camera, Perspective
+from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_axes
 from lalaloc_core.photograph.exif import read_exif_lens
-from lalaloc_core.photograph.levelling import MAX_ESTIMATED_SD, estimate_attitude, estimate_calibration
-from lalaloc_core.photograph.lines import find_segments, lines_of
+from lalaloc_core.photograph.levelling import (
+    MAX_ESTIMATED_SD,
+    estimate_attitude,
+    estimate_calibration,
+    find_segments,
+    lines_of,
+)
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture, orientation_of, scaled, turned
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
-from lalaloc_core.photograph.sphere_levelling import camera_axes
-from lalaloc_core.photograph.spheres import Sphere, open_sphere
+from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.photograph.spheres import warm_up as warm_up_spheres
 from lalaloc_core.photograph.stated_camera import StatedCamera
 
@@ -69,8 +73,8 @@ class Photograph:
         roll: clockwise rotation of the camera about its optical axis.
         azimuths: first and last azimuth (radians) that the photograph shows, relative to its centre, clockwise.
         patches: level patches that cover the photograph; empty for a full sphere.
-        panorama: the level sphere; None for other photographs.
-        encoded: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
+        sphere: (h, w, 3) pixels of the level full sphere; None for other photographs.
+        features: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
@@ -84,17 +88,22 @@ class Photograph:
     roll: Assumed
     azimuths: tuple[float, float]
     patches: tuple[Patch, ...] = ()
-    panorama: Sphere | None = None
+    sphere: UInt8[np.ndarray, "h w 3"] | None = None
     camera: Camera | None = None
     axes: Float[np.ndarray, "3 3"] | None = None
-    encoded: PhotographFeatures | None = None
+    features: PhotographFeatures | None = None
     compass_heading: float | None = None
     warnings: tuple[str, ...] = ()
 
     @property
     def is_sphere(self) -> bool:
         """True if the photograph is a full sphere."""
-        return self.panorama is not None or (self.encoded is not None and not self.encoded.azimuths)
+        return self.sphere is not None or (self.features is not None and not self.features.azimuths)
+
+    @property
+    def patch_azimuths(self) -> tuple[float, ...]:
+        """Azimuths (radians) of the patches relative to the photograph's centre; none for a full sphere."""
+        return tuple(patch.azimuth_rad for patch in self.patches) if self.features is None else self.features.azimuths
 
     def tilt_sd(self, azimuth: float) -> float:
         """Return the standard deviation (radians) of elevations along an azimuth, from those of pitch and roll."""
@@ -162,9 +171,9 @@ def open_photograph(
     stated.check()
 
     @cache
-    def panorama(height: int = sphere_size[0], width: int = sphere_size[1]) -> Sphere:
+    def sphere(height: int = sphere_size[0], width: int = sphere_size[1]) -> UInt8[np.ndarray, "h w 3"]:
         pitch, roll = (None if angle is None else math.radians(angle) for angle in (stated.pitch_deg, stated.roll_deg))
-        return open_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
+        return read_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
 
     is_fine = sphere_size[0] >= COARSEST[0]
     with opened_picture(content, limits) as image:
@@ -174,42 +183,44 @@ def open_photograph(
             raise InvalidPhotographError(
                 f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
             )
-        sphere = read_photo_sphere(image.info.get("xmp"), width=width, height=height)
+        metadata = read_photo_sphere(image.info.get("xmp"), width=width, height=height)
         lens = find_lens(
             width,
             height,
             stated=stated,
-            sphere=sphere,
+            sphere=metadata,
             exif=read_exif_lens(image.getexif(), width=width, height=height),
-            looks_spherical=lambda: is_sphere((panorama() if is_fine else panorama(*COARSEST)).pixels),
+            looks_spherical=lambda: is_sphere(sphere() if is_fine else sphere(*COARSEST)),
         )
         if lens.is_sphere:
-            return _sphere_view(panorama(), lens, stated, sphere)
+            return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
-    return _view(picture, (width, height), lens, stated, size)
+    return _photograph_of_picture(picture, (width, height), lens, stated, size)
 
 
-def _sphere_view(panorama: Sphere, lens: Lens, stated: StatedCamera, sphere: PhotoSphere) -> Photograph:
-    def tilt(stated_deg: float | None, metadata: float) -> Assumed:
-        if stated_deg is not None:
-            return Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
-        return Assumed(value=metadata, sd=_GIVEN_SD, source="gpano" if metadata else "assumed")
-
-    half = math.pi * (1.0 if sphere.part is None else sphere.part.width)
+def _photograph_of_sphere(
+    sphere: UInt8[np.ndarray, "h w 3"], lens: Lens, stated: StatedCamera, metadata: PhotoSphere
+) -> Photograph:
+    half = math.pi * (1.0 if metadata.part is None else metadata.part.width)
+    by_metadata = (
+        Assumed(value=angle, sd=_GIVEN_SD, source="gpano" if angle else "assumed")
+        for angle in (metadata.pitch, metadata.roll)
+    )
+    pitch, roll = map(_stated_or, (stated.pitch_deg, stated.roll_deg), by_metadata)
     return Photograph(
         projection=lens.projection,
         projection_source=lens.projection_source,
         hfov=Assumed(value=2.0 * half, sd=0.0, source=lens.projection_source),
-        pitch=tilt(stated.pitch_deg, sphere.pitch),
-        roll=tilt(stated.roll_deg, sphere.roll),
+        pitch=pitch,
+        roll=roll,
         azimuths=(-half, half),
-        panorama=panorama,
-        compass_heading=panorama.compass_heading,
+        sphere=sphere,
+        compass_heading=metadata.compass_heading,
         warnings=lens.warnings,
     )
 
 
-def _view(
+def _photograph_of_picture(
     picture: UInt8[np.ndarray, "h w 3"], full_size: tuple[int, int], lens: Lens, stated: StatedCamera, size: PatchSize
 ) -> Photograph:
     rows, columns = picture.shape[:2]
@@ -220,6 +231,7 @@ def _view(
         found = estimate_calibration(segments, width=columns, height=rows)
         attitude, focal_sd = found.attitude, found.focal_sd
         camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
+        small = camera.scaled(columns, rows)
         origin = "was estimated from straight lines" if len(segments) else "is only usual"
         warnings = (
             *warnings,
@@ -227,13 +239,15 @@ def _view(
             f"{math.degrees(2.0 * _hfov_sd(camera, focal_sd)):.0f}° {origin}; "
             "send hfov_deg or the camera's original file",
         )
-        small = camera.scaled(columns, rows)
     else:
         camera, focal_sd = lens.camera, lens.focal_sd
         small = camera.scaled(columns, rows)
         attitude = estimate_attitude(lines_of(segments, small))
-    pitch = _tilt(stated.pitch_deg, attitude.pitch, attitude.pitch_sd)
-    roll = _tilt(stated.roll_deg, attitude.roll, attitude.roll_sd)
+    estimated = (
+        Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
+        for angle, sd in ((attitude.pitch, attitude.pitch_sd), (attitude.roll, attitude.roll_sd))
+    )
+    pitch, roll = map(_stated_or, (stated.pitch_deg, stated.roll_deg), estimated)
     tilt = pitch.value
     if isinstance(camera, Around) and lens.projection == "cylindrical" and pitch.source == "given":
         # A strip's pitch is the same all around, so its camera is not rotated.
@@ -253,10 +267,8 @@ def _view(
     )
 
 
-def _tilt(stated_deg: float | None, angle: float, sd: float) -> Assumed:
-    if stated_deg is not None:
-        return Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
-    return Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
+def _stated_or(stated_deg: float | None, otherwise: Assumed) -> Assumed:
+    return otherwise if stated_deg is None else Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
 
 
 def _decoded_size(width: int, height: int, lens: Lens, size: PatchSize) -> tuple[int, int]:

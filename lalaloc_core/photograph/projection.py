@@ -96,32 +96,21 @@ def find_lens(
     """
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
-    if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
-        camera = camera_of_intrinsics(projection, width, height, stated.intrinsics)
+
+    def known(camera: Camera, hfov_source: Source) -> Lens:
         return Lens(
-            projection=projection,
-            projection_source=source,
-            camera=camera,
-            hfov_source="given",
-            focal_sd=_GIVEN_SD,
+            projection=projection, projection_source=source, camera=camera, hfov_source=hfov_source, focal_sd=_GIVEN_SD
         )
+
+    if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
+        return known(camera_of_intrinsics(projection, width, height, stated.intrinsics), "given")
     is_full = projection == "equirectangular" and _is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
     if stated.hfov_deg is not None and not is_full:
-        camera = camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg))
-        return Lens(
-            projection=projection,
-            projection_source=source,
-            camera=camera,
-            hfov_source="given",
-            focal_sd=_GIVEN_SD,
-        )
+        return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
     if projection == "equirectangular":
         return Lens(projection=projection, projection_source=source, hfov_source=source)
     if projection == "cylindrical" and sphere.cylinder is not None:
-        camera = camera_of_hfov(projection, width, height, sphere.cylinder)
-        return Lens(
-            projection=projection, projection_source=source, camera=camera, hfov_source="gpano", focal_sd=_GIVEN_SD
-        )
+        return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano")
     if projection == "cylindrical":
         raise InvalidPhotographError(
             f"nothing tells which angle the strip of {width} x {height} shows; send hfov_deg, its horizontal field of "

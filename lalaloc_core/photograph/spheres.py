@@ -1,4 +1,4 @@
-"""Reader for panoramas: from encoded bytes to the pixels that the image encoder expects.
+"""Reader for spheres: from encoded bytes to the level pixels that the image encoder expects.
 
 Three kinds of metadata are used: the EXIF orientation, the visible part of the sphere, and the camera's pitch and roll
 (`photo_sphere`).
@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
+from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
     FORMATS,
@@ -25,34 +27,16 @@ from lalaloc_core.photograph.picture_files import (
     scaled,
     turned,
 )
-from lalaloc_core.photograph.sphere_levelling import level
 
 # Oversampling of pictures that are placed or levelled, relative to the encoder's input.
 _FINER = 2
 # Rounding error, in pixels.
 _EDGE = 1e-6
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sphere:
-    """The full sphere, level, as the image encoder expects it.
-
-    `compass_heading` is the azimuth of the centre column, radians clockwise from true north; None if not in the
-    metadata.
-    """
-
-    pixels: UInt8[np.ndarray, "h w 3"]
-    compass_heading: float | None = None
+# Rows levelled at once: all rays of a large picture would need many times its memory.
+_ROWS = 64
 
 
 def read_sphere(
-    content: bytes, *, height: int, width: int, limits: PhotographLimits | None = None
-) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Return the pixels of `open_sphere`; see there for errors."""
-    return open_sphere(content, height=height, width=width, limits=limits).pixels
-
-
-def open_sphere(
     content: bytes,
     *,
     height: int,
@@ -60,7 +44,7 @@ def open_sphere(
     limits: PhotographLimits | None = None,
     pitch: float | None = None,
     roll: float | None = None,
-) -> Sphere:
+) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`.
 
     Args:
@@ -73,8 +57,7 @@ def open_sphere(
 
     Raises:
         InvalidPhotographError: empty, unsupported format, damaged, too large, too many segments or scans, or neither
-        the
-            full sphere nor a part of it that the metadata describe.
+            the full sphere nor a part of it that the metadata describe.
     """
     limits = limits or PhotographLimits()
     with opened_picture(content, limits) as image:
@@ -91,8 +74,7 @@ def open_sphere(
         canvas = picture if sphere.part is None else _placed(picture, sphere.part, canvas_size)
         if not sphere.level:
             canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll))
-        pixels = np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
-    return Sphere(pixels=pixels, compass_heading=sphere.compass_heading)
+        return np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
 
 
 def warm_up(*, height: int, width: int) -> None:
@@ -101,7 +83,7 @@ def warm_up(*, height: int, width: int) -> None:
     for picture_format in FORMATS:
         buffer = io.BytesIO()
         picture.save(buffer, picture_format)
-        open_sphere(buffer.getvalue(), height=height, width=width)
+        read_sphere(buffer.getvalue(), height=height, width=width)
 
 
 def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PhotographLimits) -> None:
@@ -142,3 +124,51 @@ def _placed(picture: Image.Image, part: SpherePart, size: tuple[int, int]) -> Im
     canvas = Image.new("RGB", size, NEUTRAL)
     canvas.paste(picture.resize((right - left, bottom - top), Image.Resampling.BILINEAR, box=box), (left, top))
     return canvas
+
+
+def level(pixels: UInt8[np.ndarray, "h w 3"], *, pitch: float, roll: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Resample a sphere as taken by a level camera with the same heading; bilinear, across seam and poles.
+
+    `pitch` is the elevation of the picture's centre, radians above the horizon; `roll` the rotation of the camera about
+    that direction, radians clockwise.
+    """
+    height, width = pixels.shape[:2]
+    axes = camera_axes(pitch=pitch, roll=roll)
+    azimuth, elevation = column_azimuths(width), row_elevations(height)
+    out = np.empty_like(pixels)
+    for top in range(0, height, _ROWS):
+        block = elevation[top : top + _ROWS, None]
+        rays = np.stack(
+            np.broadcast_arrays(np.cos(block) * np.sin(azimuth), np.cos(block) * np.cos(azimuth), np.sin(block))
+        )
+        out[top : top + _ROWS] = _sample(pixels, np.einsum("ij,jrc->irc", axes, rays))
+    return out
+
+
+def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "3 r c"]) -> UInt8[np.ndarray, "r c 3"]:
+    """Return the colours along unit rays in the camera's frame (right, forward, up)."""
+    height, width = pixels.shape[:2]
+    column = (np.arctan2(rays[0], rays[1]) / (2.0 * np.pi) + 0.5) * width - 0.5
+    row = (0.5 - np.arcsin(np.clip(rays[2], -1.0, 1.0)) / np.pi) * height - 0.5
+    left, above = np.floor(column).astype(int), np.floor(row).astype(int)
+    across, down = (column - left)[..., None], (row - above)[..., None]
+    blended = sum(
+        weight * _pixels_around(pixels, above + i, left + j)
+        for i, j, weight in (
+            (0, 0, (1.0 - down) * (1.0 - across)),
+            (0, 1, (1.0 - down) * across),
+            (1, 0, down * (1.0 - across)),
+            (1, 1, down * across),
+        )
+    )
+    return np.round(blended).astype(np.uint8)
+
+
+def _pixels_around(
+    pixels: UInt8[np.ndarray, "h w 3"], row: np.ndarray, column: np.ndarray
+) -> UInt8[np.ndarray, "r c 3"]:
+    """Return pixels by row and column; a row beyond a pole is the row before it, half a turn away."""
+    height, width = pixels.shape[:2]
+    beyond = (row < 0) | (row >= height)
+    column = np.where(beyond, column + width // 2, column)
+    return pixels[np.clip(row, 0, height - 1), column % width]

@@ -101,11 +101,9 @@ class StatedCamera:
             value = getattr(intrinsics, name)
             if value is not None and not math.isfinite(value):
                 raise InvalidPhotographError(f"intrinsics: {name} is {value}; it must be finite")
-        for name in ("fx", "fy"):
-            if getattr(intrinsics, name) <= 0.0:
-                raise InvalidPhotographError(
-                    f"intrinsics: {name} is {getattr(intrinsics, name):g}; it must be positive"
-                )
+        for name, focal in (("fx", intrinsics.fx), ("fy", intrinsics.fy)):
+            if focal <= 0.0:
+                raise InvalidPhotographError(f"intrinsics: {name} is {focal:g}; it must be positive")
         if not 1.0 / _MAX_FOCAL_RATIO <= intrinsics.fx / intrinsics.fy <= _MAX_FOCAL_RATIO:
             raise InvalidPhotographError(
                 f"intrinsics: fx is {intrinsics.fx:g} and fy {intrinsics.fy:g}; they must agree within a factor of "
@@ -116,9 +114,9 @@ class StatedCamera:
         unused = ("p1", "p2") if self.projection == "fisheye" else ("k4",)
         for name in unused:
             if getattr(intrinsics, name) != 0.0:
+                kind = "fisheye" if self.projection == "fisheye" else "perspective"
                 raise InvalidPhotographError(
-                    f"intrinsics: {name} does not belong to the projection "
-                    f"'{'fisheye' if self.projection == 'fisheye' else 'perspective'}'; leave it out"
+                    f"intrinsics: {name} does not belong to the projection '{kind}'; leave it out"
                 )
 
 
@@ -149,27 +147,13 @@ def camera_of_intrinsics(
             )
         centre.append(position)
     k1, k2, k3 = intrinsics.k1, intrinsics.k2, intrinsics.k3
+    matrix = {"fx": intrinsics.fx, "fy": intrinsics.fy, "cx": centre[0], "cy": centre[1]}
+    camera: Camera
     if projection == "fisheye":
-        camera = Fisheye(
-            width=width,
-            height=height,
-            fx=intrinsics.fx,
-            fy=intrinsics.fy,
-            cx=centre[0],
-            cy=centre[1],
-            radial=(k1, k2, k3, intrinsics.k4),
-        )
+        camera = Fisheye(width=width, height=height, **matrix, radial=(k1, k2, k3, intrinsics.k4))
     else:
-        camera = Perspective(
-            width=width,
-            height=height,
-            fx=intrinsics.fx,
-            fy=intrinsics.fy,
-            cx=centre[0],
-            cy=centre[1],
-            radial=(k1, k2, k3),
-            tangential=(intrinsics.p1, intrinsics.p2),
-        )
+        tangential = intrinsics.p1, intrinsics.p2
+        camera = Perspective(width=width, height=height, **matrix, radial=(k1, k2, k3), tangential=tangential)
     low, high = HFOV_RANGE_DEG[projection]
     hfov_deg = math.degrees(camera.hfov)
     if not low <= hfov_deg <= high:

@@ -6,7 +6,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 from jaxtyping import Float
 
-from lalaloc_core.conventions import Array, column_azimuths, row_elevations
+from lalaloc_core.conventions import Array, column_azimuths, row_elevations, unit_rays
 
 
 def layout_depth(
@@ -36,11 +36,5 @@ def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
     xp = array_namespace(depth_m)
     batch, rows, columns = depth_m.shape
     azimuth, elevation = column_azimuths(columns)[None, :], row_elevations(rows)[:, None]
-    rays = np.stack(
-        np.broadcast_arrays(
-            np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
-        ),
-        axis=-1,
-    )
-    rays = xp.asarray(rays, dtype=depth_m.dtype, device=device(depth_m))
+    rays = xp.asarray(unit_rays(azimuth, elevation), dtype=depth_m.dtype, device=device(depth_m))
     return xp.reshape(depth_m[..., None] * rays[None], (batch, rows * columns, 3))

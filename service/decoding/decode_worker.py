@@ -105,5 +105,5 @@ def _shown(job: ShowJob, content: bytes, limits: PhotographLimits) -> np.ndarray
         return open_picture(content, max_size=job.max_size, limits=limits)
     width, height = job.max_size
     view = open_photograph(content, sphere_size=(height, width), stated=job.stated, limits=limits)
-    assert view.panorama is not None
-    return view.panorama.pixels
+    assert view.sphere is not None
+    return view.sphere

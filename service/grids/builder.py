@@ -10,7 +10,7 @@ from time import monotonic
 
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from service.capacity.fair_share import FairSemaphore
 from service.errors import (
@@ -76,7 +76,7 @@ class GridBuilder:
     def __init__(
         self,
         store: Store,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         cache: GridCache,
         permits: FairSemaphore,
         settings: Settings,

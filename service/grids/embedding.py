@@ -10,7 +10,7 @@ import numpy as np
 
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.match.layouts import joined_layouts, layouts_of_plans
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
@@ -30,7 +30,7 @@ _BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400
 
 def embed(
     plan: FloorPlan,
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     *,
     step_m: float,
     camera_height_m: float,
@@ -80,7 +80,7 @@ def embed(
 
 def embed_small(
     plans: Sequence[FloorPlan],
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     *,
     step_m: float,
     computing: Callable[[], AbstractContextManager[None]],

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Self
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.render.sampling import grid_size
 from service.capacity.fair_share import FairSemaphore
@@ -80,7 +80,7 @@ class GridProvider:
     def __init__(
         self,
         store: Store,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         model_sha256: str,
         settings: Settings,
         telemetry: Telemetry,

@@ -11,7 +11,7 @@ from lalaloc_core.localise.belief import Posterior, photograph_heading, pose_unc
 from lalaloc_core.localise.query import KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.search import SequenceLocalisation
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from service.query.geopose import geopose_at
 from service.query.ground import Ground, Place
 from service.query.spots import Spot, view_answer

@@ -13,7 +13,7 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints
 from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.tracking.ground import LeftOut
+from lalaloc_core.localise.tracking.tracked_plans import LeftOut
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import share_searched
 from service.schemas import PlanProbability

@@ -50,7 +50,7 @@ class Grounds:
         plans: VenuePlans,
         search: VenueSearch,
     ) -> None:
-        self._latents_alone = not encoder.networks.predicts_profile
+        self._latents_alone = not encoder.predicts_profile
         self._grids = grids
         self._queries = queries
         self._reads = reads

@@ -12,8 +12,8 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence_steps
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn, localised_turn
 from lalaloc_core.localise.venue.merged_plans import GAP_M
 from lalaloc_core.photograph import Photograph
 from service.query.answers import compose_answer, compose_sequence_answer
@@ -58,7 +58,7 @@ class SequenceSearch:
             LaLaLocError: see `Localiser.localise`.
         """
         form, context, count = query.form, query.context, len(query.contents)
-        if form.camera_heights_m is not None and not self._encoder.networks.predicts_profile:
+        if form.camera_heights_m is not None and not self._encoder.predicts_profile:
             raise InvalidPoseError(
                 "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
                 "give camera_height_m"
@@ -116,7 +116,7 @@ class SequenceSearch:
         steps = localise_sequence_steps(
             ground.plan,
             ground.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded,
             form.steps(len(photographs)),
             refine=form.refine,
@@ -150,7 +150,7 @@ class SequenceSearch:
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded[0],
             refine=form.refine,
             top_k=form.top_k,

@@ -19,9 +19,9 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import KnownHeading
 from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.ground import Ground as TrackGround
-from lalaloc_core.localise.tracking.motion import WalkGraph
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
@@ -100,7 +100,7 @@ class SessionSearch:
             levels = [row.level for row in site.ready] if isinstance(site, VenueSite) else []
             steps = track_steps(
                 await self._executor.compute(context, partial(self._track_ground, ground, levels)),
-                self._encoder.networks,
+                self._encoder,
                 state or TrackState.first(len(encoded.roll)),
                 encoded,
                 form.odometry,
@@ -115,10 +115,10 @@ class SessionSearch:
         timings_ms = self._executor.observe(context, tracked.stage)
         return TrackOutcome(tracked.state.to_bytes(), self._stored(ground, tracked, Spot(photograph), form, timings_ms))
 
-    def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackGround:
+    def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackedPlans:
         """Return a ground with the ways through its plans; `levels` are those of all plans of the venue."""
         if ground.merged is None or ground.loaded is None:
-            return TrackGround.of_plan(ground.plan, ground.grid, self._graph(ground.records[0], ground.grid))
+            return TrackedPlans.of_plan(ground.plan, ground.grid, self._graph(ground.records[0], ground.grid))
         loaded = ground.loaded
         plans = [
             PlanOnLevel(record.plan, row.level, anchor)
@@ -126,7 +126,7 @@ class SessionSearch:
         ]
         graphs = [self._graph(record, grid) for record, grid in zip(loaded.records, loaded.grids, strict=True)]
         keys = [row.revision_id for row in loaded.rows]
-        return TrackGround.of_levels(ground.merged, plans, graphs, keys, levels, ground.left_out)
+        return TrackedPlans.of_levels(ground.merged, plans, graphs, keys, levels, ground.left_out)
 
     def _graph(self, record: PlanRecord, grid: PoseGrid) -> WalkGraph:
         """Return the links of a plan's pose grid."""

@@ -83,7 +83,7 @@ class SingleSearch:
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._encoder.networks,
+            self._encoder,
             encoded,
             refine=form.refine,
             top_k=form.top_k,
@@ -135,7 +135,7 @@ class SingleSearch:
         def draw() -> str:
             model = self._bundle.manifest.confidence_for(view=outcome.found.query.is_view)
             source = _SOURCES[outcome.answer.heading_source]
-            drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, view=outcome.photograph)
+            drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, photograph=outcome.photograph)
             return draw_answer(drawn, picture, request.picture, rooms=request.rooms)
 
         svg = await self._executor.compute(context, draw)

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from lalaloc_core.localise.tracking import Odometry
-from lalaloc_core.localise.tracking.motion import MAX_STEP_M, MAX_TURN
+from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN
 from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import HEADING_MEANING

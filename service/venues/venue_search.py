@@ -145,7 +145,7 @@ class VenueSearch:
             # Another query may be making the index, in the time that it has itself.
             async with context.bounded():
                 known, plan_index = await self._indices.index(tenant, possible, compute, venue_id=whole_venue)
-            manifest = self._encoder.networks.manifest
+            manifest = self._encoder.manifest
             choosing = [(encoded, manifest.evidence_for(view=encoded.is_view)) for encoded in queries]
             log_prior = hints.log_prior(known, shares)
             preferred = None if favour is None else favour(known)

@@ -18,7 +18,7 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
-from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
+from lalaloc_core.localise.sequence.joint_refinement import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ import torch
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from tests.core.questions import PaintedSession
 
 
@@ -29,9 +29,9 @@ def opened_bundle(tiny_bundle: Path) -> Bundle:
 
 
 @pytest.fixture(scope="session")
-def encoders(opened_bundle: Bundle) -> Encoders:
+def encoders(opened_bundle: Bundle) -> PhotographEncoder:
     """Tiny bundle on onnxruntime."""
-    return Encoders(opened_bundle, threads=1)
+    return PhotographEncoder(opened_bundle, threads=1)
 
 
 @pytest.fixture(scope="session")
@@ -47,9 +47,9 @@ def materials() -> MaterialLibrary:
 
 
 @pytest.fixture(scope="session")
-def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> Encoders:
-    """Encoders whose image encoder reads the wall profile from painted pixels."""
-    encoders = Encoders(opened_bundle, threads=1)
+def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> PhotographEncoder:
+    """PhotographEncoder whose image encoder reads the wall profile from painted pixels."""
+    encoders = PhotographEncoder(opened_bundle, threads=1)
     assert isinstance(optimiser.encoder, RingLayoutEncoder)
-    encoders.images.session = PaintedSession(optimiser.encoder)
+    encoders.spheres.session = PaintedSession(optimiser.encoder)
     return encoders

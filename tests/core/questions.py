@@ -12,15 +12,12 @@ import torch
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.evaluate.methods.method import Pose, Question
-from lalaloc_core.evaluate.runs.predictions import (
-    Prediction,
-    RunInfo,
-)
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet, pose_grid
@@ -61,7 +58,7 @@ def question_at(
 
 
 def perfect_query(
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     plan: FloorPlan,
     position_m: tuple[float, float] | np.ndarray,
     *,

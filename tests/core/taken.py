@@ -13,8 +13,7 @@ import numpy as np
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.photograph.cameras import Camera
-from lalaloc_core.photograph.sphere_levelling import camera_axes
+from lalaloc_core.photograph.cameras import Camera, camera_axes
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

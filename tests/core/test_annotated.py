@@ -33,7 +33,7 @@ from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of
@@ -375,7 +375,7 @@ class TestGalleryScores:
 
 
 class TestEvaluating:
-    def test_reading_compares_encoder_predictions(self, root: Path, encoders: Encoders) -> None:
+    def test_reading_compares_encoder_predictions(self, root: Path, encoders: PhotographEncoder) -> None:
         photographs = AnnotatedPhotographs(root).photographs
         for read, photograph in zip(read_photographs(encoders, photographs), photographs, strict=True):
             image = photograph.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)

@@ -22,7 +22,7 @@ from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
 from lalaloc_core.floorplan.rooms import interior_point
 from lalaloc_core.photograph.file_segments import check_segments
 from lalaloc_core.photograph.photo_sphere import read_photo_sphere
-from lalaloc_core.photograph.spheres import open_sphere
+from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 from tests.growth import assert_no_worse_than_linear
@@ -333,7 +333,7 @@ def test_many_segments_are_read_in_linear_time(kind: str) -> None:
 
         def work() -> None:
             with suppress(InvalidPhotographError):
-                open_sphere(content, height=32, width=64)
+                read_sphere(content, height=32, width=64)
 
         return work
 
@@ -344,10 +344,10 @@ def test_million_segments_are_refused_early() -> None:
     jpeg, png = _picture("JPEG"), _picture("PNG")
     for piece, message in ((_segment(0xFE, b""), "2000 segments"), (_segment(0xE1, b"Exif\0\0x"), "16 Exif segments")):
         with pytest.raises(InvalidPhotographError, match=message):
-            open_sphere(jpeg[:2] + piece * 1_000_000 + jpeg[2:], height=32, width=64)
+            read_sphere(jpeg[:2] + piece * 1_000_000 + jpeg[2:], height=32, width=64)
     for piece in (_chunk(b"tEXt", b"a\0b"), _chunk(b"IDAT", b"")):
         with pytest.raises(InvalidPhotographError, match="20000 chunks"):
-            open_sphere(png[:33] + piece * 1_000_000 + png[33:], height=32, width=64)
+            read_sphere(png[:33] + piece * 1_000_000 + png[33:], height=32, width=64)
 
 
 def test_usual_segment_counts_are_accepted() -> None:

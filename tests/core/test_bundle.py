@@ -39,7 +39,7 @@ from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets import load_decoder
@@ -83,7 +83,7 @@ class TestExport:
         assert manifest.training["layout"]["steps"] == TINY.layout.steps
 
     def test_onnx_and_torch_agree_on_layout_latents(
-        self, opened_bundle: Bundle, encoders: Encoders, optimiser: PoseRefiner
+        self, opened_bundle: Bundle, encoders: PhotographEncoder, optimiser: PoseRefiner
     ) -> None:
         # More than one batch shows that no batch size is fixed.
         scene = scene_of(crooked_flat(), 300, 0)
@@ -97,7 +97,7 @@ class TestExport:
         actual = encoders.layouts(profile.numpy(), *(height.numpy() for height in heights))
         np.testing.assert_allclose(actual, expected, atol=1e-4)
 
-    def test_empty_batch_gives_no_latents(self, encoders: Encoders) -> None:
+    def test_empty_batch_gives_no_latents(self, encoders: PhotographEncoder) -> None:
         assert encoders.layouts(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
 
     def test_exported_files_name_no_local_paths(self, tiny_bundle: Path) -> None:
@@ -126,7 +126,7 @@ class TestExport:
     def test_bundle_without_decoder_is_valid(self, tmp_path: Path) -> None:
         bundle = exported_bundle(tmp_path, TINY)
         assert DECODER_WEIGHTS not in bundle.manifest.files
-        Encoders(bundle, threads=1)
+        PhotographEncoder(bundle, threads=1)
         with pytest.raises(BundleError, match=DECODER_WEIGHTS):
             load_decoder(bundle)
 
@@ -134,10 +134,10 @@ class TestExport:
     def test_bundle_without_image_encoder_encodes_layouts(self, tmp_path: Path) -> None:
         bundle = export_bundle(tmp_path, TINY, build_layout_encoder(TINY), None, name="half", version="1")
         assert not {IMAGE_ONNX, IMAGE_WEIGHTS} & set(bundle.manifest.files)
-        encoders = Encoders(bundle, threads=1)
+        encoders = PhotographEncoder(bundle, threads=1)
         assert encoders.layouts(np.full((1, 32), 2.0), np.array([1.5]), np.array([2.5])).shape == (1, 128)
         with pytest.raises(BundleError, match="layout queries only"):
-            encoders.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
+            encoders.spheres.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
 
     def test_network_that_differs_from_torch_is_not_exported(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -154,12 +154,12 @@ class TestExport:
         bundle = exported_bundle(tmp_path, config)
         assert (bundle.manifest.architecture, bundle.manifest.ring_sectors) == ("paper", 0)
         assert HEAD_ONNX not in bundle.manifest.files
-        encoders, optimiser = Encoders(bundle, threads=1), PoseRefiner.from_bundle(bundle)
+        encoders, optimiser = PhotographEncoder(bundle, threads=1), PoseRefiner.from_bundle(bundle)
         image = np.random.default_rng(0).integers(0, 256, (64, 128, 3), dtype=np.uint8)
-        known = encoders.query(image, 0.0, CameraHeight(1.5))
+        known = encoders.spheres.query(image, 0.0, CameraHeight(1.5))
         assert known.latents.shape == (1, 128)
         # The hypothesis of an eighth turn undoes the turn of the photograph.
-        unknown = encoders.query(np.roll(image, -16, axis=1), None, CameraHeight(1.5))
+        unknown = encoders.spheres.query(np.roll(image, -16, axis=1), None, CameraHeight(1.5))
         eighth = int(np.abs(unknown.roll - np.pi / 4).argmin())
         np.testing.assert_allclose(unknown.latents[eighth], known.latents[0], atol=1e-5)
         scene = scene_of(crooked_flat(), 2, 0)
@@ -181,12 +181,12 @@ class TestReading:
         (bundle_copy / name).write_bytes(content)
         bundle = Bundle.open(bundle_copy)
         with pytest.raises(BundleError, match=f"{name}.*SHA-256"):
-            PoseRefiner.from_bundle(bundle) if name == LAYOUT_WEIGHTS else Encoders(bundle)
+            PoseRefiner.from_bundle(bundle) if name == LAYOUT_WEIGHTS else PhotographEncoder(bundle)
 
     def test_missing_file_is_named(self, bundle_copy: Path) -> None:
         (bundle_copy / IMAGE_ONNX).unlink()
         with pytest.raises(BundleError, match=IMAGE_ONNX):
-            Encoders(Bundle.open(bundle_copy))
+            PhotographEncoder(Bundle.open(bundle_copy))
 
     @pytest.mark.parametrize("name", ["other.onnx", "../manifest.json", MANIFEST_NAME])
     def test_only_listed_files_are_read(self, opened_bundle: Bundle, name: str) -> None:
@@ -273,7 +273,7 @@ class TestIdentity:
         replaced = exported_bundle(bundle_copy, TINY)
         assert replaced.sha256 != opened_bundle.sha256
         assert Bundle.open(bundle_copy).sha256 == replaced.sha256
-        Encoders(replaced)
+        PhotographEncoder(replaced)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("architecture", ["ring", pytest.param("trunk", marks=pytest.mark.slow)])
@@ -281,7 +281,7 @@ class TestIdentity:
         before = exported_bundle(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])
         manifest = Bundle.open(tmp_path).manifest
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
-        first = Encoders(before, threads=1).query(image, None, CameraHeight(1.5))
+        first = PhotographEncoder(before, threads=1).spheres.query(image, None, CameraHeight(1.5))
         for name in (IMAGE_ONNX, LAYOUT_ONNX, HEAD_ONNX):
             model = onnx.load_from_string(before.read(name))
             model.producer_name = "older"
@@ -289,7 +289,7 @@ class TestIdentity:
         older = write_manifest(tmp_path, manifest)
         after = reexport_bundle(tmp_path)
         assert after.sha256 == Bundle.open(tmp_path).sha256 != older.sha256
-        again = Encoders(after, threads=1).query(image, None, CameraHeight(1.5))
+        again = PhotographEncoder(after, threads=1).spheres.query(image, None, CameraHeight(1.5))
         np.testing.assert_allclose(again.latents, first.latents, atol=1e-6)
         assert after.manifest.image_config == manifest.image_config
         assert after.manifest.opening_prior == manifest.opening_prior

@@ -32,21 +32,19 @@ from lalaloc_core.evaluate.calibrate.parameter_fits import (
     fit_matching_weights,
     with_heading_doubt,
 )
-from lalaloc_core.evaluate.methods.method import (
-    Pose,
-    PredictedCandidate,
-)
+from lalaloc_core.evaluate.methods.method import Pose, PredictedCandidate
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import Cohort, MatchingConfig, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.match.cohort import SIZE
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise
-from lalaloc_core.localise.search.retrieval import build_grid, grid_costs
+from lalaloc_core.localise.search.retrieval import grid_costs
 from tests.core.questions import perfect_query, prediction_of
 from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
 
@@ -328,11 +326,11 @@ class TestAppearance:
         assert by_opening == [{"window", "door"}, {"window"}, {"passage", "door"}, {"passage"}, {"door", "passage"}]
         assert redrawn(plan, 3).to_dict() == redrawn(plan, 3).to_dict()
 
-    def test_fit_needs_predicted_openings_and_gives_probabilities(self, encoders: Encoders) -> None:
+    def test_fit_needs_predicted_openings_and_gives_probabilities(self, encoders: PhotographEncoder) -> None:
         scenes = [GeneratedScenes(homes=1, shots_per_home=1).load("validation-00000")]
         with pytest.raises(BundleError, match="predicts no openings"):
             fit_appearance(encoders, scenes)
-        rows = np.array(fit_appearance(Encoders(Bundle.open(default_bundle()), threads=1), scenes))
+        rows = np.array(fit_appearance(PhotographEncoder(Bundle.open(default_bundle()), threads=1), scenes))
         assert MatchingWeights(appearance=tuple(map(tuple, rows.tolist()))).appearance is not None
         # Half of the result is the prior, in which walls look like walls.
         assert rows[0, 0] > 0.49
@@ -411,11 +409,11 @@ PLANS = training_plans(4, 0)
 
 
 @pytest.fixture(scope="module")
-def cohort(encoders: Encoders) -> Cohort:
+def cohort(encoders: PhotographEncoder) -> Cohort:
     return cohort_of(PLANS, encoders.manifest.profile_columns, 0)
 
 
-def log_cost_to_cohort(encoders: Encoders, cohort: Cohort | None, plan: FloorPlan, query: Query) -> float:
+def log_cost_to_cohort(encoders: PhotographEncoder, cohort: Cohort | None, plan: FloorPlan, query: Query) -> float:
     weights, config = MatchingWeights(), MatchingConfig()
     grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
     cost = float(grid_costs(plan, grid, query, weights, config).cost.min())
@@ -424,21 +422,23 @@ def log_cost_to_cohort(encoders: Encoders, cohort: Cohort | None, plan: FloorPla
 
 
 @pytest.mark.parametrize("log_scale", [-3.5, -2.0], ids=["clear", "dim"])
-def test_only_the_own_home_fits_better_than_the_cohort(encoders: Encoders, cohort: Cohort, log_scale: float) -> None:
+def test_only_the_own_home_fits_better_than_the_cohort(
+    encoders: PhotographEncoder, cohort: Cohort, log_scale: float
+) -> None:
     home, hall = crooked_flat(), plan_of(rectangle(14.0, 11.0))
     query = perfect_query(encoders, home, (5.1, 1.3), log_scale=log_scale)
     assert log_cost_to_cohort(encoders, cohort, home, query) < -0.5
     assert log_cost_to_cohort(encoders, cohort, hall, query) > 0.5
 
 
-def test_signal_is_zero_without_cohort_or_profile(encoders: Encoders, cohort: Cohort) -> None:
+def test_signal_is_zero_without_cohort_or_profile(encoders: PhotographEncoder, cohort: Cohort) -> None:
     home = crooked_flat()
     query = perfect_query(encoders, home, (5.1, 1.3), log_scale=-3.5)
     assert log_cost_to_cohort(encoders, None, home, query) == 0.0
     assert log_cost_to_cohort(encoders, cohort, home, replace(query, profile=None)) == 0.0
 
 
-def test_cohort_has_a_fixed_size_and_is_reproducible(cohort: Cohort, encoders: Encoders) -> None:
+def test_cohort_has_a_fixed_size_and_is_reproducible(cohort: Cohort, encoders: PhotographEncoder) -> None:
     columns = encoders.manifest.profile_columns
     assert cohort.log_profile.shape == cohort.kind.shape == (min(SIZE, len(cohort.kind)), columns)
     assert len(cohort.kind) > 500
@@ -459,7 +459,7 @@ class TestBundles:
     ) -> None:
         found = present(Cohort.of_bundle(Bundle.open(with_cohort.folder)))
         np.testing.assert_array_equal(found.kind, cohort.kind)
-        encoders, home = Encoders(with_cohort, threads=1), crooked_flat()
+        encoders, home = PhotographEncoder(with_cohort, threads=1), crooked_flat()
         query = perfect_query(encoders, home, (5.1, 1.3), log_scale=-3.5)
         grid = build_grid(home, encoders, step_m=0.5, camera_height_m=CAMERA_M)
         config = LocaliseConfig(every_stage=True)

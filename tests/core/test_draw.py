@@ -66,7 +66,7 @@ def test_wall_lines_match_the_renderer(room: int, heading: float) -> None:
     outline = layout_outline(PLAN, position_m, room, heading, EYE_M)
     columns = 512
     profile_m = profiles_at(PLAN, position_m[None], np.array([room]), np.array([heading]), columns)[0]
-    for line, rise_m in ((outline.floor, -EYE_M), (outline.ceiling, 1.0)):
+    for line, rise_m in zip(outline.edges, (-EYE_M, 1.0), strict=False):
         expected = wall_line(profile_m, rise_m, 256) / [columns, 256]
         drawn = np.interp(expected[:, 0], line[:, 0], line[:, 1])
         # Next to corners either wall is correct.
@@ -80,10 +80,11 @@ def test_corners_match_the_plan() -> None:
     outline = layout_outline(PLAN, MIDDLE, 0, heading, EYE_M)
     offset = PLAN.rooms[0].polygon_m - MIDDLE
     azimuth = np.sort(wrap_angle(np.arctan2(offset[:, 0], offset[:, 1]) - heading))
-    np.testing.assert_allclose(np.sort(outline.corners[:, 0, 0]), azimuth / TWO_PI + 0.5, atol=1e-4)
+    corners = np.stack(outline.edges[2:])
+    np.testing.assert_allclose(np.sort(corners[:, 0, 0]), azimuth / TWO_PI + 0.5, atol=1e-4)
     distance_m = float(np.hypot(*offset[0]))
-    np.testing.assert_allclose(outline.corners[:, 0, 1], 0.5 + math.atan(EYE_M / distance_m) / math.pi, atol=1e-4)
-    np.testing.assert_allclose(outline.corners[:, 1, 1], 0.5 - math.atan(1.0 / distance_m) / math.pi, atol=1e-4)
+    np.testing.assert_allclose(corners[:, 0, 1], 0.5 + math.atan(EYE_M / distance_m) / math.pi, atol=1e-4)
+    np.testing.assert_allclose(corners[:, 1, 1], 0.5 - math.atan(1.0 / distance_m) / math.pi, atol=1e-4)
 
 
 def test_openings_are_drawn_and_split_at_the_edge() -> None:
@@ -116,8 +117,8 @@ def test_round_room_has_no_corners() -> None:
     ring = np.stack([3.0 * np.sin(azimuth), 3.0 * np.cos(azimuth)], axis=1)[::-1]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"name": "round", "polygon": ring.tolist()}]})
     outline = layout_outline(plan, np.zeros(2), 0, 0.0, EYE_M)
-    assert len(outline.corners) == 0
-    np.testing.assert_allclose(outline.floor[:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
+    assert len(outline.edges) == 2
+    np.testing.assert_allclose(outline.edges[0][:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
 
 
 def all_places(probability: np.ndarray, poses: PoseSet) -> ProbabilityMap:

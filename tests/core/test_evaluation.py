@@ -21,7 +21,7 @@ from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.synth.scene.facts import facts_of
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from tests.core.questions import run_info
 from tests.strategies import present
 
@@ -183,7 +183,7 @@ class TestCommandLine:
 
 
 def test_figures_cover_every_panorama_and_azimuth() -> None:
-    encoders = Encoders(Bundle.open(default_bundle()), threads=1)
+    encoders = PhotographEncoder(Bundle.open(default_bundle()), threads=1)
     figures = azimuth_figures(encoders, GeneratedScenes(homes=1, shots_per_home=3))
     assert figures["n"] == 3
     assert figures["median_error"] < 0.2

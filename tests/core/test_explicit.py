@@ -23,7 +23,7 @@ from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import DepthGrid, Layout
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.refine import LpoConfig, RefinementJob
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
@@ -118,21 +118,23 @@ class TestAligner:
 class TestPredictedProfile:
     @given(heading=st.floats(-math.pi, TWO_PI))
     @settings(max_examples=15)
-    def test_profile_is_turned_to_heading_zero(self, perfect: Encoders, heading: float) -> None:
+    def test_profile_is_turned_to_heading_zero(self, perfect: PhotographEncoder, heading: float) -> None:
         plan, position = crooked_flat(), (1.37, 1.12)
         image = PaintedRoom(plan, position, heading).image(0, 0)
-        profile, left_over = perfect.profile(image, heading, CAMERA_M)
+        profile, left_over = perfect.spheres.profile(image, heading, CAMERA_M)
         assert abs(left_over) <= 0.5 * TWO_PI / COLUMNS + 1e-9
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
 
-    def test_profile_averages_panorama_and_mirror_image(self, encoders: Encoders, opened_bundle: Bundle) -> None:
+    def test_profile_averages_panorama_and_mirror_image(
+        self, encoders: PhotographEncoder, opened_bundle: Bundle
+    ) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
-        profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
+        profile, left_over = encoders.spheres.profile(image, 0.0, CAMERA_M)
         predicted_profiles = []
         for view in (image, image[:, ::-1]):
             inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.array([CAMERA_M], np.float32)}
-            (predicted,) = present(encoders.images.session).run(["log_profile"], inputs)
+            (predicted,) = present(encoders.spheres.session).run(["log_profile"], inputs)
             predicted_profiles.append(np.asarray(predicted)[0])
         assert left_over == 0.0
         np.testing.assert_allclose(
@@ -142,23 +144,23 @@ class TestPredictedProfile:
         # Side by side on two threads, they give the same.
         threads: list[str] = []
         with ThreadPoolExecutor(1, "helper", lambda: threads.append(threading.current_thread().name)) as helper:
-            beside = Encoders(opened_bundle, threads=1)
-            beside.images.helper = lambda: helper
-            np.testing.assert_allclose(beside.profile(image, 0.0, CAMERA_M)[0], profile, rtol=1e-4)
+            beside = PhotographEncoder(opened_bundle, threads=1)
+            beside.spheres.helper = lambda: helper
+            np.testing.assert_allclose(beside.spheres.profile(image, 0.0, CAMERA_M)[0], profile, rtol=1e-4)
         assert threads == ["helper_0"]
 
     def test_network_without_profile_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
-        encoders = Encoders(opened_bundle, threads=1)
-        encoders.predicts_profile = False
+        encoders = PhotographEncoder(opened_bundle, threads=1)
+        encoders.spheres.predicts_profile = False
         with pytest.raises(BundleError, match="log_profile"):
-            encoders.profile(np.zeros((RING.image_height, RING.image_width, 3), np.uint8), 0.0, CAMERA_M)
+            encoders.spheres.profile(np.zeros((RING.image_height, RING.image_width, 3), np.uint8), 0.0, CAMERA_M)
 
 
 class TestMethod:
     @pytest.mark.parametrize("position", [(1.13, 1.02), (5.21, 1.42), (2.34, 4.81)])
     @pytest.mark.parametrize("heading", [None, 0.0, 2.3])
     def test_perfect_prediction_is_located(
-        self, perfect: Encoders, position: tuple[float, float], heading: float | None
+        self, perfect: PhotographEncoder, position: tuple[float, float], heading: float | None
     ) -> None:
         plan = crooked_flat()
         photograph = None if heading is None else PaintedRoom(plan, position, heading)
@@ -177,7 +179,7 @@ class TestMethod:
 
     @given(seed=seeds())
     @settings(max_examples=3)
-    def test_retrieval_minimises_mean_depth_difference(self, perfect: Encoders, seed: int) -> None:
+    def test_retrieval_minimises_mean_depth_difference(self, perfect: PhotographEncoder, seed: int) -> None:
         document = crooked_flat().to_dict()
         document["rooms"][1]["ceiling_height_m"] = 3.1
         plan = FloorPlan.from_dict(document)
@@ -189,7 +191,7 @@ class TestMethod:
         assert expected[present(answer.retrieved)] == pytest.approx(expected.min(), abs=1e-5)
         assert answer.stages["retrieval"].distance == pytest.approx(expected.min(), abs=1e-5)
 
-    def test_unknown_heading_is_refused(self, perfect: Encoders) -> None:
+    def test_unknown_heading_is_refused(self, perfect: PhotographEncoder) -> None:
         with pytest.raises(InvalidInputError, match="heading"):
             ExplicitLayout(perfect).locate(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
 
@@ -208,7 +210,7 @@ class TrueDecoder(LayoutDecoder):
 
 
 @pytest.mark.parametrize("position", [(1.4, 1.3), (2.1, 0.9), (3.1, 1.6)])
-def test_perfect_decoder_finds_the_truth(encoders: Encoders, position: tuple[float, float]) -> None:
+def test_perfect_decoder_finds_the_truth(encoders: PhotographEncoder, position: tuple[float, float]) -> None:
     question = question_at(plan_of([[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [0.0, 3.0]]), position)
     answer = VdrDecode(encoders, TrueDecoder(question)).locate(question)
     found = answer.stages["decode"]
@@ -218,7 +220,7 @@ def test_perfect_decoder_finds_the_truth(encoders: Encoders, position: tuple[flo
 
 
 @pytest.mark.parametrize("heading_known", [True, False])
-def test_retrieval_and_vdr_equal_lalaloc(encoders: Encoders, heading_known: bool) -> None:
+def test_retrieval_and_vdr_equal_lalaloc(encoders: PhotographEncoder, heading_known: bool) -> None:
     torch.manual_seed(0)
     question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
     answer = VdrDecode(encoders, LayoutDecoder()).locate(question)
@@ -234,7 +236,7 @@ def test_retrieval_and_vdr_equal_lalaloc(encoders: Encoders, heading_known: bool
         assert found.heading == pytest.approx(0.7)
 
 
-def test_decoded_layouts_have_the_compared_width(encoders: Encoders) -> None:
+def test_decoded_layouts_have_the_compared_width(encoders: PhotographEncoder) -> None:
     torch.manual_seed(0)
     decoder = LayoutDecoder().eval()
     latents = np.random.default_rng(0).normal(size=(3, 128)).astype(np.float32)

@@ -18,11 +18,11 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet
@@ -80,25 +80,27 @@ class TestRealEncoders:
 
     @given(st.integers(0, SECTORS - 1))
     @settings(max_examples=SECTORS)
-    def test_true_hypothesis_has_the_latent_of_heading_zero(self, encoders: Encoders, sector: int) -> None:
+    def test_true_hypothesis_has_the_latent_of_heading_zero(self, encoders: PhotographEncoder, sector: int) -> None:
         rng = np.random.default_rng(sector)
         at_zero = rng.integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         # Turning the camera to the right rolls the panorama to the left.
         turned = np.roll(at_zero, -sector * RING.image_width // SECTORS, axis=1)
-        straight = encoders.query(at_zero, 0.0, CameraHeight(CAMERA_M))
-        unknown = encoders.query(turned, None, CameraHeight(CAMERA_M))
+        straight = encoders.spheres.query(at_zero, 0.0, CameraHeight(CAMERA_M))
+        unknown = encoders.spheres.query(turned, None, CameraHeight(CAMERA_M))
         assert len(unknown.latents) == len(unknown.roll) == SECTORS
         hypothesis = int(np.abs(wrap_angle(unknown.roll - sector * SECTOR)).argmin())
         assert abs(wrap_angle(unknown.roll[hypothesis] - sector * SECTOR)) < 1e-9
         np.testing.assert_allclose(unknown.latents[hypothesis], straight.latents[0], atol=1e-4)
-        known = encoders.query(turned, sector * SECTOR, CameraHeight(CAMERA_M))
+        known = encoders.spheres.query(turned, sector * SECTOR, CameraHeight(CAMERA_M))
         np.testing.assert_allclose(known.latents[0], straight.latents[0], atol=1e-4)
         assert abs(known.frame_heading) < 1e-9
 
     @given(headings)
-    def test_roll_and_frame_heading_add_up_to_a_known_heading(self, encoders: Encoders, heading: float) -> None:
+    def test_roll_and_frame_heading_add_up_to_a_known_heading(
+        self, encoders: PhotographEncoder, heading: float
+    ) -> None:
         image = np.zeros((RING.image_height, RING.image_width, 3), np.uint8)
-        query = encoders.query(image, heading, CameraHeight(CAMERA_M))
+        query = encoders.spheres.query(image, heading, CameraHeight(CAMERA_M))
         assert query.heading_known
         assert abs(wrap_angle(query.roll[0] + query.frame_heading - heading)) < 1e-9
         assert abs(query.frame_heading) <= math.pi / RING.image_width + 1e-9
@@ -109,9 +111,11 @@ class TestPerfectEncoder:
     @given(headings)
     @settings(max_examples=30)
     def test_nearest_hypothesis_has_the_latent_of_the_layout(
-        self, perfect: Encoders, flat: FloorPlan, known: bool, heading: float
+        self, perfect: PhotographEncoder, flat: FloorPlan, known: bool, heading: float
     ) -> None:
-        query = perfect.query(photograph_of(flat, POSE, heading), heading if known else None, CameraHeight(CAMERA_M))
+        query = perfect.spheres.query(
+            photograph_of(flat, POSE, heading), heading if known else None, CameraHeight(CAMERA_M)
+        )
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
@@ -122,10 +126,18 @@ class TestPerfectEncoder:
     @given(heading=headings, share=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
     @settings(max_examples=30)
     def test_inexact_heading_is_searched_within_its_tolerance(
-        self, perfect: Encoders, optimiser: PoseRefiner, flat: FloorPlan, heading: float, share: float, tolerance: float
+        self,
+        perfect: PhotographEncoder,
+        optimiser: PoseRefiner,
+        flat: FloorPlan,
+        heading: float,
+        share: float,
+        tolerance: float,
     ) -> None:
         image = photograph_of(flat, POSE, heading)
-        query = perfect.query(image, heading + share * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
+        query = perfect.spheres.query(
+            image, heading + share * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance
+        )
         assert not query.heading_known
         turned = wrap_angle(query.roll + query.frame_heading - (heading + share * tolerance))
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
@@ -138,11 +150,19 @@ class TestPerfectEncoder:
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)
     def test_search_finds_the_pose_and_the_heading(
-        self, perfect: Encoders, optimiser: PoseRefiner, flat: FloorPlan, heading: float, known: bool, place: int
+        self,
+        perfect: PhotographEncoder,
+        optimiser: PoseRefiner,
+        flat: FloorPlan,
+        heading: float,
+        known: bool,
+        place: int,
     ) -> None:
         position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
         pose = PoseSet(position[None], flat.room_index_at(position[None]))
-        query = perfect.query(photograph_of(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M))
+        query = perfect.spheres.query(
+            photograph_of(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M)
+        )
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert best.room_index == pose.room_index[0]

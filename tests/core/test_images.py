@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from PIL import Image, ImageChops
 
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.file_segments import count_scans
-from lalaloc_core.photograph.spheres import NEUTRAL, PhotographLimits, open_sphere, read_sphere
+from lalaloc_core.photograph.spheres import NEUTRAL, PhotographLimits, read_sphere
 from tests.growth import assert_no_worse_than_linear
 
 HEIGHT, WIDTH = 32, 64
@@ -189,11 +190,13 @@ class TestAccepted:
     def test_location_metadata_do_not_reach_the_pixels(self) -> None:
         exif = Image.Exif()
         exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 1.0), 3: "E", 4: (11.0, 34.0, 2.0)})
-        found = open_sphere(encoded(picture(), "JPEG", exif=exif), height=HEIGHT, width=WIDTH)
-        assert {name: type(value) for name, value in vars(found).items()} == {
-            "pixels": np.ndarray,
-            "compass_heading": type(None),
-        }
+        stated = StatedCamera(projection="equirectangular")
+        plain, located = (
+            vars(open_photograph(encoded(picture(), "JPEG", **metadata), sphere_size=(HEIGHT, WIDTH), stated=stated))
+            for metadata in ({}, {"exif": exif})
+        )
+        np.testing.assert_array_equal(located.pop("sphere"), plain.pop("sphere"))
+        assert located == plain
 
     def test_scaling_averages_instead_of_picking(self) -> None:
         stripes = np.zeros((128, 256, 3), np.uint8)

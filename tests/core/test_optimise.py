@@ -18,7 +18,7 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.refine import LpoConfig, Problem, RefinementJob, RefinementResult, refine_walls
 from lalaloc_core.localise.refine.descent_methods import descend
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
-from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingConfig, RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import Scene, convex_polygons, l_shape, plan_of, present, room_polygons, scene_of, seeds

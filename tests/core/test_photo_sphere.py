@@ -16,9 +16,9 @@ from PIL.PngImagePlugin import PngInfo
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph import open_photograph
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
-from lalaloc_core.photograph.sphere_levelling import level
-from lalaloc_core.photograph.spheres import NEUTRAL, Sphere, open_sphere
+from lalaloc_core.photograph.spheres import NEUTRAL, level, read_sphere
 
 HEIGHT, WIDTH = 64, 128
 FULL_HEIGHT, FULL_WIDTH = 512, 1024
@@ -105,8 +105,8 @@ def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) 
     return buffer.getvalue()
 
 
-def opened(content: bytes) -> Sphere:
-    return open_sphere(content, height=HEIGHT, width=WIDTH)
+def opened(content: bytes) -> np.ndarray:
+    return read_sphere(content, height=HEIGHT, width=WIDTH)
 
 
 FULL = world(directions(FULL_HEIGHT, FULL_WIDTH))
@@ -124,7 +124,7 @@ class TestParts:
         self, kind: str, write: Callable[..., bytes], left: int, top: int, width: int, height: int
     ) -> None:
         packet = write(**crop(left, top, width, height))
-        pixels = opened(encoded(FULL[top : top + height, left : left + width], kind, packet)).pixels.astype(int)
+        pixels = opened(encoded(FULL[top : top + height, left : left + width], kind, packet)).astype(int)
         scale = FULL_WIDTH // WIDTH
         inner = (
             slice(-(-top // scale) + 1, (top + height) // scale - 1),
@@ -139,12 +139,12 @@ class TestParts:
     def test_scaled_part_keeps_its_place(self) -> None:
         packet = xmp(**crop(128, 64, 640, 320))
         small = np.asarray(Image.fromarray(FULL[64:384, 128:768]).resize((320, 160), Image.Resampling.BOX))
-        pixels = opened(encoded(small, "PNG", packet)).pixels.astype(int)
+        pixels = opened(encoded(small, "PNG", packet)).astype(int)
         np.testing.assert_allclose(pixels[10:46, 18:94], LEVEL[10:46, 18:94], atol=5)
 
     def test_explicit_full_sphere_changes_nothing(self) -> None:
-        explicit = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512)))).pixels
-        np.testing.assert_array_equal(explicit, opened(encoded(FULL)).pixels)
+        explicit = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512))))
+        np.testing.assert_array_equal(explicit, opened(encoded(FULL)))
 
     @pytest.mark.parametrize(
         ("changes", "reason"),
@@ -162,7 +162,7 @@ class TestParts:
     def test_contradictory_part_is_refused(self, changes: dict[str, object], reason: str) -> None:
         packet = xmp(**(crop(128, 64, 640, 320) | changes))
         np.testing.assert_array_equal(
-            opened(encoded(FULL[:320, :640], "PNG", packet)).pixels, opened(encoded(FULL[:320, :640])).pixels
+            opened(encoded(FULL[:320, :640], "PNG", packet)), opened(encoded(FULL[:320, :640]))
         )
         flat = encoded(FULL[:256, :640], "PNG", xmp(**(crop(128, 64, 640, 256) | changes)))
         with pytest.raises(InvalidPhotographError, match=f"640 x 256; .* twice as wide as high, .*: .*{reason}"):
@@ -189,7 +189,7 @@ class TestLevelling:
     def test_tilted_camera_is_levelled(self, pitch_deg: float, roll_deg: float) -> None:
         packet = xmp(PosePitchDegrees=pitch_deg, PoseRollDegrees=roll_deg)
         content = encoded(tilted(FULL_HEIGHT, FULL_WIDTH, pitch_deg, roll_deg), "PNG", packet)
-        np.testing.assert_allclose(opened(content).pixels.astype(int), LEVEL, atol=5)
+        np.testing.assert_allclose(opened(content).astype(int), LEVEL, atol=5)
 
     @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(30, 0), (0, 20)])
     def test_pitch_and_roll_signs_follow_the_specification(self, pitch_deg: float, roll_deg: float) -> None:
@@ -224,15 +224,16 @@ class TestLevelling:
     def test_tilted_part_is_placed_first(self) -> None:
         whole = tilted(FULL_HEIGHT, FULL_WIDTH, 10, 5)
         packet = xmp(**crop(0, 64, 1024, 384, PosePitchDegrees=10, PoseRollDegrees=5))
-        pixels = opened(encoded(whole[64:448], "PNG", packet)).pixels.astype(int)
+        pixels = opened(encoded(whole[64:448], "PNG", packet)).astype(int)
         np.testing.assert_allclose(pixels[20:44], LEVEL[20:44], atol=5)
 
 
 class TestMetadata:
     def test_compass_heading_is_returned(self) -> None:
-        heading = opened(encoded(FULL, "JPEG", xmp(PoseHeadingDegrees=123.5))).compass_heading
+        content = encoded(FULL, "JPEG", xmp(PoseHeadingDegrees=123.5))
+        heading = open_photograph(content, sphere_size=(HEIGHT, WIDTH)).compass_heading
         assert heading == pytest.approx(math.radians(123.5))
-        assert opened(encoded(FULL)).compass_heading is None
+        assert open_photograph(encoded(FULL), sphere_size=(HEIGHT, WIDTH)).compass_heading is None
 
     def test_initial_view_is_ignored(self) -> None:
         packet = xmp(InitialViewHeadingDegrees=90, InitialViewPitchDegrees=20, InitialViewRollDegrees=20)
@@ -263,7 +264,7 @@ class TestMetadata:
     )
     def test_unreadable_packet_is_ignored(self, packet: bytes) -> None:
         assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
-        np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)).pixels, opened(encoded(FULL)).pixels)
+        np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)), opened(encoded(FULL)))
 
     def test_entity_bomb_is_harmless(self) -> None:
         levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))

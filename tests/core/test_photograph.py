@@ -13,14 +13,14 @@ import pytest
 from PIL import ExifTags, Image
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.nets.layout_encoder import RingConfig
-from lalaloc_core.nets.view_encoder import ViewEncoderConfig
+from lalaloc_core.nets.layout_network import RingConfig
+from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.patches import UNSEEN, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
-from lalaloc_core.photograph.sphere_levelling import level
+from lalaloc_core.photograph.spheres import level
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 
 Tag = ExifTags.Base
@@ -53,7 +53,7 @@ class TestProjection:
         assert (view.projection, view.projection_source, view.hfov.source) == ("perspective", "exif", "exif")
         assert math.degrees(view.hfov.value) == pytest.approx(67.3, abs=0.1)
         assert 0.0 < math.degrees(view.hfov.sd) < 3.0
-        assert view.panorama is None
+        assert view.sphere is None
 
     def test_orientation_is_applied_before_the_lens(self) -> None:
         upright = take(sphere("living_room"), Perspective.of_hfov(480, 640, math.radians(53.1)))
@@ -68,8 +68,8 @@ class TestProjection:
     def test_sphere_without_metadata_is_recognised(self, name: str) -> None:
         view = opened((EXAMPLES / f"{name}.jpg").read_bytes())
         assert (view.projection, view.projection_source) == ("equirectangular", "estimated")
-        assert view.panorama is not None
-        assert view.panorama.pixels.shape == (128, 256, 3)
+        assert view.sphere is not None
+        assert view.sphere.shape == (128, 256, 3)
         assert view.patches == ()
 
     @pytest.mark.parametrize("name", ["bedroom", "kitchen", "living_room", "study"])
@@ -96,7 +96,7 @@ class TestProjection:
         content = (EXAMPLES / "kitchen.jpg").read_bytes()
         assert opened(content, projection="cylindrical", hfov_deg=180.0).projection == "cylindrical"
         white = jpeg(np.full((256, 512, 3), 255, np.uint8))
-        assert opened(white, projection="equirectangular").panorama is not None
+        assert opened(white, projection="equirectangular").sphere is not None
 
     def test_gpano_metadata_decide(self) -> None:
         panorama = sphere("kitchen")
@@ -235,11 +235,11 @@ class TestTilt:
         tilted = sphere("kitchen")
         content = jpeg(tilted)
         view = opened(content, projection="equirectangular", pitch_deg=10.0, roll_deg=0.0)
-        assert view.panorama is not None
+        assert view.sphere is not None
         expected = cv2.resize(
             level(tilted, pitch=math.radians(10.0), roll=0.0), (256, 128), interpolation=cv2.INTER_AREA
         )
-        assert np.abs(view.panorama.pixels.astype(int) - expected).mean() < 4.0
+        assert np.abs(view.sphere.astype(int) - expected).mean() < 4.0
 
 
 def patch_error(view: Photograph, name: str, heading_deg: float = 0.0) -> float:

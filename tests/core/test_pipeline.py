@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import HEADING_SEPARATION, photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet, random_poses
 from tests.core.questions import perfect_query
 from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
@@ -38,16 +38,16 @@ def flat() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def search(flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner) -> Search:
+def search(flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Search:
     return partial(localise, flat, grid, encoders, refiner=optimiser.refine)
 
 
 @pytest.fixture(scope="module")
-def grid(flat: FloorPlan, encoders: Encoders) -> PoseGrid:
+def grid(flat: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
     return build_grid(flat, encoders, step_m=0.5, camera_height_m=CAMERA_M)
 
 
-def layout_query(encoders: Encoders, plan: FloorPlan, pose: PoseSet, *, by_profile: bool = False) -> Query:
+def layout_query(encoders: PhotographEncoder, plan: FloorPlan, pose: PoseSet, *, by_profile: bool = False) -> Query:
     log_scale = -5.0 if by_profile else None
     return perfect_query(encoders, plan, pose.position_m[0], log_scale=log_scale, height=EXACT)
 
@@ -63,7 +63,7 @@ def error_m(found: Localisation, pose: PoseSet) -> float:
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
     def test_each_stage_is_more_accurate(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, by_profile: bool
+        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
         for seed in range(20):
@@ -76,7 +76,9 @@ class TestAccuracy:
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8
 
-    def test_each_stage_lowers_the_latent_distance(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
+    def test_each_stage_lowers_the_latent_distance(
+        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
+    ) -> None:
         for seed in range(10):
             query = layout_query(encoders, flat, random_pose(flat, seed))
             best = [search(query, refine=stage).candidates[0] for stage in ("lpo", "vdr", "none")]
@@ -92,7 +94,7 @@ class TestCandidates:
     def test_candidates_are_ranked_distinct_and_inside_rooms(
         self,
         flat: FloorPlan,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         search: Search,
         seed: int,
         top_k: int,
@@ -100,7 +102,7 @@ class TestCandidates:
         refine: Refine,
     ) -> None:
         image = np.random.default_rng(seed).integers(0, 256, (32, 64, 3), dtype=np.uint8)
-        query = encoders.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
+        query = encoders.spheres.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
         found = search(query, refine=refine, top_k=top_k)
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
@@ -117,13 +119,13 @@ class TestCandidates:
         for candidate in found.candidates:
             assert -math.pi <= photograph_heading(query, candidate) <= math.pi
 
-    def test_small_plan_has_fewer_candidates(self, encoders: Encoders) -> None:
+    def test_small_plan_has_fewer_candidates(self, encoders: PhotographEncoder) -> None:
         plan = plan_of(rectangle(1.2, 1.2))
         grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
         query = layout_query(encoders, plan, PoseSet(np.array([[0.5, 0.6]]), np.array([0])))
         assert len(localise(plan, grid, encoders, query, refine="vdr", top_k=5).candidates) == 1
 
-    def test_localisation_is_deterministic(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
+    def test_localisation_is_deterministic(self, flat: FloorPlan, encoders: PhotographEncoder, search: Search) -> None:
         query = layout_query(encoders, flat, random_pose(flat, 1))
         first, second = (search(query).candidates for _ in range(2))
         assert first == second
@@ -138,7 +140,7 @@ class TestCandidates:
 
 class TestStages:
     @pytest.fixture
-    def query(self, flat: FloorPlan, encoders: Encoders) -> Query:
+    def query(self, flat: FloorPlan, encoders: PhotographEncoder) -> Query:
         return layout_query(encoders, flat, random_pose(flat, 3))
 
     def test_localisation_names_its_stage(self, search: Search, query: Query) -> None:
@@ -178,7 +180,9 @@ class TestStages:
         assert few.signals == many.signals
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
-    def test_profile_query_runs_vdr_only_if_needed(self, flat: FloorPlan, encoders: Encoders, search: Search) -> None:
+    def test_profile_query_runs_vdr_only_if_needed(
+        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
+    ) -> None:
         query = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
         every = LocaliseConfig(every_stage=True)
         short = search(query)
@@ -194,12 +198,12 @@ class TestStages:
         assert short.signals["lpo"] == complete.signals["lpo"]
 
     def test_refiner_gets_each_candidates_room_and_target(
-        self, flat: FloorPlan, encoders: Encoders, search: Search
+        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
     ) -> None:
         jobs: list[RefinementJob] = []
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         for heading in (None, 0.5):
-            query = encoders.query(image, heading, CameraHeight(CAMERA_M))
+            query = encoders.spheres.query(image, heading, CameraHeight(CAMERA_M))
             assert query.profile is not None
             search(query, refiner=lambda job: jobs.append(job))
             expected = search(query, refine="none").candidates
@@ -217,7 +221,7 @@ class TestStages:
                 assert job.camera_height_m[index] == CAMERA_M
 
     def test_number_of_refined_candidates_is_configured(
-        self, flat: FloorPlan, encoders: Encoders, search: Search, query: Query
+        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, query: Query
     ) -> None:
         sizes: list[int] = []
 
@@ -242,7 +246,7 @@ class TestStages:
         assert np.linalg.norm(places[1:] - places[0], axis=1).min(initial=9.0) >= 1.0
 
     def test_posterior_pairs_each_refined_candidate_with_its_mode(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, search: Search
+        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, search: Search
     ) -> None:
         def unmoved(job: RefinementJob) -> RefinementResult:
             return refinement_result(job, position_m=job.position_m, cost=np.linspace(0.1, 0.2, len(job.position_m)))
@@ -264,7 +268,7 @@ class TestStages:
 
 class TestGrid:
     def test_grid_has_latents_and_profiles_at_heading_zero(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
+        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
     ) -> None:
         assert len(present(grid.latents)) == len(grid.poses)
         index = np.array([0, 5, len(grid.poses) - 1])
@@ -273,7 +277,9 @@ class TestGrid:
         np.testing.assert_allclose(latents, present(grid.latents)[index], atol=1e-5)
         np.testing.assert_array_equal(profile_m, grid.profile_m[index])
 
-    def test_grid_depends_on_the_camera_height(self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
+    def test_grid_depends_on_the_camera_height(
+        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
+    ) -> None:
         higher = build_grid(flat, encoders, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
         assert np.abs(present(higher.latents) - grid.latents).max() > 1e-3
@@ -305,7 +311,7 @@ def copied(polygons: list[Any], count: int) -> FloorPlan:
 
 
 def localised(
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     optimiser: PoseRefiner,
     plan: FloorPlan,
     place_m: tuple[float, float],
@@ -328,7 +334,7 @@ def localised(
 class TestShares:
     @pytest.mark.parametrize("place_m", [(1.37, 1.12), (5.1, 1.3)])
     def test_copies_of_a_flat_share_the_probability(
-        self, encoders: Encoders, optimiser: PoseRefiner, count: int, known: bool, place_m: tuple[float, float]
+        self, encoders: PhotographEncoder, optimiser: PoseRefiner, count: int, known: bool, place_m: tuple[float, float]
     ) -> None:
         plan = copied([room.polygon_m for room in crooked_flat().rooms], count)
         found = localised(encoders, optimiser, plan, place_m, known=known)
@@ -337,7 +343,7 @@ class TestShares:
 
     @pytest.mark.parametrize("width_m", [0.9, 1.15, 1.6, 2.9])
     def test_equal_offices_share_the_probability(
-        self, encoders: Encoders, optimiser: PoseRefiner, count: int, known: bool, width_m: float
+        self, encoders: PhotographEncoder, optimiser: PoseRefiner, count: int, known: bool, width_m: float
     ) -> None:
         plan = copied([np.array(rectangle(width_m, 4.1))], count)
         found = localised(encoders, optimiser, plan, (0.4 * width_m, 1.3), known=known)
@@ -350,7 +356,7 @@ class TestHeadings:
     @pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-5])
     def test_symmetric_room_is_split_between_its_headings(
         self,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         optimiser: PoseRefiner,
         depth_m: float,
         ways: int,
@@ -370,7 +376,7 @@ class TestHeadings:
         assert found.posterior.position == pytest.approx(1.0 if middle else 1.0 / ways, abs=1e-3)
 
     def test_first_of_equal_places_does_not_depend_on_rounding(
-        self, encoders: Encoders, optimiser: PoseRefiner
+        self, encoders: PhotographEncoder, optimiser: PoseRefiner
     ) -> None:
         plan = plan_of(rectangle(3.2, 3.2))
         first = localised(encoders, optimiser, plan, (0.9, 1.1), known=False).candidates[0]
@@ -380,7 +386,7 @@ class TestHeadings:
             assert noisy.hypothesis == first.hypothesis
 
 
-def test_corridor_is_determined_across_but_not_along(encoders: Encoders, optimiser: PoseRefiner) -> None:
+def test_corridor_is_determined_across_but_not_along(encoders: PhotographEncoder, optimiser: PoseRefiner) -> None:
     # The ends are visible at a few azimuths only.
     plan = plan_of(rectangle(60.0, 1.8))
     position = np.array([[30.0, 0.8]])

@@ -28,7 +28,8 @@ from lalaloc_core.localise.belief import (
     signals_of,
     weighted_places,
 )
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import (
     NO_HINTS,
@@ -42,7 +43,7 @@ from lalaloc_core.localise.query import (
 )
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, Refine, localise
-from lalaloc_core.localise.search.retrieval import build_grid, grid_costs
+from lalaloc_core.localise.search.retrieval import grid_costs
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.questions import perfect_query
 from tests.strategies import plan_of, present, rectangle, seeds
@@ -286,9 +287,9 @@ STANDS_M = (1.3, 0.9)
 
 
 @pytest.fixture(scope="module")
-def encoders(opened_bundle: Bundle) -> Encoders:
-    """Encoders with the temperature of the shipped model."""
-    encoders = Encoders(opened_bundle, threads=1)
+def encoders(opened_bundle: Bundle) -> PhotographEncoder:
+    """PhotographEncoder with the temperature of the shipped model."""
+    encoders = PhotographEncoder(opened_bundle, threads=1)
     encoders.manifest = replace(encoders.manifest, evidence=replace(encoders.manifest.evidence, temperature=44.0))
     return encoders
 
@@ -301,18 +302,18 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
+def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
     return build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 @pytest.fixture(scope="module")
-def query(plan: FloorPlan, encoders: Encoders) -> Query:
+def query(plan: FloorPlan, encoders: PhotographEncoder) -> Query:
     return perfect_query(encoders, plan, STANDS_M)
 
 
 class TestLocalisation:
     @pytest.fixture
-    def ask(self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner) -> Ask:
+    def ask(self, plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Ask:
         def localised(query: Query, hints: Hints = NO_HINTS, refine: Refine = "lpo") -> Localisation:
             return localise(plan, grid, encoders, query, refine=refine, refiner=optimiser.refine, hints=hints)
 
@@ -332,7 +333,7 @@ class TestLocalisation:
 
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])
     def test_wrong_hint_does_not_override_a_clear_match(
-        self, ask: Ask, plan: FloorPlan, encoders: Encoders, refine: Refine
+        self, ask: Ask, plan: FloorPlan, encoders: PhotographEncoder, refine: Refine
     ) -> None:
         query = perfect_query(encoders, plan, (2.1, 5.7))
         for hints, missed in (
@@ -353,7 +354,7 @@ class TestLocalisation:
 
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])
     def test_strict_hints_restrict_and_report_contradictions(
-        self, ask: Ask, plan: FloorPlan, encoders: Encoders, refine: Refine
+        self, ask: Ask, plan: FloorPlan, encoders: PhotographEncoder, refine: Refine
     ) -> None:
         query = perfect_query(encoders, plan, (2.1, 5.7))
         near = Near(11.0, 1.0, 0.8)
@@ -378,7 +379,7 @@ class TestLocalisation:
 
 
 def test_allowed_poses_of_a_large_grid_are_compared(
-    plan: FloorPlan, grid: PoseGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
+    plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lalaloc_core.localise.search.retrieval._ALL_COMPARED", 0)
     monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 8)

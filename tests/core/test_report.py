@@ -28,10 +28,7 @@ from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_panor
 from lalaloc_core.evaluate.report.reading import TOTAL, stage_times
 from lalaloc_core.evaluate.report.tables import distance, number
 from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
-from lalaloc_core.evaluate.runs.predictions import (
-    Prediction,
-    RunFolder,
-)
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.render.depth import layout_depth

@@ -17,7 +17,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.localise.belief import suppress
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import (
     LowestCosts,
     MatchingConfig,
@@ -62,7 +62,7 @@ def unknown_heading_query(latents: np.ndarray) -> Query:
     return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, False, EXACT)
 
 
-class PlaceEncoders(Encoders):
+class PlaceEncoders(PhotographEncoder):
     """Fake encoders: the latent of a pose is a direction that depends smoothly on its position."""
 
     def __init__(self) -> None:

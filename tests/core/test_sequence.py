@@ -21,16 +21,21 @@ from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, spli
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
 from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.search.retrieval import build_grid
-from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
-from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
-from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, SequenceRefiner, linked, localise_sequence
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
+from lalaloc_core.localise.sequence.chain_inference import best_paths, forward_backward
+from lalaloc_core.localise.sequence.joint_refinement import motion_residuals, refine_sequence
+from lalaloc_core.localise.sequence.measured_motion import FLOOR, Motion, States, Transition, transition
+from lalaloc_core.localise.sequence.sequence_search import (
+    SequenceLocalisation,
+    SequenceRefiner,
+    linked,
+    localise_sequence,
+)
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, present, rectangle
 
@@ -216,11 +221,11 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
+def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
     return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
-def queries_along(encoders: Encoders, plan: FloorPlan, walk: Walk, height: CameraHeight) -> list[Query]:
+def queries_along(encoders: PhotographEncoder, plan: FloorPlan, walk: Walk, height: CameraHeight) -> list[Query]:
     """Return the queries of a perfect image encoder along a walk, headings unknown."""
     queries = []
     for place, room, heading in walk:
@@ -247,12 +252,12 @@ def motions_along(walk: Walk, *, directed: bool = False) -> list[Motion]:
 
 
 @pytest.fixture(scope="module")
-def search(plan: FloorPlan, grid: PoseGrid, encoders: Encoders) -> Search:
+def search(plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder) -> Search:
     return partial(localise_sequence, plan, grid, encoders)
 
 
 @pytest.fixture(scope="module")
-def walk_queries(plan: FloorPlan, encoders: Encoders) -> list[Query]:
+def walk_queries(plan: FloorPlan, encoders: PhotographEncoder) -> list[Query]:
     return queries_along(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
 
 
@@ -285,7 +290,7 @@ class TestSearch:
         assert refiner is None or found.path_probability > 0.98
 
     def test_photographs_without_motions_are_independent(
-        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, search: Search, walk_queries: list[Query]
+        self, plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, search: Search, walk_queries: list[Query]
     ) -> None:
         together = search(walk_queries, [Motion()] * 2)
         for query, picture in zip(walk_queries, together.pictures, strict=True):
@@ -294,7 +299,7 @@ class TestSearch:
             assert picture.candidates[0].cost == pytest.approx(alone.candidates[0].cost, abs=1e-5)
 
     def test_turn_is_judged_by_all_its_photographs_together(
-        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, search: Search
+        self, plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, search: Search
     ) -> None:
         spot: Walk = [((1.6, 7.0), 2, 0.3), ((1.6, 7.0), 2, 1.5)]
         queries = queries_along(encoders, plan, spot, CameraHeight(CAMERA_M, 0.0))
@@ -320,7 +325,7 @@ class TestSearch:
         for (place, _, _), picture in zip(WALK, found.pictures, strict=True):
             assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
 
-    def test_shared_camera_height_is_found(self, plan: FloorPlan, encoders: Encoders, search: Search) -> None:
+    def test_shared_camera_height_is_found(self, plan: FloorPlan, encoders: PhotographEncoder, search: Search) -> None:
         stated = CameraHeight(CAMERA_M, math.inf)
         # Distances that are predicted 12 % too small mean a camera 12 % higher.
         queries = [query.scaled(-math.log(1.12)) for query in queries_along(encoders, plan, WALK, stated)]
@@ -331,7 +336,9 @@ class TestSearch:
         for (place, _, _), picture in zip(WALK, found.pictures, strict=True):
             assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
 
-    def test_heights_differ_between_photographs(self, plan: FloorPlan, encoders: Encoders, search: Search) -> None:
+    def test_heights_differ_between_photographs(
+        self, plan: FloorPlan, encoders: PhotographEncoder, search: Search
+    ) -> None:
         factors = np.linspace(0.95, 1.05, len(WALK))
         queries = [
             query.scaled(-math.log(factor))
@@ -346,7 +353,7 @@ class TestSearch:
     def test_number_of_places_is_limited(
         self, search: Search, walk_queries: list[Query], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("lalaloc_core.localise.sequence.search._MAX_PLACES", 60)
+        monkeypatch.setattr("lalaloc_core.localise.sequence.sequence_search._MAX_PLACES", 60)
         found = search(walk_queries, motions_along(WALK), refiner=refine_sequence)
         assert [picture.candidates[0].room_index for picture in found.pictures] == [1, 2, 2]
 
@@ -377,7 +384,7 @@ class TestConfidence:
     @pytest.mark.parametrize("index", HOMES)
     @pytest.mark.parametrize("heights", ["each", "one"])
     def test_sequence_is_as_sure_as_its_photographs(self, shipped: Bundle, index: int, heights: str) -> None:
-        encoders, refiner = Encoders(shipped, threads=1), local_refiner(shipped)
+        encoders, refiner = PhotographEncoder(shipped, threads=1), local_refiner(shipped)
         home, rng = home_of(VALIDATION, 0, index)
         shots = [
             replace(shot, camera_height_m=height_m)
@@ -387,7 +394,7 @@ class TestConfidence:
         renderers = split_renderer_cache(VALIDATION, 0, None)
         size = shipped.manifest.image_height, shipped.manifest.image_width
         queries = [
-            encoders.query(
+            encoders.spheres.query(
                 RenderedPhotograph(shot, renderers).image(*size),
                 None,
                 stated.at(shot.camera_height_m) if heights == "each" else stated,

@@ -17,17 +17,17 @@ import pytest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError, InvalidStateError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import run_steps
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.localise.tracking import Odometry, TrackState
-from lalaloc_core.localise.tracking.filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.ground import Ground
-from lalaloc_core.localise.tracking.motion import States, WalkGraph, moved
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
-from lalaloc_core.localise.tracking.state import MAX_STATES, StatePlan
+from lalaloc_core.localise.tracking.track_state import MAX_STATES, StatePlan
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.walk_motion import States, WalkGraph, moved
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
 from tests.strategies import l_shape, plan_of, present, rectangle
@@ -56,7 +56,7 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
+def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
     return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
@@ -66,12 +66,12 @@ def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
 
 
 @pytest.fixture(scope="module")
-def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> Ground:
-    return Ground.of_plan(plan, grid, graph)
+def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> TrackedPlans:
+    return TrackedPlans.of_plan(plan, grid, graph)
 
 
 @pytest.fixture(scope="module")
-def queries(encoders: Encoders, plan: FloorPlan) -> list[Query]:
+def queries(encoders: PhotographEncoder, plan: FloorPlan) -> list[Query]:
     return queries_along(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
 
 
@@ -148,7 +148,9 @@ class TestMotion:
             Odometry.of_stds(1.0, 0.0, 0.0, (0.1, -1.0, 0.1))
 
 
-def follow(ground: Ground, encoders: Encoders, queries: list[Query], moves: list[Odometry | None]) -> list[Tracked]:
+def follow(
+    ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query], moves: list[Odometry | None]
+) -> list[Tracked]:
     """Follow a walk, with the state in bytes between photographs."""
     state, found = TrackState.first(len(queries[0].roll)), []
     for query, move in zip(queries, moves, strict=True):
@@ -158,7 +160,9 @@ def follow(ground: Ground, encoders: Encoders, queries: list[Query], moves: list
 
 
 class TestFilter:
-    def test_walk_is_followed_through_a_door(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+    def test_walk_is_followed_through_a_door(
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
+    ) -> None:
         found = follow(ground, encoders, queries, odometry_along(WALK))
         for (place, room, heading), answer in list(zip(WALK, found, strict=True))[1:]:
             assert answer.pose.room_index == room
@@ -169,7 +173,7 @@ class TestFilter:
         assert np.linalg.eigvalsh(last.pose.covariance).min() > 0.0
 
     def test_camera_carried_elsewhere_is_found_again(
-        self, ground: Ground, encoders: Encoders, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         still = Odometry.of_stds(0.0, 0.0, 0.0, EXACT)
         carried = [*queries[:3], *queries[5:], *queries[5:], *queries[5:]]
@@ -179,8 +183,8 @@ class TestFilter:
     @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
     def test_known_heading_is_right_within_its_tolerance(
         self,
-        ground: Ground,
-        encoders: Encoders,
+        ground: TrackedPlans,
+        encoders: PhotographEncoder,
         queries: list[Query],
         off_deg: float,
         right: bool,
@@ -195,20 +199,22 @@ class TestFilter:
         # As probable as with the exact heading; far less probable beyond the tolerance.
         assert (beliefs[1] > 0.5 * beliefs[0]) == right
 
-    def test_other_grid_is_refused(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+    def test_other_grid_is_refused(
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
+    ) -> None:
         other = (StatePlan("", len(ground.grid.poses) + 1),)
         state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
             run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
 
 
-def building(encoders: Encoders, plans: Sequence[FloorPlan]) -> Ground:
+def building(encoders: PhotographEncoder, plans: Sequence[FloorPlan]) -> TrackedPlans:
     """Return the ground of a building with one plan per level."""
     grids = [build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
     graphs = [WalkGraph.of(grid.poses, grid.layouts(plan), STEP_M) for plan, grid in zip(plans, grids, strict=True)]
     entries = [PlanOnLevel(plan, float(level)) for level, plan in enumerate(plans)]
     levels, keys = [entry.level for entry in entries], [f"plan {level}" for level in range(len(plans))]
-    return Ground.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
+    return TrackedPlans.of_levels(MergedPlans.of(plans, grids, CAMERA_M), entries, graphs, keys, levels)
 
 
 def level_of(*polygons: list[list[float]], stairs: str | None) -> FloorPlan:
@@ -231,7 +237,7 @@ CLIMB: list[tuple[int, Walk]] = [
 
 class TestLevels:
     @pytest.mark.parametrize("stairs", ["stairs", "Lift 2", None])
-    def test_camera_is_followed_to_another_level(self, encoders: Encoders, stairs: str | None) -> None:
+    def test_camera_is_followed_to_another_level(self, encoders: PhotographEncoder, stairs: str | None) -> None:
         plans = [level_of(LOWER, STAIRS, stairs=stairs), level_of(UPPER, STAIRS, stairs=stairs)]
         height = CameraHeight(CAMERA_M, 0.0)
         queries = [query for level, walk in CLIMB for query in queries_along(encoders, plans[level], walk, height)]
@@ -249,7 +255,7 @@ class TestLevels:
         kept = found[-1].state
         assert max(kept.by_plan, key=kept.by_plan.__getitem__) == "plan 1"
 
-    def test_stairs_are_taken_rather_than_walls(self, encoders: Encoders) -> None:
+    def test_stairs_are_taken_rather_than_walls(self, encoders: PhotographEncoder) -> None:
         ground = building(
             encoders, [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
         )
@@ -262,7 +268,7 @@ class TestLevels:
         assert arrived[0] == 0.0
         assert arrived[1] == pytest.approx(0.1, abs=0.02)
 
-    def test_levels_without_stairs_are_joined_everywhere(self, encoders: Encoders) -> None:
+    def test_levels_without_stairs_are_joined_everywhere(self, encoders: PhotographEncoder) -> None:
         ground = building(encoders, [level_of(LOWER, STAIRS, stairs=name) for name in (None, None, "stairs")])
         start = at(ground.grid, tuple(np.add((1.0, 1.0), ground.shift_m[0])), 0.0)
         belief = ground.moved(start, SECTORS, None)
@@ -270,7 +276,7 @@ class TestLevels:
         assert arrived[1] == pytest.approx(0.01)
         assert arrived[2] == 0.0
 
-    def test_right_plan_of_similar_ones_is_found(self, encoders: Encoders) -> None:
+    def test_right_plan_of_similar_ones_is_found(self, encoders: PhotographEncoder) -> None:
         # The plans differ in their second rooms alone.
         others = [rectangle(2.0, depth, corner=(4.2, 0.0)) for depth in (2.4, 3.6, 4.8)]
         plans = [level_of(LOWER, other, stairs=None) for other in others]
@@ -282,7 +288,7 @@ class TestLevels:
         assert [answer.pose.plan for answer in found[2:]] == [1, 1]
         assert found[-1].pose.probability > 0.6
 
-    def test_belief_keeps_its_plans_when_the_ground_changes(self, encoders: Encoders) -> None:
+    def test_belief_keeps_its_plans_when_the_ground_changes(self, encoders: PhotographEncoder) -> None:
         plans = [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
         query = queries_along(encoders, plans[1], CLIMB[1][1][2:3], CameraHeight(CAMERA_M, 0.0))
         ground = building(encoders, plans)
@@ -292,13 +298,13 @@ class TestLevels:
         again = turned.left(turned.entered(state))
         assert again.by_plan == pytest.approx(state.by_plan)
         assert present(again.pose).position_m == pytest.approx(present(state.pose).position_m)
-        alone = replace(Ground.of_plan(plans[0], ground.grid), keys=("another",))
+        alone = replace(TrackedPlans.of_plan(plans[0], ground.grid), keys=("another",))
         assert alone.entered(state).pose is None
         assert not len(alone.entered(state).belief.pose)
 
 
 class TestState:
-    def test_size_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+    def test_size_does_not_grow(self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]) -> None:
         state = follow(ground, encoders, queries[:1], [None])[0].state
         many = np.random.default_rng(0).integers(0, 100, 4096)
         full = replace(state, belief=States(many, many % state.sectors, np.full(4096, 1 / 4096)))
@@ -324,7 +330,9 @@ class TestState:
             assert np.angle(heading) == pytest.approx(math.pi / 2)
 
     @pytest.mark.slow
-    def test_long_session_does_not_grow(self, ground: Ground, encoders: Encoders, queries: list[Query]) -> None:
+    def test_long_session_does_not_grow(
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
+    ) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(260)]
         walk = [WALK[index] for index in order]
@@ -340,7 +348,7 @@ class TestState:
 
     @pytest.mark.slow
     def test_session_of_10_000_photographs_does_not_grow(
-        self, ground: Ground, encoders: Encoders, queries: list[Query]
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query]
     ) -> None:
         there = [*range(len(WALK)), *range(len(WALK) - 2, 0, -1)]
         order = [there[index % len(there)] for index in range(10_000)]

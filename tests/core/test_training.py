@@ -40,9 +40,9 @@ from lalaloc_core.learn.training.rotation import sample_rotation
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder
-from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.image_features import ImageFeatures, WallModes
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.render.sweep import profiles_at
@@ -70,7 +70,7 @@ def layout_stage(config: TrainConfig = TINY) -> LayoutStage:
     return LayoutStage(config, GeneratedSource(config))
 
 
-def image_stage(config: TrainConfig, teacher: LayoutEncoder) -> ImageStage:
+def image_stage(config: TrainConfig, teacher: LayoutNetwork) -> ImageStage:
     return ImageStage(config, GeneratedSource(config), teacher)
 
 

@@ -20,9 +20,9 @@ from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.learn.export.bundle_export import export_bundle
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, rolled
-from lalaloc_core.nets.image_encoder import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
+from lalaloc_core.nets.sphere_network import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
 from lalaloc_core.nets.trunk import (
     PRETRAINED_PACKAGE,
     TAP_STRIDES,
@@ -296,8 +296,8 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 
 
 @pytest.fixture(scope="module")
-def service(bundle: Bundle) -> Encoders:
-    return Encoders(bundle, threads=1)
+def service(bundle: Bundle) -> PhotographEncoder:
+    return PhotographEncoder(bundle, threads=1)
 
 
 def panorama() -> np.ndarray:
@@ -325,8 +325,8 @@ class TestBundle:
         np.testing.assert_allclose(manifest.opening_prior, np.array([0.8, 0.4, 0.4, 0.2]) / 1.8, rtol=1e-5)
         assert sum(manifest.room_type_prior) == pytest.approx(1.0)
 
-    def test_query_has_openings_ceiling_and_room_type(self, service: Encoders) -> None:
-        query = service.query(panorama(), None, CameraHeight(1.5))
+    def test_query_has_openings_ceiling_and_room_type(self, service: PhotographEncoder) -> None:
+        query = service.spheres.query(panorama(), None, CameraHeight(1.5))
         shape = (TINY.ring.sectors, TINY.profile_columns, len(OPENING_CLASSES))
         assert present(query.openings).log_probability.shape == shape
         np.testing.assert_allclose(np.exp(present(query.openings).log_probability).sum(axis=2), 1.0, rtol=1e-5)
@@ -334,16 +334,18 @@ class TestBundle:
         assert np.exp(present(query.room_type).log_probability).sum() == pytest.approx(1.0, rel=1e-5)
         assert np.isfinite([present(query.ceiling).log_m, present(query.ceiling).log_scale]).all()
 
-    def test_openings_rotate_with_the_hypotheses(self, service: Encoders) -> None:
-        query = service.query(panorama(), None, CameraHeight(1.5))
+    def test_openings_rotate_with_the_hypotheses(self, service: PhotographEncoder) -> None:
+        query = service.spheres.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
         shifts = np.arange(TINY.ring.sectors) * (TINY.profile_columns // TINY.ring.sectors)
         np.testing.assert_array_equal(present(query.profile).log_m, rolled(present(query.profile).log_m[0], shifts))
         np.testing.assert_array_equal(query.openings.log_probability, rolled(query.openings.log_probability[0], shifts))
         assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
 
-    def test_mirrored_panorama_gives_mirrored_predictions(self, service: Encoders) -> None:
-        plain, mirrored = (service.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1]))
+    def test_mirrored_panorama_gives_mirrored_predictions(self, service: PhotographEncoder) -> None:
+        plain, mirrored = (
+            service.spheres.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1])
+        )
         for found, expected in (
             (present(mirrored.profile).log_m, present(plain.profile).log_m[:, ::-1]),
             (present(mirrored.openings).log_probability, present(plain.openings).log_probability[:, ::-1]),
@@ -367,13 +369,13 @@ class TestBundle:
         raw = json.loads((tmp_path / MANIFEST_NAME).read_text())
         (tmp_path / MANIFEST_NAME).write_text(json.dumps({**raw, key: value}))
         with pytest.raises(BundleError, match=message):
-            Encoders(Bundle.open(tmp_path), threads=1)
+            PhotographEncoder(Bundle.open(tmp_path), threads=1)
 
 
 class TestOlderModels:
-    def test_model_without_structure_predicts_walls_only(self, encoders: Encoders) -> None:
+    def test_model_without_structure_predicts_walls_only(self, encoders: PhotographEncoder) -> None:
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
-        query = encoders.query(image, None, CameraHeight(1.5))
+        query = encoders.spheres.query(image, None, CameraHeight(1.5))
         assert query.profile is not None
         assert (query.openings, query.ceiling, query.room_type) == (None, None, None)
 

@@ -35,9 +35,9 @@ from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import Trunk
 from tests.core.test_training import LineStage, same_weights
 from tests.strategies import present
@@ -227,7 +227,9 @@ class TestRuns:
         assert Checkpoint.load(folder / "layout.pt").config.architecture == "ring"
         bundle = Bundle.open(folder / "bundle")
         assert bundle.manifest.architecture == "trunk"
-        query = Encoders(bundle, threads=1).query(np.zeros((*TINY.image_size, 3), np.uint8), None, CameraHeight(1.5))
+        query = PhotographEncoder(bundle, threads=1).spheres.query(
+            np.zeros((*TINY.image_size, 3), np.uint8), None, CameraHeight(1.5)
+        )
         expected = losses.opening_prior(checkpoint.averaged["image_encoder"]["opening_share"], 0.5)
         np.testing.assert_allclose(present(query.openings).prior, expected, rtol=1e-5)
 
@@ -266,7 +268,7 @@ class TestRuns:
             assert bundle.read(name) == origin.read(name)
         # It is the encoder that was trained, with its own classes and modes.
         assert bundle.read("image_encoder.onnx") == Bundle.open(folder / "bundle").read("image_encoder.onnx")
-        assert Encoders(bundle, threads=1).predicts_structure
+        assert PhotographEncoder(bundle, threads=1).spheres.predicts_structure
         with pytest.raises(CheckpointError, match="no checkpoint of stage 'image' or 'view'"):
             export_into(tiny_bundle, tmp_path, tmp_path / "other", version="2")
 

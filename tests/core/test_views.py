@@ -27,12 +27,12 @@ from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.view_stage import middle
-from lalaloc_core.localise.encode.view_encoder import LevelPatch, OnnxViewEncoder
+from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query, RivalWall
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import WallModes
-from lalaloc_core.nets.view_encoder import ViewEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets.view_network import ViewNetwork
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet
@@ -128,7 +128,7 @@ class TestViewScenes:
 class TestEncoder:
     def test_transparent_pixels_do_not_matter(self) -> None:
         torch.manual_seed(0)
-        encoder = ViewEncoder(TINY.view, TINY.ring).eval()
+        encoder = ViewNetwork(TINY.view, TINY.ring).eval()
         image = torch.randint(0, 256, (1, 64, 64, 4), dtype=torch.uint8)
         image[..., 3] = 255
         image[:, :, 40:, 3] = 0
@@ -142,7 +142,7 @@ class TestEncoder:
 
     def test_it_starts_from_the_encoder_of_spheres(self) -> None:
         torch.manual_seed(0)
-        sphere, encoder = TrunkImageEncoder(TINY.trunk, TINY.ring), ViewEncoder(TINY.view, TINY.ring)
+        sphere, encoder = TrunkImageEncoder(TINY.trunk, TINY.ring), ViewNetwork(TINY.view, TINY.ring)
         encoder.start_from(sphere)
         for name in ("trunk._conv_stem.weight", "to_openings.weight", "norm.weight"):
             assert torch.equal(encoder.state_dict()[name], sphere.state_dict()[name])
@@ -164,7 +164,7 @@ class TestTraining:
         assert {"val_nll", "val_log_error_80", "val_opening_accuracy_106"} <= checkpoint.metrics.keys()
         origin = exported_bundle(tmp_path / "origin", TINY)
         with pytest.raises(BundleError, match="no encoder of views"):
-            OnnxViewEncoder(origin)
+            ViewEncoder(origin)
         bundle = export_into(origin.folder, run, tmp_path / "out", version="2")
         bundle.check()
         stored = Bundle.open(bundle.folder).manifest.view
@@ -172,7 +172,9 @@ class TestTraining:
         assert (stored.sectors, stored.image_width) == (4, 64)
         image = np.random.default_rng(0).integers(0, 256, (64, 64, 4), dtype=np.uint8)
         image[..., 3] = 255
-        query = OnnxViewEncoder(bundle).query([LevelPatch(image, 0.0)], None, EXACT)
+        encoder = ViewEncoder(bundle)
+        outputs = encoder.outputs([image], EXACT.height_m)
+        query = encoder.query_of_outputs(outputs, [(0.0, 0.0)], None, EXACT)
         assert query.profile is not None
         columns = TINY.profile_columns
         assert len(query.roll) == columns
@@ -182,7 +184,7 @@ class TestTraining:
         assert np.array_equal(query.profile.seen[3], np.roll(expected, 3))
         # An uncertain tilt widens the predictions: numerically, by the distance of an edge seen at another elevation.
         tilt, error = math.radians(3.0), math.sqrt(math.radians(3.0) ** 2 - math.radians(0.7) ** 2)
-        tilted = OnnxViewEncoder(bundle).query([LevelPatch(image, 0.0, tilt)], None, EXACT).profile
+        tilted = encoder.query_of_outputs(outputs, [(0.0, tilt)], None, EXACT).profile
         assert tilted is not None
         log_m, seen = query.profile.log_m[0, expected], np.exp(query.profile.log_scale[0, expected])
         elevation = np.arctan(EXACT.height_m / np.exp(log_m))

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import Bundle, write_manifest
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
-from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from service.capacity.bounded_cache import BoundedCache
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
@@ -60,7 +60,7 @@ LARGE_HALL = FloorPlan.from_dict(
 )
 
 
-class CountingEncoders(Encoders):
+class CountingEncoders(PhotographEncoder):
     """Real encoders that count the rendered poses, and can wait between chunks."""
 
     def __init__(self, bundle: Bundle) -> None:
@@ -125,7 +125,7 @@ def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord
 def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvider]]:
     made: list[GridProvider] = []
 
-    def make(store: Store, own_encoders: Encoders | None = None, **settings: Any) -> GridProvider:
+    def make(store: Store, own_encoders: PhotographEncoder | None = None, **settings: Any) -> GridProvider:
         made.append(GridProvider(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry(), _permits()))
         return made[-1]
 
@@ -138,7 +138,7 @@ MakeGrids = Callable[..., GridProvider]
 OpenStore = Callable[[], Store]
 
 
-def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: Encoders) -> None:
+def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: PhotographEncoder) -> None:
     computed = make_grids(store).compute(_add(store, HALL), 1.5).result(30.0)
     expected = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5, latents=False)
     np.testing.assert_array_equal(computed.poses.position_m, expected.poses.position_m)
@@ -233,7 +233,7 @@ def test_failed_call_fails_for_all_who_wait_and_is_made_again() -> None:
     assert cache.get_or_make("a", lambda: 3) == 3
 
 
-def test_cache_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
+def test_cache_is_in_the_metrics(store: Store, encoders: PhotographEncoder) -> None:
     telemetry = Telemetry()
     grids = GridProvider(store, encoders, "m1", Settings(), telemetry, _permits())
     record = _add(store)

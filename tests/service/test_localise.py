@@ -20,10 +20,10 @@ from shapely import Point
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search import pipeline
-from lalaloc_core.localise.search.retrieval import build_grid
 from lalaloc_core.photograph.spheres import read_sphere
 from service.schemas import TimingsAnswer
 from service.settings import Settings
@@ -311,10 +311,10 @@ def test_confidence_does_not_depend_on_top_k(
 
 def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipeline.Localisation:
     """Return the core's retrieval result for a query of the flat."""
-    encoders = Encoders(Bundle.open(bundle), threads=1)
+    encoders = PhotographEncoder(Bundle.open(bundle), threads=1)
     manifest, limits = encoders.manifest, Settings().photographs.photograph_limits
     image = read_sphere(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
-    query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
+    query = encoders.spheres.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
     plan = FloorPlan.from_dict(FLAT)
     grid = build_grid(plan, encoders, step_m=Settings().grids.grid_step_m, camera_height_m=1.5)
     return pipeline.localise(plan, grid, encoders, query, refine="none")

@@ -168,11 +168,11 @@ def test_features_replace_the_photograph(browser: Browser, service: httpx.Client
         own, other = getattr(found, name), getattr(expected, name)
         assert (own.value, own.sd, own.source) == (pytest.approx(other.value), pytest.approx(other.sd), other.source)
     assert found.azimuths == pytest.approx(expected.azimuths, abs=0.01)
-    assert found.encoded
-    assert expected.encoded
-    assert found.encoded.azimuths == expected.encoded.azimuths
-    for name, values in expected.encoded.outputs.items():
-        difference = np.abs(found.encoded.outputs[name] - values).mean()
+    assert found.features
+    assert expected.features
+    assert found.features.azimuths == expected.features.azimuths
+    for name, values in expected.features.outputs.items():
+        difference = np.abs(found.features.outputs[name] - values).mean()
         assert difference < 0.02 + 0.03 * np.std(values), name
     fields = {name: str(value) for name, value in stated.items()} | {"floorplan_id": answer["floorplan_id"]}
     uploaded = service.post("/localise", data=fields, files={"photo": content}).json()

@@ -16,7 +16,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Dataset
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.layout import render_layout
 
 _MAX_HOMES = 100
@@ -27,13 +27,13 @@ def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     # Needs embree, from the extra `oracle`.
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
-    encoders = Encoders(bundle, threads=1)
+    encoders = PhotographEncoder(bundle, threads=1)
     homes = min(homes, _MAX_HOMES)
     datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "heldout": HeldoutScenes(homes=homes)}
     return {family: azimuth_figures(encoders, dataset) for family, dataset in datasets.items()}
 
 
-def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
+def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, Any]:
     """Return the `AzimuthSummary` of a data set's test split, and its `confusion`: shares by true and predicted class.
 
     Raises:
@@ -58,7 +58,7 @@ def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
     return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
 
 
-def _measure(encoders: Encoders, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> AzimuthMeasures:
+def _measure(encoders: PhotographEncoder, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> AzimuthMeasures:
     """Compare the predictions from a panorama with the plan around the camera."""
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])

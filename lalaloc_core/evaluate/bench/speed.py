@@ -29,8 +29,8 @@ from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthes
 from lalaloc_core.learn.synth.homes.plans import TEST, Home, home_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
-from lalaloc_core.localise.encode.encoders import Encoders
-from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_depth
@@ -75,7 +75,7 @@ def bench_rendering(bundle: Bundle) -> dict[str, float]:
             room = plan.rooms[sampled.room_index[index]]
             reference_depth(room, sampled.position_m[index], 0.0, 1.5, 128, 256)
 
-    encoders = Encoders(bundle)
+    encoders = PhotographEncoder(bundle)
     closed_form_ms = median_ms(closed_form) / poses
     oracle_ms = median_ms(oracle, repeats=3) / len(sample)
     grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5)
@@ -121,7 +121,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
         for index, shot in enumerate(shots)
     ]
     icp = _mean_seconds(Icp(), questions)
-    lalaloc = _mean_seconds(LaLaLoc(Encoders(bundle, threads=1), refiner=local_refiner(bundle)), questions)
+    lalaloc = _mean_seconds(LaLaLoc(PhotographEncoder(bundle, threads=1), refiner=local_refiner(bundle)), questions)
     return {
         "area_m2": home.plan.area_m2,
         "grid_poses": len(grid),

@@ -18,10 +18,10 @@ from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.sequence.joint import refine_sequence
-from lalaloc_core.localise.sequence.motion import Motion
-from lalaloc_core.localise.sequence.search import localise_sequence
-from lalaloc_core.localise.sequence.turn import found_turns, judged_turn
+from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
+from lalaloc_core.localise.sequence.measured_motion import Motion
+from lalaloc_core.localise.sequence.sequence_search import localise_sequence
+from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn
 
 # Photographs taken while turning on the spot are this close together (m).
 _TURNED_STD_M = 0.1

@@ -35,7 +35,7 @@ from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.synthetic import training_plans
 from lalaloc_core.learn.metrics import Accuracy
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import Cohort, cohort_of
 
 _LOG = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
     weights = replace(weights, tail=config.tail or weights.tail)
     if not config.keep_evidence:
         appearance = bundle.manifest.evidence.appearance
-        encoders = Encoders(bundle, threads=1)
+        encoders = PhotographEncoder(bundle, threads=1)
         if encoders.predicts_structure and not views:
             appearance = queries.appearance(encoders)
         bundle = store_matching_weights(bundle, replace(weights, appearance=appearance), views=views)
@@ -145,7 +145,7 @@ class _Queries:
         )
         return Answers(own=own, disturbed=[*disturbed, *unopened], mismatched=[*mismatched, *foreign])
 
-    def appearance(self, encoders: Encoders) -> tuple[tuple[float, ...], ...]:
+    def appearance(self, encoders: PhotographEncoder) -> tuple[tuple[float, ...], ...]:
         """Fit `MatchingWeights.appearance` on the own and the disturbed photographs."""
         datasets = [build_dataset(self._run_info(name, True)) for name in ("own", "disturbed")]
         return fit_appearance(encoders, (data.load(name) for data in datasets for name in data.scenes("validation")))

@@ -66,14 +66,14 @@ def spots(homes: int, split: Split, textures: Path | None) -> Iterator[Spot]:
 
 def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:
     """Return the queries of a spot by photograph and heading, as `localisability.CONDITIONS` names them."""
-    manifest, views = encoder.networks.manifest, spot.views
+    manifest, views = encoder.manifest, spot.views
     height = CameraHeight(views[0].camera_height_m)
     pixels = photograph_of(views[0]).sphere.photograph.image(manifest.image_height, manifest.image_width)
     opened = [photograph_of(view).open(patch_size(manifest)) for view in views]
     others = list(zip(opened[1:], spot.turns[1:], strict=True))
     queries: dict[str, Query] = {}
     for name, heading in (("known_heading", views[0].heading), ("unknown_heading", None)):
-        queries[f"sphere_{name}"] = encoder.networks.query(pixels, heading, height)
+        queries[f"sphere_{name}"] = encoder.query(pixels, heading, height)
         queries[f"phone_{name}"] = encoder.query(opened[0], heading, height)
         queries[f"three_phone_{name}"] = encoder.query(opened[0], heading, height, others=others)
     return queries

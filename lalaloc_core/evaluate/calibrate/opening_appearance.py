@@ -21,7 +21,7 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.render.sampling import PoseSet
@@ -35,7 +35,7 @@ _PRIOR_SHARE = 0.5
 _ITERATIONS, _DECIMALS = 200, 3
 
 
-def fit_appearance(encoders: Encoders, scenes: Iterable[Scene]) -> tuple[tuple[float, ...], ...]:
+def fit_appearance(encoders: PhotographEncoder, scenes: Iterable[Scene]) -> tuple[tuple[float, ...], ...]:
     """Return `MatchingWeights.appearance`, fitted on the photographs of scenes in their redrawn plans.
 
     Raises:
@@ -47,7 +47,7 @@ def fit_appearance(encoders: Encoders, scenes: Iterable[Scene]) -> tuple[tuple[f
         for camera in scene.cameras:
             for photograph in camera.photographs.values():
                 image = photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
-                query = encoders.query(image, camera.heading, CameraHeight(camera.camera_height_m, 0.0))
+                query = encoders.spheres.query(image, camera.heading, CameraHeight(camera.camera_height_m, 0.0))
                 if query.openings is None:
                     raise BundleError(f"model '{encoders.manifest.name}' predicts no openings; use another bundle")
                 poses = PoseSet(camera.position_m[None], np.array([camera.room_index]))

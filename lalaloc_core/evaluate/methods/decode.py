@@ -16,7 +16,7 @@ from torch.nn import functional
 from lalaloc_core.evaluate.methods.explicit import depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.evaluate.methods.method import Answer, Question
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.refine.refinement import refinement_job
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock, localise
@@ -26,7 +26,7 @@ from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecod
 class VdrDecode:
     """Method with a bundle and the decoder that its layout encoder was trained with."""
 
-    def __init__(self, encoders: Encoders, decoder: LayoutDecoder) -> None:
+    def __init__(self, encoders: PhotographEncoder, decoder: LayoutDecoder) -> None:
         self._lalaloc = LaLaLoc(encoders, refine="vdr")
         # The paper compares latents only.
         self._config = LocaliseConfig(matching=MatchingConfig(use_profile=False))

@@ -20,7 +20,7 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.lalaloc import read_image
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.refine import LpoConfig, RefinementJob
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock
@@ -51,7 +51,7 @@ _ROWS = 32
 class ExplicitLayout:
     """Method with the wall profile that a `ring` bundle predicts; layout queries use the true one."""
 
-    def __init__(self, encoders: Encoders) -> None:
+    def __init__(self, encoders: PhotographEncoder) -> None:
         self._encoders = encoders
         self._config = LocaliseConfig()
         self._columns = encoders.manifest.profile_columns

@@ -20,14 +20,14 @@ from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Pre
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, Refiner, StageClock, localise
-from lalaloc_core.localise.search.retrieval import build_grid
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.render.sampling import PoseSet
 
@@ -62,7 +62,7 @@ class LaLaLoc:
 
     def __init__(
         self,
-        encoders: Encoders,
+        encoders: PhotographEncoder,
         *,
         refine: Refine = "lpo",
         refiner: Refiner | None = None,
@@ -162,7 +162,7 @@ class LocalModel:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.encoder = PhotographEncoder(bundle, threads=1)
-        self.networks = self.encoder.networks
+        self.networks = self.encoder
         self.refiner = local_refiner(bundle)
 
     def grid(self, plan: FloorPlan, camera_height_m: float) -> PoseGrid:
@@ -186,7 +186,7 @@ class LocalModel:
         return localise(plan, grid, self.networks, query, refiner=self.refiner)
 
 
-def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
+def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return the photograph of a panorama query at the encoder's size; None for layout queries.
 
     Raises:
@@ -198,7 +198,7 @@ def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w
 
 
 def encode(
-    encoders: Encoders,
+    encoders: PhotographEncoder,
     question: Question,
     image: UInt8[np.ndarray, "h w 3"] | None,
     stated: StatedHeight = StatedHeight(),

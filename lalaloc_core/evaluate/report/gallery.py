@@ -26,7 +26,7 @@ from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
 from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match.cost_terms import latent_distances
 
 PER_GROUP = 3
@@ -165,7 +165,7 @@ class _CardWriter:
         return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.final_pose)]
 
 
-def _open_encoders(run: ReopenedRun, left_out: list[str]) -> Encoders | None:
+def _open_encoders(run: ReopenedRun, left_out: list[str]) -> PhotographEncoder | None:
     """Return the run's model, or None if the method compares no latents or the model is missing."""
     if run.info.method not in _LATENT_METHODS:
         left_out.append(f"Method “{run.info.method}” compares no latents, so there is no map of latent distances.")
@@ -177,7 +177,7 @@ def _open_encoders(run: ReopenedRun, left_out: list[str]) -> Encoders | None:
         return None
 
 
-def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) -> list[DrawnMap]:
+def _maps(question: Question, encoders: PhotographEncoder | None, left_out: list[str]) -> list[DrawnMap]:
     """Return maps of the query's distance to every place of the plan: by latent, and by true layout."""
     plan, camera = question.plan, question.camera
     cells = Cells.cover(plan, max(_CELL_M, math.sqrt(plan.area_m2 / _MAX_CELLS)))

@@ -42,7 +42,7 @@ from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.learn.metrics import ClassScores, summarise_azimuths
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 _HEIGHT, _WIDTH = 256, 512
 CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}
@@ -238,7 +238,7 @@ def evaluate_photographs(
             f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'; "
             "at least one must be 'fair' or 'good'"
         )
-    read = read_photographs(Encoders(Bundle.open(bundle), threads=1), dataset.photographs)
+    read = read_photographs(PhotographEncoder(Bundle.open(bundle), threads=1), dataset.photographs)
 
     def located(field_deg: float | None, heading: str, known: bool) -> list[GalleryAnswer]:
         name = heading if field_deg is None else f"view-{field_deg:g}-{heading}"

@@ -9,7 +9,7 @@ from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.render.sampling import pose_grid
 
 _SAME_PLACE_M = 1e-3
@@ -27,7 +27,7 @@ class ReopenedRun:
         self._dataset = build_dataset(info)
         self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
 
-    def open_model(self) -> Encoders:
+    def open_model(self) -> PhotographEncoder:
         """Return the model.
 
         Raises:
@@ -39,7 +39,7 @@ class ReopenedRun:
             raise BundleError(
                 f"'{self.info.bundle}' holds another model than the run used: its SHA-256 is {bundle.sha256}"
             )
-        return Encoders(bundle)
+        return PhotographEncoder(bundle)
 
     def find_camera(self, prediction: Prediction) -> tuple[Scene, Camera]:
         """Return the scene and the camera of a query.

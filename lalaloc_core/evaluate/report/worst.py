@@ -37,11 +37,7 @@ from lalaloc_core.evaluate.report.pictures import (
 from lalaloc_core.evaluate.report.reopening import ReopenedRun
 from lalaloc_core.evaluate.report.tables import distance, percent
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluate.runs.predictions import (
-    Prediction,
-    RunFolder,
-    RunInfo,
-)
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Scene

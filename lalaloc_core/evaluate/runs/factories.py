@@ -133,7 +133,7 @@ def build_method(info: RunInfo) -> Method:
         return Icp()
     bundle = require_bundle(info)
     photographs = PhotographEncoder(bundle, threads=1)
-    encoders = photographs.networks
+    encoders = photographs
     # Tensors of a few poses are too small for several threads.
     torch.set_num_threads(1)
     if info.method == "explicit":
@@ -168,7 +168,7 @@ def _lalaloc(bundle: Bundle, photographs: PhotographEncoder, settings: LaLaLocSe
         std_m=settings.camera_height_std_m,
     )
     return LaLaLoc(
-        photographs.networks,
+        photographs,
         refine=settings.refine,
         refiner=refiner,
         config=config,

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.errors import BundleError
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 
 
@@ -28,7 +28,7 @@ class ReadPhotograph:
     measures: AzimuthMeasures
 
 
-def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
+def read_photographs(encoders: PhotographEncoder, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
     """Predict walls and openings of each photograph and compare them with the annotation.
 
     Raises:
@@ -54,7 +54,7 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
 
 
 def read_azimuths(
-    encoders: Encoders, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
+    encoders: PhotographEncoder, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
 ) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
     """Predict walls and openings of a panorama in its own frame.
 

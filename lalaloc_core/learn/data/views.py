@@ -18,15 +18,7 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.learn.data.dataset import (
-    Appearance,
-    Camera,
-    Dataset,
-    DatasetPhotograph,
-    Scene,
-    Split,
-    WithoutDepth,
-)
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, WithoutDepth
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph, open_photograph

@@ -43,12 +43,12 @@ from lalaloc_core.errors import ExportError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
-from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
+from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.nets.view_encoder import ViewEncoder
+from lalaloc_core.nets.view_network import ViewNetwork
 
 PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4
@@ -61,7 +61,7 @@ _STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "roo
 def export_bundle(
     folder: Path,
     config: TrainConfig,
-    layout_encoder: LayoutEncoder,
+    layout_encoder: LayoutNetwork,
     image_encoder: ImageEncoder | None,
     decoder: LayoutDecoder | None = None,
     *,
@@ -105,7 +105,7 @@ def _new_files(folder: Path) -> Iterator[Path]:
             (folder / path.name).write_bytes(path.read_bytes())
 
 
-def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewEncoder, training: dict[str, Any]) -> Bundle:
+def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, training: dict[str, Any]) -> Bundle:
     """Add an encoder of views to a bundle, or replace it; its weights are rounded in place.
 
     Raises:
@@ -153,7 +153,7 @@ def replace_image_encoder(
 
 
 def reexport_networks(
-    bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
+    bundle: Bundle, config: TrainConfig, layout_encoder: LayoutNetwork, image_encoder: ImageEncoder | None
 ) -> Bundle:
     """Export the ONNX networks of a bundle again from its own weights; only they and the digests change.
 
@@ -169,7 +169,7 @@ def reexport_networks(
 
 
 def _export_networks(
-    work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
+    work: Path, config: TrainConfig, layout_encoder: LayoutNetwork, image_encoder: ImageEncoder | None
 ) -> float:
     """Export every network and compare it with torch; return the largest difference."""
     generator = torch.Generator().manual_seed(0)
@@ -220,7 +220,7 @@ class _RingOutputs(nn.Module):
 class _ViewOutputs(nn.Module):
     """Encoder of views with its features as a plain tuple."""
 
-    def __init__(self, encoder: ViewEncoder) -> None:
+    def __init__(self, encoder: ViewNetwork) -> None:
         super().__init__()
         self.encoder = encoder
 

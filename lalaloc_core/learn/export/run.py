@@ -28,7 +28,7 @@ from lalaloc_core.learn.training.warm_start import (
     training_totals,
 )
 from lalaloc_core.nets import ImageEncoder, load_layout_encoder
-from lalaloc_core.nets.view_encoder import ViewEncoder
+from lalaloc_core.nets.view_network import ViewNetwork
 
 
 def export_run(
@@ -114,7 +114,7 @@ def export_into(
     for checkpoint in checkpoints:
         config, summary = checkpoint.config, _summary(checkpoint, folder, last=last)
         if checkpoint.stage == "view":
-            view_encoder = ViewEncoder(config.view, config.ring)
+            view_encoder = ViewNetwork(config.view, config.ring)
             view_encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
             made = add_view_encoder(made, config, view_encoder, summary)
         else:

@@ -9,10 +9,10 @@ from typing import Any, Literal
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.decoder import DECODED_WIDTH
-from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
-from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.paper_encoders import PaperConfig
-from lalaloc_core.nets.view_encoder import ViewEncoderConfig
+from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
+from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.render.sampling import TripletSampling
 
 Architecture = Literal["ring", "trunk", "paper"]

@@ -24,10 +24,10 @@ from lalaloc_core.learn.training.stages import (
     photograph_loss,
     sample_styles,
 )
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets import LayoutNetwork
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 
 # Part of the horizon, in turns, that is seen in pictures with hidden sectors.
 _SEEN_TURNS = (0.15, 0.6)
@@ -44,11 +44,11 @@ class ImageStage(TrainingStage):
         self,
         config: TrainConfig,
         source: Source,
-        layout_encoder: LayoutEncoder,
+        layout_encoder: LayoutNetwork,
         photographs: Photographs | None = None,
     ) -> None:
         self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
-        self.teacher: LayoutEncoder = layout_encoder.eval().requires_grad_(False)
+        self.teacher: LayoutNetwork = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
         self._generators: dict[torch.device, torch.Generator] = {}

@@ -15,7 +15,7 @@ from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import LayoutStageConfig, TrainConfig
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, build_decoder, build_layout_encoder
-from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.depth import back_project, layout_depth
 
@@ -48,7 +48,7 @@ class LayoutStage(TrainingStage):
 class LayoutObjective:
     """Log-ratio and decoding losses of groups: anchors, each with its neighbours (paper, section 3.1)."""
 
-    def __init__(self, settings: LayoutStageConfig, encoder: LayoutEncoder, decoder: LayoutDecoder | None) -> None:
+    def __init__(self, settings: LayoutStageConfig, encoder: LayoutNetwork, decoder: LayoutDecoder | None) -> None:
         self.settings = settings
         self.encoder = encoder
         self.decoder = decoder

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
-from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
-from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.layout_network import RingConfig
+from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
 from lalaloc_core.nets.trunk import TrunkConfig
-from lalaloc_core.nets.view_encoder import ViewEncoderConfig
+from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.render.sampling import TripletSampling
 
 PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)

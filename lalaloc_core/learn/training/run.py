@@ -28,8 +28,8 @@ from lalaloc_core.learn.training.warm_start import (
     load_trained_layout_encoder,
     load_warm_start,
 )
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets import LayoutNetwork
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
 
 StageName = Literal["layout", "image", "view", "end-to-end"]
@@ -88,7 +88,7 @@ def train_stage(
     )
 
 
-def _load_teacher(config: TrainConfig, folder: Path, teacher: Path | None, origin: Path | None) -> LayoutEncoder:
+def _load_teacher(config: TrainConfig, folder: Path, teacher: Path | None, origin: Path | None) -> LayoutNetwork:
     """Load the layout encoder that the image stage is trained against, if need be from a bundle or another run."""
     if origin is not None and teacher is None and not (folder / "layout.pt").exists():
         start = load_warm_start(origin, "layout", config)
@@ -99,7 +99,7 @@ def _load_teacher(config: TrainConfig, folder: Path, teacher: Path | None, origi
 
 
 def _build_stage(
-    name: StageName, config: TrainConfig, data: TrainingData, layout_encoder: LayoutEncoder | None
+    name: StageName, config: TrainConfig, data: TrainingData, layout_encoder: LayoutNetwork | None
 ) -> TrainingStage:
     if name == "view":
         if data.dataset is not None:
@@ -130,7 +130,7 @@ def _validation(
     config: TrainConfig,
     folder: Path,
     data: TrainingData,
-    layout_encoder: LayoutEncoder | None,
+    layout_encoder: LayoutNetwork | None,
     device: torch.device,
 ) -> Validate | None:
     """Return the validation of a stage; None without validation scenes."""

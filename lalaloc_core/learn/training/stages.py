@@ -18,11 +18,11 @@ from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConf
 from lalaloc_core.learn.training.deferred import DeferredRenderer
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
-from lalaloc_core.nets import ImageEncoder, LayoutEncoder
+from lalaloc_core.nets import ImageEncoder, LayoutNetwork
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.image_features import WallModes
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.trunk import StyleMixing, Trunk
@@ -68,7 +68,7 @@ class TrainingStage(ABC):
         """Return the weighted losses of a batch by name; the loop minimises their sum."""
 
 
-def build_layout_encoder(config: TrainConfig) -> LayoutEncoder:
+def build_layout_encoder(config: TrainConfig) -> LayoutNetwork:
     """Build an untrained layout encoder of the configured architecture."""
     return RingLayoutEncoder(config.ring) if config.has_ring else PaperLayoutEncoder(config.paper)
 

@@ -21,7 +21,7 @@ from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
-from lalaloc_core.nets.view_encoder import ViewEncoder, ViewFeatures
+from lalaloc_core.nets.view_network import ViewNetwork, ViewFeatures
 
 # Size of the spheres from which views of photographs are cut, about as fine as the views.
 PHOTOGRAPH_SIZE = (384, 768)
@@ -39,7 +39,7 @@ class ViewStage(TrainingStage):
 
     def __init__(self, config: TrainConfig, source: Source, photographs: Photographs | None = None) -> None:
         self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
-        self.encoder = ViewEncoder(config.view, config.ring)
+        self.encoder = ViewNetwork(config.view, config.ring)
         self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
         self._azimuths, self._elevations = (
             torch.from_numpy(angles).float()

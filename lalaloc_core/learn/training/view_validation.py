@@ -19,7 +19,7 @@ from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.view_stage import middle, view_window
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
-from lalaloc_core.nets.view_encoder import ViewEncoder
+from lalaloc_core.nets.view_network import ViewNetwork
 from lalaloc_core.render.sweep import profiles_at
 
 _FIELDS_DEG = (80.0, 106.0)
@@ -72,7 +72,7 @@ class ViewValidation:
     def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
         """Return the metrics of the module `view_encoder` by name."""
         encoder = modules["view_encoder"]
-        assert isinstance(encoder, ViewEncoder)
+        assert isinstance(encoder, ViewNetwork)
         was_training = encoder.training
         encoder.eval()
         metrics = {}
@@ -83,7 +83,7 @@ class ViewValidation:
         encoder.train(was_training)
         return metrics
 
-    def _measure(self, encoder: ViewEncoder, field_deg: float) -> dict[str, float]:
+    def _measure(self, encoder: ViewNetwork, field_deg: float) -> dict[str, float]:
         config = self._config
         azimuths, elevations = (
             torch.from_numpy(angles).float()

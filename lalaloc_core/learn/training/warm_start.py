@@ -27,9 +27,9 @@ from lalaloc_core.errors import BundleError, CheckpointError
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.stages import build_layout_encoder
-from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
+from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
 
 JOINT = "end-to-end"
 _MODULES = {
@@ -206,7 +206,7 @@ def find_checkpoint(stage: str, folder: Path, *, last: bool = False) -> Checkpoi
     return Checkpoint.load(best if best.exists() and not last else path, stage=path.stem)
 
 
-def load_trained_layout_encoder(folder: Path, *, last: bool = False) -> LayoutEncoder:
+def load_trained_layout_encoder(folder: Path, *, last: bool = False) -> LayoutNetwork:
     """Load a run's layout encoder: the best by validation, or the last."""
     checkpoint = find_checkpoint("layout", folder, last=last)
     encoder = build_layout_encoder(checkpoint.config)

@@ -18,7 +18,6 @@ from lalaloc_core.localise.belief.posterior import (
     Support,
     WeightedPlaces,
     area_shares,
-    posterior_from_weights,
     probability_map,
     weighted_places,
 )
@@ -46,7 +45,6 @@ __all__ = [
     "marginal_information",
     "photograph_heading",
     "pose_uncertainty",
-    "posterior_from_weights",
     "probability_map",
     "ranked",
     "signals_of",

@@ -4,8 +4,8 @@ A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the te
 queries. The prior is uniform over floor area and over the searched headings. Costs include the cost of hints.
 
 Candidates are the modes of the posterior. A grid pose is up to half a step away from the minimum of its mode.
-Refinement moves a candidate to the minimum; the decrease of its cost is its *gain*. `posterior_of` applies this to all
-pairs:
+Refinement moves a candidate to the minimum; the decrease of its cost is its *gain*. `weighted_places` applies this to
+all pairs:
 
 * Pairs of a refined mode move with its candidate, and their cost is lowered by its gain.
 * The cost of all other pairs is lowered by the median gain.
@@ -152,7 +152,15 @@ class SortedPlaces:
 
 @dataclass(frozen=True, eq=False)
 class WeightedPlaces:
-    """Probable places of a query after some modes of the grid were refined; see `posterior_from_weights`."""
+    """Probable places of a query.
+
+    Attributes:
+        pose: (m,) number of the grid pose that each place comes from.
+        heading: (m,) headings of the photograph (radians).
+        weight: (m,) probability; the sum is one.
+        poses: number of grid poses.
+        counted: the same places as candidates count them; None for the same.
+    """
 
     query: Query
     pose: Int[np.ndarray, "m"]
@@ -160,11 +168,26 @@ class WeightedPlaces:
     heading: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
     poses: int
-    counted: SortedPlaces
+    counted: SortedPlaces | None = None
 
     def posterior(self, candidates: Sequence[Candidate]) -> Posterior:
         """Return the posterior with the probabilities of candidates, the answer first."""
-        return posterior_from_weights(candidates=candidates, **vars(self))
+        answer, weight, left, shares = candidates[0], self.weight, self.weight.copy(), []
+        places = self.counted or SortedPlaces(self.position, self.heading, self.query)
+        for candidate in candidates:
+            near = places.near(candidate, RIGHT_WITHIN_M)
+            shares.append(float(left[near].sum()))
+            left[near] = 0.0
+        turned = wrap_angle(self.heading - (self.query.roll[answer.hypothesis] + answer.frame_heading))
+        # A hypothesis stands for the headings up to half a sector from it.
+        is_right = np.abs(turned) <= HEADING_WITHIN + 0.5 * self.query.sector
+        return Posterior(
+            pose=np.bincount(self.pose, weight, minlength=self.poses),
+            position=min(float(weight[places.within(answer.position_m, RIGHT_WITHIN_M)].sum()), 1.0),
+            candidate=tuple(shares),
+            heading=float(weight[is_right].sum()),
+            support=Support(self.pose, self.position, weight),
+        )
 
 
 def weighted_places(
@@ -207,15 +230,7 @@ def weighted_places(
         counted = _ties_at_their_ends(position, heading, mode, ends, query)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return WeightedPlaces(
-        query,
-        pose=pose,
-        position=position,
-        heading=heading,
-        weight=weight,
-        poses=len(grid.poses),
-        counted=SortedPlaces(*counted, query),
-    )
+    return WeightedPlaces(query, pose, position, heading, weight, len(grid.poses), SortedPlaces(*counted, query))
 
 
 def _modes(
@@ -296,52 +311,6 @@ def _ties_at_their_ends(
         position[mode == index] = ends[index].position_m
         heading[mode == index] = query.roll[ends[index].hypothesis] + ends[index].frame_heading
     return position, heading
-
-
-def posterior_from_weights(
-    query: Query,
-    candidates: Sequence[Candidate],
-    *,
-    pose: Int[np.ndarray, "m"],
-    position: Float[np.ndarray, "m 2"],
-    heading: Float[np.ndarray, "m"],
-    weight: Float[np.ndarray, "m"],
-    poses: int,
-    counted: SortedPlaces | None = None,
-) -> Posterior:
-    """Return the posterior of weighted places.
-
-    `pose` is the number of each place's grid pose, of `poses`; `heading` is that of the panorama (radians); the sum of
-    `weight` is one. `candidates` are those whose probability is wanted, the answer first; they count the places by
-    `counted` (default: `position` and `heading`).
-    """
-    places = counted or SortedPlaces(position, heading, query)
-    near = places.within(candidates[0].position_m, RIGHT_WITHIN_M)
-    return Posterior(
-        pose=np.bincount(pose, weight, minlength=poses),
-        position=min(float(weight[near].sum()), 1.0),
-        candidate=_shares(places, weight, candidates),
-        heading=_heading_share(heading, weight, query, candidates),
-        support=Support(pose, position, weight),
-    )
-
-
-def _shares(places: SortedPlaces, weight: Float[np.ndarray, "m"], candidates: Sequence[Candidate]) -> tuple[float, ...]:
-    left, shares = weight.copy(), []
-    for candidate in candidates:
-        near = places.near(candidate, RIGHT_WITHIN_M)
-        shares.append(float(left[near].sum()))
-        left[near] = 0.0
-    return tuple(shares)
-
-
-def _heading_share(
-    heading: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"], query: Query, candidates: Sequence[Candidate]
-) -> float:
-    answer = query.roll[candidates[0].hypothesis] + candidates[0].frame_heading
-    # A hypothesis stands for the headings up to half a sector from it.
-    half = 0.5 * query.sector
-    return float(weight[np.abs(wrap_angle(heading - answer)) <= HEADING_WITHIN + half].sum())
 
 
 @dataclass(frozen=True, eq=False)

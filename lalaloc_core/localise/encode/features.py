@@ -26,8 +26,9 @@ from lalaloc_core.errors import (
     InvalidFeaturesError,
     InvalidPhotographError,
 )
-from lalaloc_core.localise.encode.sphere_network import PROFILE_OUTPUTS, SHARE_OUTPUT, SphereNetwork
-from lalaloc_core.localise.encode.view_encoder import OnnxViewEncoder
+from lalaloc_core.localise.encode.exported_network import PROFILE_OUTPUTS, SHARE_OUTPUT
+from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
+from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.photograph import Assumed, Intrinsics, Photograph, PhotographFeatures, StatedCamera
 from lalaloc_core.photograph.cameras import Camera, Fisheye, Perspective
 from lalaloc_core.photograph.projection import Source
@@ -122,35 +123,29 @@ class FeatureEncoder:
                 "send the photograph instead"
             )
         self._bundle = bundle
-        self._spheres = SphereNetwork(bundle, threads=threads)
-        self._views = None if bundle.manifest.view is None else OnnxViewEncoder(bundle, threads=threads)
+        self._spheres = SphereEncoder(bundle, threads=threads, outputs_only=True)
+        self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
 
-    def encoded(self, view: Photograph) -> Photograph:
-        """Return a decoded photograph with the outputs of its image encoder instead of its pixels.
+    def features(self, photograph: Photograph) -> bytes:
+        """Return the features of a decoded photograph as a file.
 
         Raises:
             InvalidPhotographError: the model gives no features of such photographs.
         """
-        if view.panorama is not None and _encodes_spheres(self._bundle.manifest):
-            by_height = [self._spheres.outputs(view.panorama.pixels, height_m) for height_m in _RING_HEIGHTS_M]
+        manifest = self._bundle.manifest
+        if photograph.sphere is not None and _encodes_spheres(manifest):
+            by_height = [self._spheres.outputs(photograph.sphere, height_m) for height_m in _RING_HEIGHTS_M]
             outputs = by_height[_RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
-        elif view.panorama is None and self._views is not None:
-            outputs = self._views.predicted([patch.rgba for patch in view.patches], 1.0)
+        elif photograph.sphere is None and self._views is not None:
+            outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0)
         else:
             raise InvalidPhotographError(
-                f"the photograph is {view.projection}, of which model '{self._bundle.manifest.name}' gives no "
-                "features; send the photograph itself"
+                f"the photograph is {photograph.projection}, of which model '{manifest.name}' gives no features; send "
+                "the photograph itself"
             )
-        encoded = PhotographFeatures(outputs, tuple(patch.azimuth_rad for patch in view.patches))
-        return dataclasses.replace(view, panorama=None, patches=(), encoded=encoded)
-
-    def features(self, view: Photograph) -> bytes:
-        """Return the features of a decoded photograph as a file; raises the errors of `encoded`."""
-        header, encoded = _header_of(view, self._bundle), self.encoded(view).encoded
-        assert encoded is not None
-        text = json.dumps(dataclasses.asdict(header), allow_nan=False).encode()
-        shapes = _layout(self._bundle.manifest, len(view.patches))
-        arrays = (np.asarray(encoded.outputs[name], "<f4").reshape(shape).tobytes() for name, shape in shapes.items())
+        text = json.dumps(dataclasses.asdict(_header_of(photograph, self._bundle)), allow_nan=False).encode()
+        shapes = _layout(manifest, len(photograph.patches))
+        arrays = (np.asarray(outputs[name], "<f4").reshape(shape).tobytes() for name, shape in shapes.items())
         return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + b"".join(arrays)
 
 
@@ -173,7 +168,7 @@ def read_features(content: bytes, bundle: Bundle) -> Photograph:
     """Read features.
 
     Returns:
-        The photograph, with `encoded` instead of pixels.
+        The photograph, with `features` instead of pixels.
 
     Raises:
         InvalidFeaturesError: the file is damaged, truncated or too large, or a value is out of range.
@@ -183,7 +178,7 @@ def read_features(content: bytes, bundle: Bundle) -> Photograph:
     manifest = bundle.manifest
     if header.model != bundle.sha256:
         raise ForeignFeaturesError(header.model[:64], manifest.name, bundle.sha256)
-    view = _view_of(header, manifest)
+    photograph = _photograph_of(header, manifest)
     shapes = _layout(manifest, len(header.patches))
     expected = 4 * sum(math.prod(shape) for shape in shapes.values())
     if len(body) != expected:
@@ -196,13 +191,13 @@ def read_features(content: bytes, bundle: Bundle) -> Photograph:
         outputs[name] = _checked(name, np.frombuffer(body, "<f4", count, first).astype(np.float32).reshape(shape))
         first += 4 * count
     azimuths = tuple(place * TWO_PI / manifest.profile_columns for place in header.patches)
-    return dataclasses.replace(view, encoded=PhotographFeatures(outputs, azimuths))
+    return dataclasses.replace(photograph, features=PhotographFeatures(outputs, azimuths))
 
 
-def at_height(encoded: PhotographFeatures, camera_height_m: float) -> dict[str, np.ndarray]:
+def at_height(features: PhotographFeatures, camera_height_m: float) -> dict[str, np.ndarray]:
     """Return the outputs of an image encoder for a camera height; rings are interpolated between their heights."""
     log_height = np.float32(math.log(camera_height_m))
-    outputs = dict(encoded.outputs)
+    outputs = dict(features.outputs)
     for name in ("log_profile", "log_ceiling"):
         outputs[name] = outputs[name] + log_height
     if "ring" in outputs:
@@ -263,33 +258,33 @@ def _split(content: bytes) -> tuple[_Header, memoryview]:
     return header, memoryview(content)[end:]
 
 
-def _header_of(view: Photograph, bundle: Bundle) -> _Header:
+def _header_of(photograph: Photograph, bundle: Bundle) -> _Header:
     def angle(assumed: Assumed) -> _Angle:
         return _Angle(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
 
     column = TWO_PI / bundle.manifest.profile_columns
     return _Header(
         model=bundle.sha256,
-        projection=view.projection,
-        projection_source=view.projection_source,
-        hfov=angle(view.hfov),
-        pitch=angle(view.pitch),
-        roll=angle(view.roll),
-        seen_deg=(math.degrees(view.azimuths[0]), math.degrees(view.azimuths[1])),
-        patches=[round(patch.azimuth_rad / column) for patch in view.patches],
-        compass_deg=None if view.compass_heading is None else math.degrees(view.compass_heading),
-        camera=_camera_model(view),
-        warnings=[text[:_MAX_WARNING_CHARACTERS] for text in view.warnings[:_MAX_WARNINGS]],
+        projection=photograph.projection,
+        projection_source=photograph.projection_source,
+        hfov=angle(photograph.hfov),
+        pitch=angle(photograph.pitch),
+        roll=angle(photograph.roll),
+        seen_deg=(math.degrees(photograph.azimuths[0]), math.degrees(photograph.azimuths[1])),
+        patches=[round(patch.azimuth_rad / column) for patch in photograph.patches],
+        compass_deg=None if photograph.compass_heading is None else math.degrees(photograph.compass_heading),
+        camera=_camera_model(photograph),
+        warnings=[text[:_MAX_WARNING_CHARACTERS] for text in photograph.warnings[:_MAX_WARNINGS]],
     )
 
 
-def _camera_model(view: Photograph) -> _CameraModel | None:
-    camera = view.camera
+def _camera_model(photograph: Photograph) -> _CameraModel | None:
+    camera = photograph.camera
     if not isinstance(camera, Perspective | Fisheye):
         return None
     model = _CameraModel(width=camera.width, height=camera.height, intrinsics=intrinsics_of(camera))
     try:
-        _camera_of(model, view.projection)
+        _camera_of(model, photograph.projection)
     except InvalidPhotographError:
         # Estimated cameras can be outside of the limits of stated ones. Answers then have no camera.
         return None
@@ -307,7 +302,7 @@ def _camera_of(model: _CameraModel, projection: Projection) -> Camera:
     return camera_of_intrinsics(projection, model.width, model.height, model.intrinsics)
 
 
-def _view_of(header: _Header, manifest: Manifest) -> Photograph:
+def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
     """Return the photograph of a header, without outputs."""
     half = manifest.profile_columns // 2
     first_deg, last_deg = header.seen_deg

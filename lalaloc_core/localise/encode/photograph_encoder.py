@@ -1,27 +1,31 @@
-"""Queries from photographs of any projection: full spheres by one network, all others by another."""
+"""Networks of a bundle; those for photographs are chosen here: full spheres by one, all others by another."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 
 import numpy as np
 
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.encode.features import at_height
-from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, LevelPatch, OnnxViewEncoder
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
+from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
+from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.photograph import PatchSize, Photograph
 
 
-class PhotographEncoder:
-    """Networks of one bundle for photographs; safe to share between threads.
+class PhotographEncoder(LayoutEncoder):
+    """Networks of one bundle for photographs and for the layouts that they are compared with.
+
+    It is safe to share between threads.
 
     Attributes:
-        networks: encoders of layouts and spheres, which searches need as well.
+        spheres: encoder of full spheres.
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
@@ -30,14 +34,20 @@ class PhotographEncoder:
         `threads` is the number of intra-op threads per session, 0 for one per core.
 
         Raises:
-            BundleError: see `Encoders` and `OnnxViewEncoder`.
+            BundleError: see `LayoutEncoder`, `SphereEncoder` and `ViewEncoder`.
         """
-        self.networks = Encoders(bundle, threads=threads)
-        self._views = None if bundle.manifest.view is None else OnnxViewEncoder(bundle, threads=threads)
+        super().__init__(bundle, threads=threads)
+        self.spheres = SphereEncoder(bundle, threads=threads)
+        self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
+
+    @property
+    def predicts_profile(self) -> bool:
+        """True if spheres have a predicted wall profile; otherwise latents alone are compared."""
+        return self.spheres.predicts_profile
 
     def query(
         self,
-        view: Photograph,
+        photograph: Photograph,
         heading: float | None,
         camera_height: CameraHeight,
         *,
@@ -47,71 +57,64 @@ class PhotographEncoder:
         """Return the query of a photograph.
 
         Args:
-            view: the decoded photograph, its sphere or patches of the sizes of `sphere_size` and `patch_size`.
+            photograph: decoded, its sphere or patches of the sizes of `sphere_size` and `patch_size`; or its features.
             heading: azimuth of its centre (radians); None if unknown.
-            camera_height: as in `Encoders.query`.
-            heading_tolerance: as in `Encoders.query`.
+            camera_height: as in `SphereEncoder.query`.
+            heading_tolerance: as in `SphereEncoder.query`.
             others: further photographs from the same place, none of them a sphere, each with its heading minus that of
-                `view` (radians); all of them encoded if `view` is.
+                `photograph` (radians); all of them features if `photograph` is.
 
         Raises:
             InvalidPhotographError: the photograph is no sphere, and the bundle has no encoder of views.
         """
-        if view.is_sphere:
+        height_m = camera_height.height_m
+        if photograph.is_sphere:
             assert not others, "a sphere shows all that others could add"
-            if view.encoded is not None:
-                outputs = at_height(view.encoded, camera_height.height_m)
-                return self.networks.query_of_outputs(
-                    outputs, heading, camera_height, heading_tolerance=heading_tolerance
+            if photograph.features is None:
+                assert photograph.sphere is not None
+                return self.spheres.query(
+                    photograph.sphere, heading, camera_height, heading_tolerance=heading_tolerance
                 )
-            assert view.panorama is not None
-            return self.networks.query(
-                view.panorama.pixels, heading, camera_height, heading_tolerance=heading_tolerance
-            )
-        self.check(view)
+            outputs = at_height(photograph.features, height_m)
+            return self.spheres.query_of_outputs(outputs, heading, camera_height, heading_tolerance=heading_tolerance)
+        self.check(photograph)
         assert self._views is not None
-        views = [(view, 0.0), *others]
-        if view.encoded is not None:
-            parts = [at_height(other.encoded, camera_height.height_m) for other, _ in views if other.encoded]
+        turned = [(photograph, 0.0), *others]
+        if photograph.features is None:
+            outputs = self._views.outputs([patch.rgba for view, _ in turned for patch in view.patches], height_m)
+        else:
+            parts = [at_height(view.features, height_m) for view, _ in turned if view.features]
             outputs = {name: np.concatenate([part[name] for part in parts]) for name in VIEW_OUTPUTS}
-            placed = [
-                (azimuth + turn, other.tilt_sd(azimuth))
-                for other, turn in views
-                if other.encoded
-                for azimuth in other.encoded.azimuths
-            ]
-            return self._views.query_of_outputs(
-                outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
-            )
-        patches = [
-            LevelPatch(patch.rgba, patch.azimuth_rad + turn, other.tilt_sd(patch.azimuth_rad))
-            for other, turn in views
-            for patch in other.patches
-        ]
-        return self._views.query(patches, heading, camera_height, heading_tolerance=heading_tolerance)
+        placed = [(azimuth + turn, view.tilt_sd(azimuth)) for view, turn in turned for azimuth in view.patch_azimuths]
+        return self._views.query_of_outputs(
+            outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
+        )
 
-    def check(self, view: Photograph) -> None:
+    def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.
 
         Raises:
             InvalidPhotographError: the photograph is no sphere, and the bundle has no encoder of views.
         """
-        manifest = self.networks.manifest
-        if not view.is_sphere and manifest.view is None:
+        if not photograph.is_sphere and self.manifest.view is None:
             raise InvalidPhotographError(
-                f"the photograph is {view.projection}, and model '{manifest.name}' reads full 360° spheres only; send "
-                "an equirectangular picture, twice as wide as high, or use a model with an encoder of views"
+                f"the photograph is {photograph.projection}, and model '{self.manifest.name}' reads full 360° spheres "
+                "only; send an equirectangular picture, twice as wide as high, or use a model with an encoder of views"
             )
+
+    def use_helper(self, helper: Callable[[], Executor | None]) -> None:
+        """Encode spheres on a second thread whenever `helper` returns one; see `SphereEncoder`."""
+        self.spheres.helper = helper
 
     def warm_up(self) -> None:
         """Run each network once, because the first run allocates memory."""
-        manifest, height = self.networks.manifest, CameraHeight(1.5)
-        image = np.zeros((*sphere_size(manifest), 3), np.uint8)
-        self.networks.query(image, None, height)
-        self.networks.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
+        manifest, height = self.manifest, CameraHeight(1.5)
+        self.spheres.query(np.zeros((*sphere_size(manifest), 3), np.uint8), None, height)
+        self.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
         if self._views is not None:
             size = patch_size(manifest)
-            self._views.query([LevelPatch(np.zeros((size.height, size.width, 4), np.uint8), 0.0)], None, height)
+            outputs = self._views.outputs([np.zeros((size.height, size.width, 4), np.uint8)], height.height_m)
+            self._views.query_of_outputs(outputs, [(0.0, 0.0)], None, height)
 
 
 def sphere_size(manifest: Manifest) -> tuple[int, int]:

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.bundle import VIEW_ONNX, Bundle
-from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import BundleError
-from lalaloc_core.localise.encode.encoders import log_softmax
-from lalaloc_core.localise.encode.sphere_network import PROFILE_OUTPUTS, SHARE_OUTPUT, STRUCTURE_OUTPUTS, array, session
-from lalaloc_core.localise.query import (
-    CameraHeight,
-    PredictedCeiling,
-    PredictedOpenings,
-    PredictedProfile,
-    PredictedRoomType,
-    Query,
-    rolled,
+from lalaloc_core.localise.encode.exported_network import (
+    PROFILE_OUTPUTS,
+    SHARE_OUTPUT,
+    STRUCTURE_OUTPUTS,
+    as_array,
+    open_session,
+    query_of_hypotheses,
+    turned_predictions,
 )
+from lalaloc_core.localise.query import CameraHeight, Query
 
 # Standard deviation (radians) of errors of levelling that the network was trained with.
 _TRAINED_TILT_SD = math.radians(0.7)
@@ -34,21 +31,7 @@ MIN_SEEN = 0.25
 VIEW_OUTPUTS = [*PROFILE_OUTPUTS, SHARE_OUTPUT, "seen", *STRUCTURE_OUTPUTS]
 
 
-class LevelPatch(NamedTuple):
-    """Part of a photograph that was levelled, as the encoder of views expects it.
-
-    Attributes:
-        image: of the size that the manifest's `view` states, RGB and opacity.
-        azimuth: of its centre column relative to the photograph's, radians.
-        tilt_sd: standard deviation of the error of levelling along the centre column, radians.
-    """
-
-    image: UInt8[np.ndarray, "h w 4"]
-    azimuth: float
-    tilt_sd: float = 0.0
-
-
-class OnnxViewEncoder:
+class ViewEncoder:
     """Encoder of views of one bundle, ready to run; safe to share between threads."""
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
@@ -61,66 +44,45 @@ class OnnxViewEncoder:
         if self._manifest.view is None:
             raise BundleError(f"model '{self._manifest.name}' has no encoder of views ({VIEW_ONNX}); it needs spheres")
         self._view = self._manifest.view
-        self._session = session(bundle.read(VIEW_ONNX), threads)
-
-    def query(
-        self,
-        patches: Sequence[LevelPatch],
-        heading: float | None,
-        camera_height: CameraHeight,
-        *,
-        heading_tolerance: float = 0.0,
-    ) -> Query:
-        """Return the query of a photograph that shows a part of the horizon.
-
-        Args:
-            patches: parts of the photograph; where they overlap, the nearer centre counts.
-            heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
-            camera_height: gives the picture its metric scale.
-            heading_tolerance: as in `Encoders.query`.
-        """
-        predicted = self.predicted([patch.image for patch in patches], camera_height.height_m)
-        placed = [(patch.azimuth, patch.tilt_sd) for patch in patches]
-        return self.query_of_outputs(predicted, placed, heading, camera_height, heading_tolerance=heading_tolerance)
+        self._session = open_session(bundle.read(VIEW_ONNX), threads)
 
     def query_of_outputs(
         self,
-        predicted: Mapping[str, np.ndarray],
+        outputs: Mapping[str, np.ndarray],
         placed: Sequence[tuple[float, float]],
         heading: float | None,
         camera_height: CameraHeight,
         *,
         heading_tolerance: float = 0.0,
     ) -> Query:
-        """Return the query of a photograph by what the network predicted of its patches.
+        """Return the query of a photograph that shows a part of the horizon, by the outputs for its patches.
 
         Args:
-            predicted: see `predicted`, for the given camera height.
-            placed: azimuth and standard deviation of the tilt of each patch, as in `LevelPatch`.
-            heading: as for `query`, like the other arguments.
-            camera_height: as for `query`.
-            heading_tolerance: as for `query`.
+            outputs: see `outputs`, for the given camera height.
+            placed: azimuth (radians) of each patch's centre relative to the photograph's, and standard deviation
+                (radians) of the error of levelling there; where patches overlap, the nearer centre counts.
+            heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
+            camera_height: gives the picture its metric scale.
+            heading_tolerance: as in `SphereEncoder.query`.
         """
         columns = self._manifest.profile_columns
-        outputs = self._on_circle(predicted, placed, camera_height.height_m)
-        column = TWO_PI / columns
-        frame = 0 if heading is None else round(heading / column)
-        frame_heading = 0.0 if heading is None else float(wrap_angle(heading - frame * column))
-        all_shifts = np.arange(columns)
-        max_shift = min(math.ceil(heading_tolerance / column), (columns - 1) // 2)
-        shifts = all_shifts if heading is None else np.arange(-max_shift, max_shift + 1)
-        query = self._hypotheses(outputs, frame + shifts, camera_height)
-        searched = None if heading is None else self._hypotheses(outputs, all_shifts, camera_height)
-        known = heading is not None and heading_tolerance == 0.0
-        return replace(query, frame_heading=frame_heading, heading_known=known, searched=searched)
+        circle = self._on_circle(outputs, placed, camera_height.height_m)
 
-    def predicted(self, images: Sequence[UInt8[np.ndarray, "h w 4"]], camera_height_m: float) -> dict[str, np.ndarray]:
-        """Run the encoder of views on level patches; return its outputs by patch."""
+        def hypotheses(shifts: Int[np.ndarray, "k"]) -> Query:
+            latents = np.zeros((len(shifts), self._manifest.latent_size), np.float32)
+            predictions = turned_predictions(circle, shifts, self._view)
+            roll = shifts * (TWO_PI / columns)
+            return Query(latents, roll, 0.0, False, camera_height, **predictions, is_view=True)
+
+        return query_of_hypotheses(hypotheses, columns, heading, heading_tolerance)
+
+    def outputs(self, images: Sequence[UInt8[np.ndarray, "h w 4"]], camera_height_m: float) -> dict[str, np.ndarray]:
+        """Run the network on level patches (`Patch.rgba`); return its outputs by patch."""
         parts: list[list[np.ndarray]] = []
         for first in range(0, len(images), _BATCH):
             batch = images[first : first + _BATCH]
             inputs = {"image": np.stack(batch), "camera_height_m": np.full(len(batch), camera_height_m, np.float32)}
-            parts.append([array(value) for value in self._session.run(VIEW_OUTPUTS, inputs)])
+            parts.append([as_array(value) for value in self._session.run(VIEW_OUTPUTS, inputs)])
         columns = zip(*parts, strict=True)
         return {name: np.concatenate(values) for name, values in zip(VIEW_OUTPUTS, columns, strict=True)}
 
@@ -151,24 +113,6 @@ class OnnxViewEncoder:
         for name in STRUCTURE_OUTPUTS[1:]:
             circle[name] = predicted[name].mean(axis=0)
         return circle
-
-    def _hypotheses(
-        self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], camera_height: CameraHeight
-    ) -> Query:
-        """Return a query with one hypothesis for each shift, a number of columns to the right."""
-        openings = rolled(log_softmax(outputs["opening_logits"]), shifts)
-        return Query(
-            np.zeros((len(shifts), self._manifest.latent_size), np.float32),
-            shifts * (TWO_PI / self._manifest.profile_columns),
-            0.0,
-            False,
-            camera_height,
-            profile=PredictedProfile.of_outputs(outputs).moved(shifts),
-            openings=PredictedOpenings(openings, np.array(self._view.opening_prior)),
-            ceiling=PredictedCeiling(float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])),
-            room_type=PredictedRoomType(log_softmax(outputs["room_type_logits"]), np.array(self._view.room_type_prior)),
-            is_view=True,
-        )
 
 
 def _widened(

@@ -16,8 +16,8 @@ from lalaloc_core.localise.refine.descent_methods import descend
 from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement_problem import LpoConfig, Norm, Problem
 from lalaloc_core.localise.refine.wall_refiner import refine_walls
-from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets import LayoutNetwork, load_layout_encoder
+from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.render.gradient import ProfileJacobian
 from lalaloc_core.render.profile import wall_profile
 
@@ -101,7 +101,7 @@ class _EmbeddedProblem(Problem):
 class PoseRefiner:
     """Refiner with one layout encoder; it compares wall profiles if a job has predicted ones."""
 
-    def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
+    def __init__(self, layout_encoder: LayoutNetwork, config: LpoConfig | None = None) -> None:
         layout_encoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
         self._device = next(layout_encoder.parameters()).device

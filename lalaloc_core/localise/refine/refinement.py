@@ -10,11 +10,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
 from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
@@ -72,7 +72,7 @@ def refinement_job(
 
 def refined_candidates(
     plan: FloorPlan,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     query: Query,
     starts: list[Candidate],
     result: RefinementResult,
@@ -83,7 +83,7 @@ def refined_candidates(
 
     A candidate that left the region of strict hints stays at its start.
     """
-    weights = encoders.manifest.evidence_for(view=query.is_view)
+    weights = encoder.manifest.evidence_for(view=query.is_view)
     rooms = np.array([start.room_index for start in starts])
     excluded = ~np.isfinite(hints.penalty(plan, result.position_m, rooms))
     result = _put_back(starts, result, excluded)
@@ -96,7 +96,7 @@ def refined_candidates(
     cost, terms = result.cost, [{} for _ in starts]
     if matching.compares_profiles(query):
         hypotheses = np.array([start.hypothesis for start in starts])
-        columns = encoders.manifest.profile_columns
+        columns = encoder.manifest.profile_columns
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
         matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
         by_term = matching_cost.terms(layouts, hypotheses, offsets)
@@ -143,8 +143,22 @@ def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[
     )
 
 
+def latent_distances_at(
+    plan: FloorPlan,
+    encoder: LayoutEncoder,
+    query: Query,
+    poses: PoseSet,
+    heading: Float[np.ndarray, "k"],
+    hypotheses: list[int],
+    camera_height_m: float,
+) -> Float[np.ndarray, "k"]:
+    """Return the distances of the latents at poses to those of the query's hypotheses."""
+    latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
+    return np.linalg.norm(latents - query.latents[hypotheses], axis=1)
+
+
 def with_latents(
-    plan: FloorPlan, encoders: Encoders, query: Query, candidates: list[Candidate], camera_height_m: float
+    plan: FloorPlan, encoder: LayoutEncoder, query: Query, candidates: list[Candidate], camera_height_m: float
 ) -> list[Candidate]:
     """Return candidates with the latent distances at their poses.
 
@@ -160,10 +174,11 @@ def with_latents(
     poses = PoseSet(
         np.stack([candidates[k].position_m for k in moved]), np.array([candidates[k].room_index for k in moved])
     )
-    heading = np.array([candidates[k].frame_heading for k in moved])
-    latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
-    targets = query.latents[[candidates[k].hypothesis for k in moved]]
-    distance = np.linalg.norm(latents - targets, axis=1)
+    heading, hypotheses = (
+        np.array([candidates[k].frame_heading for k in moved]),
+        [candidates[k].hypothesis for k in moved],
+    )
+    distance = latent_distances_at(plan, encoder, query, poses, heading, hypotheses, camera_height_m)
     completed = list(candidates)
     for row, k in enumerate(moved):
         completed[k] = replace(candidates[k], latent_distance=float(distance[row]))

@@ -28,7 +28,7 @@ from lalaloc_core.localise.belief import (
     signals_of,
     weighted_places,
 )
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
@@ -197,7 +197,7 @@ class StageClock:
 def localise(
     plan: FloorPlan,
     grid: PoseGrid,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     query: Query,
     *,
     refine: Refine = "lpo",
@@ -219,7 +219,7 @@ def localise(
     if refiner is None and refine == "lpo":
         refine = "vdr"
     steps = localise_steps(
-        plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
+        plan, grid, encoder, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
     )
     return run_steps(steps, refiner)
 
@@ -227,7 +227,7 @@ def localise(
 def localise_steps(
     plan: FloorPlan,
     grid: PoseGrid,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     query: Query,
     *,
     refine: Refine = "lpo",
@@ -239,7 +239,7 @@ def localise_steps(
     """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `next_step`."""
     config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
-    search = _Search(plan, grid, encoders, query, config=config, clock=clock, hints=hints, top_k=top_k)
+    search = _Search(plan, grid, encoder, query, config=config, clock=clock, hints=hints, top_k=top_k)
     resampling = refine != "none" and config.vdr_candidates > 0
     if refine != "lpo":
         return search.localisation(search.without_lpo(resampling=resampling))
@@ -268,7 +268,7 @@ class _Search:
         self,
         plan: FloorPlan,
         grid: PoseGrid,
-        encoders: Encoders,
+        encoder: LayoutEncoder,
         query: Query,
         *,
         config: LocaliseConfig,
@@ -277,8 +277,8 @@ class _Search:
         top_k: int,
     ) -> None:
         """Retrieve the modes."""
-        self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
-        self._weights = encoders.manifest.evidence_for(view=query.is_view)
+        self._plan, self._grid, self._encoders, self._config = plan, grid, encoder, config
+        self._weights = encoder.manifest.evidence_for(view=query.is_view)
         self._clock, self._hints, self._top_k = clock, hints, top_k
         weights, matching = self._weights, config.matching
         with clock.stage("retrieve"):
@@ -302,7 +302,7 @@ class _Search:
             self._lpo_count = config.starts(query, self.modes)
             self._grid_cost = float(costs.cost.min())
             reach_m = matching.grid_reach * grid.step_m
-            self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, matching)
+            self._by_chance = cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching)
         self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
         # The mode that each candidate of `without_lpo` comes from.

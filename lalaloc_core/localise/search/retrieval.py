@@ -12,7 +12,7 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PairLimits, PoseGrid, grid_candidate, likeliest
 from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.match.cost_terms import latent_distances
@@ -34,13 +34,13 @@ _FIRST_RANKED = 1024
 
 
 def build_grid(
-    plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float, latents: bool = True
+    plan: FloorPlan, encoder: LayoutEncoder, *, step_m: float, camera_height_m: float, latents: bool = True
 ) -> PoseGrid:
     """Return the plan's pose grid with every layout rendered and, with `latents`, encoded, which is slow."""
     poses = pose_grid(plan, step_m)
     if not latents:
-        return PoseGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
-    embedded, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
+        return PoseGrid.without_latents(poses, encoder.rendered(plan, poses), step_m, camera_height_m)
+    embedded, profile_m = encoder.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
     return PoseGrid(poses, embedded, profile_m, step_m, camera_height_m)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
@@ -42,7 +42,7 @@ def disc_poses(
 
 def resample(
     plan: FloorPlan,
-    encoders: Encoders,
+    encoder: LayoutEncoder,
     query: Query,
     candidate: Candidate,
     *,
@@ -57,7 +57,7 @@ def resample(
     If the heading is searched, the samples also cover the sector of headings of the candidate's hypothesis.
     """
     matching = matching or MatchingConfig()
-    weights = encoders.manifest.evidence_for(view=query.is_view)
+    weights = encoder.manifest.evidence_for(view=query.is_view)
     disc, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
     # The candidate comes first, so that it is kept if others cost the same.
     poses = PoseSet(
@@ -73,11 +73,11 @@ def resample(
     target = query.latents[candidate.hypothesis][None]
     by_walls = matching.compares_profiles(query)
     if not by_walls or matching.latent_weight:
-        latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
+        latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
     offset = np.full(len(poses), candidate.height_offset)
     cost = np.zeros(len(poses)) if latents is None else latent_distances(latents, target)[0]
     if by_walls:
-        layouts = layouts_at(plan, poses, heading, encoders.manifest.profile_columns)
+        layouts = layouts_at(plan, poses, heading, encoder.manifest.profile_columns)
         matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
         layout_cost, offsets = matching_cost.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = layout_cost[0] + matching.latent_weight * cost, offsets[0]
@@ -88,7 +88,7 @@ def resample(
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:
         # The latent of one pose is cheap, and is reported with the answer.
-        latents, _ = encoders.poses(plan, chosen, heading[[index]], camera_height_m)
+        latents, _ = encoder.poses(plan, chosen, heading[[index]], camera_height_m)
     else:
         latents = latents[[index]]
     return replace(

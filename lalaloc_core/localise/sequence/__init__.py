@@ -8,7 +8,7 @@ Begin with `search.py`, the path of a query. `chain.py` sums over all paths (for
 `paths.py` computes the probability of paths. `turn.py` is about photographs from one spot.
 """
 
-from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult
-from lalaloc_core.localise.sequence.motion import Motion
+from lalaloc_core.localise.sequence.joint_refinement import SequenceJob, SequenceResult
+from lalaloc_core.localise.sequence.measured_motion import Motion
 
 __all__ = ["Motion", "SequenceJob", "SequenceResult"]

@@ -6,7 +6,7 @@ sectors of the heading. Begin with `filter.py`, the path of a photograph: the be
 LPO at its modes. `state.py` has what is stored between photographs.
 """
 
-from lalaloc_core.localise.tracking.motion import Odometry
-from lalaloc_core.localise.tracking.state import TrackState
+from lalaloc_core.localise.tracking.track_state import TrackState
+from lalaloc_core.localise.tracking.walk_motion import Odometry
 
 __all__ = ["Odometry", "TrackState"]

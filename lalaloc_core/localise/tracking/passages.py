@@ -18,7 +18,7 @@ from scipy.sparse import coo_array, csr_array
 
 from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.tracking.motion import MAX_HOPS, STROLL_M, Odometry, States, WalkGraph
+from lalaloc_core.localise.tracking.walk_motion import MAX_HOPS, STROLL_M, Odometry, States, WalkGraph
 
 _LIFTS = frozenset({"lift", "lifts", "elevator", "elevators", "aufzug", "ascenseur", "ascensor"})
 # Probability of a change of the level between two photographs: beside stairs or lifts, and in a plan without.

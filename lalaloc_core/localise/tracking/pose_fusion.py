@@ -10,10 +10,10 @@ from jaxtyping import Float
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import photograph_heading, pose_uncertainty
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.query import Candidate, Query
-from lalaloc_core.localise.tracking.motion import Odometry, axes
-from lalaloc_core.localise.tracking.state import COMPONENTS, Component, TrackedPose
+from lalaloc_core.localise.tracking.track_state import COMPONENTS, Component, TrackedPose
+from lalaloc_core.localise.tracking.walk_motion import Odometry, axes
 
 # Deviations (m, m, radians) that the residual of a motion has beside the stated ones, and the number of deviations from
 # which it is contradicted.
@@ -25,11 +25,11 @@ _UNKNOWN_STD = np.array([0.25, 0.25, math.radians(5.0)])
 Gaussian = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 
 
-def measured_pose(plan: FloorPlan, encoders: Encoders, query: Query, answer: Candidate) -> Gaussian:
+def measured_pose(plan: FloorPlan, encoder: LayoutEncoder, query: Query, answer: Candidate) -> Gaussian:
     """Return pose and covariance by the photograph alone."""
     mean = np.array([answer.x_m, answer.y_m, photograph_heading(query, answer)])
     covariance = np.diag(np.square(_UNKNOWN_STD))
-    model = encoders.manifest.confidence_for(view=query.is_view)
+    model = encoder.manifest.confidence_for(view=query.is_view)
     if answer.information is not None and model is not None:
         uncertainty = pose_uncertainty(answer.information, plan.rooms[answer.room_index], model)
         if uncertainty is not None and uncertainty.heading_std is not None:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
-from lalaloc_core.localise.tracking.motion import Odometry
+from lalaloc_core.localise.tracking.walk_motion import Odometry
 
 _CSV = ("time_s", "x_m", "y_m", "yaw_deg")
 _TUM_VALUES = 8

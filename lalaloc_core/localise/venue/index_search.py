@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float, Int
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.venue.index_segment import by_family
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.venue.segment import by_family
 
 # Default numbers of pairs per query in the code scan, in the exact comparison, and in the alignment.
 SCANNED, COMPARED, ALIGNED = 40_000_000, 20_000, 4_000

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +20,8 @@ from lalaloc_core.localise.match.layouts import joined_layouts
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.render.sampling import PoseSet
 
+# Candidates, and other poses with the same fields.
+PoseT = TypeVar("PoseT", bound=Any)
 # Gap between the bounding boxes of two plans, larger than any distance at which poses count as one place.
 GAP_M = 10.0
 
@@ -77,13 +80,17 @@ class MergedPlans:
     def in_own_plan(self, candidate: Candidate) -> tuple[int, Candidate]:
         """Return the number of a candidate's plan, and the candidate in that plan's frame."""
         index = self.plan_of(candidate.room_index)
-        x_m, y_m = candidate.position_m - self.shift_m[index]
-        room = candidate.room_index - int(self.first_room[index])
-        return index, replace(candidate, x_m=float(x_m), y_m=float(y_m), room_index=room)
+        return index, translated(candidate, -self.shift_m[index], -int(self.first_room[index]))
 
     def by_plan(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "p"]:
         """Return the sum of each plan's values, given one value for each grid pose."""
         return np.add.reduceat(values, _starts(self._poses))
+
+
+def translated(pose: PoseT, shift_m: Float[np.ndarray, "2"], rooms: int) -> PoseT:
+    """Return a pose in another frame: shifted (m), with the number of its room raised."""
+    x_m, y_m = pose.position_m + shift_m
+    return replace(pose, x_m=float(x_m), y_m=float(y_m), room_index=pose.room_index + rooms)
 
 
 def _starts(counts: Sequence[int] | Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"]:

@@ -42,11 +42,11 @@ from lalaloc_core.localise.venue.index_search import (
     ShardSizes,
     cheapest,
 )
+from lalaloc_core.localise.venue.index_segment import Segment
 from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
 from lalaloc_core.localise.venue.prototype_cells import Cells, claims_of
 from lalaloc_core.localise.venue.prototype_codes import lookup_tables
 from lalaloc_core.localise.venue.prototypes import Prototypes, joined
-from lalaloc_core.localise.venue.segment import Segment
 
 # Pairs compared at a time, to bound memory.
 _BATCH_SIZE = 65_536

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.image_encoder import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder
 from lalaloc_core.nets.image_features import StructureFeatures, WallModes
-from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.layout_network import RingConfig
+from lalaloc_core.nets.sphere_network import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder
 from lalaloc_core.nets.trunk import TAP_STRIDES, StyleMixing
 
 
@@ -69,7 +69,7 @@ class ViewFeatures:
     structure: StructureFeatures
 
 
-class ViewEncoder(HorizonEncoder):
+class ViewNetwork(HorizonEncoder):
     """Image encoder of views: patch and camera height to walls, openings, ceiling height and room type."""
 
     def __init__(self, config: ViewEncoderConfig, ring: RingConfig) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from lalaloc_core.localise.sequence.motion import Transition
+from lalaloc_core.localise.sequence.measured_motion import Transition
 
 # Pairs of places and headings compared at a time, few enough to stay in the processor's cache.
 _COMPARED = 100_000

@@ -1,4 +1,4 @@
-"""Ground of a tracked camera: the plans that it can be in, as one plan with a pose grid, and the ways through them."""
+"""Plans that a tracked camera can be in, as one plan with a pose grid, and the ways through them."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
-from lalaloc_core.localise.tracking.motion import Odometry, States, WalkGraph, moved
 from lalaloc_core.localise.tracking.passages import Passages, PlanOnLevel
-from lalaloc_core.localise.tracking.state import StatePlan, TrackedPose, TrackState
-from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.tracking.track_state import StatePlan, TrackedPose, TrackState
+from lalaloc_core.localise.tracking.walk_motion import Odometry, States, WalkGraph, moved
+from lalaloc_core.localise.venue.merged_plans import MergedPlans, translated
 from lalaloc_core.localise.venue.prototypes import share_searched
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Plans of a venue that a ground leaves out for one photograph.
+    """Plans of a venue that are not searched for one photograph.
 
     Attributes:
-        area_share: share of the venue's floor area that the ground has.
+        area_share: share of the venue's floor area that is searched.
         log_mass: (v,) log masses of all plans of the venue, see `venue.plan_index`.
-        searched: (p,) numbers of the ground's plans among these.
+        searched: (p,) numbers of the searched plans among these.
     """
 
     area_share: float
@@ -35,7 +35,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class TrackedPlans:
     """One plan, or p plans of a venue laid side by side.
 
     Attributes:
@@ -59,8 +59,8 @@ class Ground:
     left_out: LeftOut | None = None
 
     @classmethod
-    def of_plan(cls, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph | None = None) -> Ground:
-        """Return the ground of one plan; its links are made unless they are given."""
+    def of_plan(cls, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph | None = None) -> TrackedPlans:
+        """Return one plan by itself; its links are made unless they are given."""
         graph = graph or WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
         return cls(plan, grid, graph, ("",), np.zeros(1, int), np.zeros((1, 2)))
 
@@ -73,8 +73,8 @@ class Ground:
         keys: Sequence[str],
         levels: Sequence[float],
         left_out: LeftOut | None = None,
-    ) -> Ground:
-        """Return the ground of several plans.
+    ) -> TrackedPlans:
+        """Return several plans.
 
         Args:
             merged: the plans side by side.
@@ -117,12 +117,10 @@ class Ground:
     def in_own_plan(self, candidate: Candidate) -> tuple[int, Candidate]:
         """Return the number of a candidate's plan, and the candidate in that plan's frame."""
         number = self.plan_of_room(candidate.room_index)
-        x_m, y_m = candidate.position_m - self.shift_m[number]
-        room = candidate.room_index - int(self.first_room[number])
-        return number, replace(candidate, x_m=float(x_m), y_m=float(y_m), room_index=room)
+        return number, translated(candidate, -self.shift_m[number], -int(self.first_room[number]))
 
     def entered(self, state: TrackState) -> TrackState:
-        """Return a state with the poses and in the frame of this ground, without the plans that it leaves out.
+        """Return a state with the poses and in the frame of these plans, without those that are left out.
 
         Raises:
             InvalidStateError: the grid of a plan has changed.
@@ -149,24 +147,17 @@ class Ground:
         if pose is None or number[pose.plan] < 0:
             return None
         plan = int(number[pose.plan])
-        x_m, y_m = pose.position_m + self.shift_m[plan]
-        room = pose.room_index + int(self.first_room[plan])
-        return replace(pose, x_m=float(x_m), y_m=float(y_m), room_index=room, plan=plan)
+        return replace(translated(pose, self.shift_m[plan], int(self.first_room[plan])), plan=plan)
 
     def left(self, state: TrackState) -> TrackState:
-        """Return a state of this ground with the poses and in the frames of the plans that it needs."""
+        """Return a state of these plans with the poses and in the frames of those that it needs."""
         assert state.pose is not None
         used = np.union1d(np.unique(state.plan_of_state), [state.pose.plan])
         plan = state.plan_of_state
         poses = np.array([plan.poses for plan in state.plans])
         begin = np.cumsum([0, *poses[used]])[np.searchsorted(used, plan)]
         belief = replace(state.belief, pose=state.belief.pose - self.graph.first[plan] + begin)
-        x_m, y_m = state.pose.position_m - self.shift_m[state.pose.plan]
-        pose = replace(
-            state.pose,
-            x_m=float(x_m),
-            y_m=float(y_m),
-            room_index=state.pose.room_index - int(self.first_room[state.pose.plan]),
-            plan=int(np.searchsorted(used, state.pose.plan)),
-        )
+        own = state.pose.plan
+        pose = translated(state.pose, -self.shift_m[own], -int(self.first_room[own]))
+        pose = replace(pose, plan=int(np.searchsorted(used, own)))
         return replace(state, plans=tuple(state.plans[number] for number in used), belief=belief, pose=pose)

@@ -1,4 +1,4 @@
-"""Path of a tracked camera, drawn on its plan."""
+"""Cameras on a plan: those of several photographs, and the path of a tracked one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.draw.canvas import FOUND, INK, path
-from lalaloc_core.draw.plan import HEAT_PLACE, Marker, draw_rooms, extent_m, svg_around
+from lalaloc_core.draw.canvas import FOUND, INK, path, xml_text
+from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_with
 from lalaloc_core.floorplan import FloorPlan
 
 _UNSURE = "#55606e"
@@ -39,5 +39,17 @@ def draw_path(plan: FloorPlan, drawn: DrawnPath) -> str:
     over = f'<path d="{line}" fill="none" stroke="{FOUND}" stroke-width="{extent / 400:.4f}"/>{dots}{start}'
     last_x, last_y = drawn.position_m[-1]
     marker = Marker(x_m=float(last_x), y_m=float(last_y), heading_deg=drawn.heading_deg)
-    head, tail = svg_around(plan.name, plan.bounds_m, marker)
-    return head + draw_rooms(plan).replace(HEAT_PLACE, "") + over + tail
+    return plan_with(plan, over, marker)
+
+
+def draw_places(plan: FloorPlan, places: Sequence[tuple[str, Marker]]) -> str:
+    """Draw a plan with a camera, labelled with its text, for each place."""
+    extent = extent_m(plan)
+    size = extent / 60
+    cameras = "".join(
+        f"{draw_camera(marker, extent)}"
+        f'<text x="{marker.x_m:.3f}" y="{size * 1.8 - marker.y_m:.3f}" font-size="{size:.3f}" fill="{INK}" '
+        f'stroke="#fff" stroke-width="{size / 5:.4f}" paint-order="stroke">{xml_text(text)}</text>'
+        for text, marker in places
+    )
+    return plan_with(plan, cameras)

@@ -4,7 +4,7 @@ The belief after a photograph is
 
     b'(s) ∝ ((1 - c) prediction(s) + c prior(s)) · (L(s) + f),    L(s) = exp(-T (cost(s) - best)),
 
-with the prediction of `Ground.moved`, the probability c of being carried anywhere, and the likelihood L of the
+with the prediction of `TrackedPlans.moved`, the probability c of being carried anywhere, and the likelihood L of the
 posterior of a single photograph (`localise.belief.posterior`). Photographs in doorways or close to furniture can fit
 elsewhere better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds
 of an outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief;
@@ -23,27 +23,16 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.belief import area_shares, confidence_of, signals_of
-from lalaloc_core.localise.encode.encoders import Encoders
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingCost, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, KnownHeading, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job, with_latents
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, SearchStage, StageClock
 from lalaloc_core.localise.search.retrieval import grid_costs
-from lalaloc_core.localise.tracking.ground import Ground
-from lalaloc_core.localise.tracking.modes import (
-    Compared,
-    hypothesis_of,
-    modes_of,
-    ranked_modes,
-    regained,
-    relative_likelihood,
-    sector_of,
-    share_alone,
-)
-from lalaloc_core.localise.tracking.motion import Odometry, States
+from lalaloc_core.localise.tracking.belief_modes import ComparedStates, hypothesis_of, sector_of
 from lalaloc_core.localise.tracking.pose_fusion import carried_on, contradicted, fused, measured_pose
-from lalaloc_core.localise.tracking.state import (
+from lalaloc_core.localise.tracking.track_state import (
     COMPONENTS,
     MAX_STATES,
     RECENT,
@@ -52,6 +41,8 @@ from lalaloc_core.localise.tracking.state import (
     TrackedPose,
     TrackState,
 )
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.walk_motion import Odometry, States
 
 # Probability of being carried elsewhere between two photographs, and odds of a photograph that fits its place badly.
 _CARRIED, _OUTLIER = 0.003, 0.05
@@ -97,8 +88,8 @@ TrackSteps = Generator[RefinementJob, RefinementResult | None, Tracked]
 
 
 def track_steps(
-    ground: Ground,
-    encoders: Encoders,
+    ground: TrackedPlans,
+    encoder: LayoutEncoder,
     state: TrackState,
     query: Query,
     odometry: Odometry | None,
@@ -113,7 +104,7 @@ def track_steps(
 
     Args:
         ground: the plans that the camera can be in.
-        encoders: the networks.
+        encoder: the networks.
         state: state after the photographs before.
         query: the photograph, encoded with an unknown heading.
         odometry: motion since the photograph before; None if it is unknown.
@@ -128,48 +119,48 @@ def track_steps(
         InvalidHintError: see `Hints.check`.
     """
     config, clock = config or LocaliseConfig(), clock or StageClock()
-    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
     plan, grid = ground.plan, ground.grid
     state = ground.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):
         prediction = _predict(ground, state, odometry, known_heading, hints)
     with clock.stage("retrieve"):
-        everything, grid_cost = _compare(ground, encoders, query, prediction, config)
+        everything, grid_cost = _compare(ground, encoder, query, prediction, config)
         compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
-    starts = modes_of(grid, query, compared, config)
+    starts = compared.modes()
     refined = ends = starts
     stage = _RETRIEVAL
     with clock.stage("lpo"):
         job = refinement_job(plan, query, starts, grid.camera_height_m, weights, matching)
         result = yield job
         if result is not None:
-            refined = refined_candidates(plan, encoders, query, starts, result, matching)
+            refined = refined_candidates(plan, encoder, query, starts, result, matching)
             # The photograph is rather an outlier at modes that fit worse than this.
-            followed = relative_likelihood(refined, weights.temperature, compared.outlier) >= 2.0 * compared.outlier
+            followed = compared.relative_likelihood(refined) >= 2.0 * compared.outlier
             ends = [
                 end if is_followed else start for start, end, is_followed in zip(starts, refined, followed, strict=True)
             ]
             stage = "lpo"
     with clock.stage("rank"):
-        compared = regained(grid, query, compared, starts, refined, weights.temperature, config.separation_m)
-        candidates, posterior = ranked_modes(grid, query, compared, starts, ends, config, top_k)
-        candidates = with_latents(plan, encoders, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        by_chance = cost_by_chance(encoders.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
-        model = encoders.manifest.confidence_for(view=query.is_view)
+        compared = compared.regained(starts, refined)
+        candidates, posterior = compared.ranked(starts, ends, top_k)
+        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
+        by_chance = cost_by_chance(encoder.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
+        model = encoder.manifest.confidence_for(view=query.is_view)
         signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
         confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
     fit = None if confidence is None else confidence.fit
     in_plan = _in_plan(state.in_plan, fit)
     probability = in_plan * posterior.position
     mode = _mode(in_plan, probability)
-    measured = measured_pose(plan, encoders, query, candidates[0])
+    measured = measured_pose(plan, encoder, query, candidates[0])
     own_plan = ground.plan_of_room(candidates[0].room_index)
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
     predicted = None if before is None or odometry is None else carried_on(before, odometry)
     tracking = before is not None and before.mode == mode == "tracking"
     # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
-    sure = share_alone(grid, query, everything, candidates[0], weights.temperature, config.separation_m) >= _SURE
+    sure = everything.share_alone(candidates[0]) >= _SURE
     comparable = tracking or (sure and before is not None and before.sure)
     judged = comparable and candidates[0].information is not None
     differing = contradicted(before, odometry, predicted, measured) if comparable else ()
@@ -213,7 +204,7 @@ class _Prediction:
 
 
 def _predict(
-    ground: Ground, state: TrackState, odometry: Odometry | None, known: KnownHeading | None, hints: Hints
+    ground: TrackedPlans, state: TrackState, odometry: Odometry | None, known: KnownHeading | None, hints: Hints
 ) -> _Prediction:
     sectors, share = state.sectors, area_shares(ground.grid.poses, ground.plan.areas_m2)
     if state.number == 0:
@@ -236,10 +227,10 @@ def _predict(
 
 
 def _compare(
-    ground: Ground, encoders: Encoders, query: Query, prediction: _Prediction, config: LocaliseConfig
-) -> tuple[Compared, float]:
+    ground: TrackedPlans, encoder: LayoutEncoder, query: Query, prediction: _Prediction, config: LocaliseConfig
+) -> tuple[ComparedStates, float]:
     """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
-    weights, matching = encoders.manifest.evidence_for(view=query.is_view), config.matching
+    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
     plan, grid, sectors = ground.plan, ground.grid, len(query.roll)
     costs = grid_costs(plan, grid, query, weights, matching)
     number = costs.pose * sectors + sector_of(query, costs.hypothesis)
@@ -260,11 +251,24 @@ def _compare(
     weight = flat[number] * (value + outlier)
     rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
     total = float(weight.sum()) + rest
-    return Compared(pose, sector, cost, offset, weight / total, rest / total, outlier), float(costs.cost.min())
+    compared = ComparedStates(
+        grid=grid,
+        query=query,
+        pose=pose,
+        sector=sector,
+        cost=cost,
+        offset=offset,
+        weight=weight / total,
+        rest=rest / total,
+        outlier=outlier,
+        temperature=weights.temperature,
+        separation_m=config.separation_m,
+    )
+    return compared, float(costs.cost.min())
 
 
 def _elsewhere(
-    ground: Ground, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
+    ground: TrackedPlans, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
 ) -> tuple[float, float]:
     """Return the likelihood of an outlier, and the weight of the plans that the ground leaves out.
 
@@ -294,7 +298,7 @@ def _mode(in_plan: float, probability: float) -> Mode:
 
 def _state_after(
     state: TrackState,
-    compared: Compared,
+    compared: ComparedStates,
     in_plan: float,
     pose: TrackedPose,
     missed: tuple[Component, ...],

@@ -20,7 +20,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.horizon_attention import HorizonAttention
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, WallModes
-from lalaloc_core.nets.layout_encoder import RingConfig
+from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 
 # Smallest update rate of the running class shares.

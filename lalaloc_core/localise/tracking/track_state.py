@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.localise.tracking.motion import States
+from lalaloc_core.localise.tracking.walk_motion import States
 
 Mode = Literal["searching", "tracking", "lost"]
 Component = Literal["forward_m", "right_m", "turn_deg"]

@@ -10,7 +10,7 @@ import numpy as np
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, Posterior, photograph_heading
 from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.sequence.search import SequenceLocalisation
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 
 
 def localised_turn(found: Localisation, turns: Sequence[float]) -> SequenceLocalisation:
