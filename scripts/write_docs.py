@@ -39,7 +39,7 @@ _OTHER_FOLDERS = {
     "models/default": ("The shipped model and its card.", "README.md"),
     "docker": ("Image, compose files, nginx, Kubernetes manifests, Grafana dashboard.", "compose.yaml"),
     "tests": (
-        "Tests, one folder per subject: `core/`, `plans/` (plan files), `service/`, `client/`, `web/`.",
+        "Tests, one folder per subject: `core/`, `importers/`, `service/`, `client/`, `web/`.",
         "test_boundaries.py",
     ),
 }

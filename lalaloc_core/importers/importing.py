@@ -136,7 +136,7 @@ def import_if_native(
 
 
 def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> bytes:
-    """Return a plan as a file; the bytes depend only on the plan, except for DXF, which contains the time.
+    """Return a plan as a file. Equal plans give equal bytes, whenever and wherever they are written.
 
     `anchor` places the plan's origin on Earth for IMDF and GeoJSON; by default it is the plan's own.
 

@@ -8,7 +8,9 @@ repairs it if it is damaged. Block contents are counted before they are expanded
 from __future__ import annotations
 
 import io
+import threading
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +53,8 @@ _CLOSED = 1e-5
 # Layers of exported drawings, with their colours.
 _LAYERS = {"ROOM": 7, "COLUMN": 8, "WALL": 1, "DOOR": 3, "WINDOW": 5, "PASSAGE": 30, "ROOM-TEXT": 2}
 _INSUNITS_METRES = 6
+# Held while the options of ezdxf, which all threads share, are changed.
+_OPTIONS = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -85,10 +89,21 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     )
 
 
+@contextmanager
+def _fixed_metadata() -> Iterator[None]:
+    """Let ezdxf write fixed times and ids, so that a plan always gives the same file."""
+    with _OPTIONS:
+        before = dxf_options.write_fixed_meta_data_for_testing
+        dxf_options.write_fixed_meta_data_for_testing = True
+        try:
+            yield
+        finally:
+            dxf_options.write_fixed_meta_data_for_testing = before
+
+
+@_fixed_metadata()
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return a plan as a DXF drawing in metres; heights, ids and the anchor are lost."""
-    # Without times and random ids, so that a plan always gives the same file.
-    dxf_options.write_fixed_meta_data_for_testing = True
     drawing = new_dxf("R2010")
     drawing.header["$INSUNITS"] = _INSUNITS_METRES
     for layer, colour in _LAYERS.items():
@@ -106,6 +121,9 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     for opening in document.get("openings", ()):
         start, end = opening["line"]
         space.add_line(start, end, dxfattribs={"layer": opening["kind"].upper()})
+    # ezdxf would add the classes in the order of a set, which differs between processes.
+    for kind in sorted(drawing.entitydb.dxf_types_in_use()):
+        drawing.classes.add_class(kind)
     text = io.StringIO()
     drawing.write(text)
     return text.getvalue().encode()
