@@ -34,7 +34,8 @@ def test_exported_plan_is_imported_unchanged(flat: FloorPlan, format):
 
 def test_equal_plans_give_equal_bytes_in_every_process(flat: FloorPlan):
     program = (
-        "import hashlib, json, sys\nfrom lalaloc_core.floorplan import FloorPlan\nfrom lalaloc_core.importers import *\n"
+        "import hashlib, json, sys\nfrom lalaloc_core.floorplan import FloorPlan\n"
+        "from lalaloc_core.importers import EXPORT_FORMATS, Anchor, export_plan\n"
         f"plan, anchor = FloorPlan.from_dict(json.load(sys.stdin)), {ANCHOR!r}\n"
         "print([hashlib.sha256(export_plan(plan, format, anchor)).hexdigest() for format in EXPORT_FORMATS])"
     )

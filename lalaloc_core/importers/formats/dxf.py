@@ -32,12 +32,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
-from lalaloc_core.importers.drawing.sketching import sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
@@ -73,20 +73,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """
     document = _open(content)
     _check_blocks(document, budget)
-    builder = ReportBuilder()
+    builder = ReportBuilder("dxf")
     drawing = _read_drawing(document, options, builder, budget)
-    factor, source = find_unit(document, drawing, options, builder)
+    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    drawing = drawing.scaled(factor, flip_y=options.y_axis == "down")
+    drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis == "down")
     sketch = sketch_drawing(drawing, builder, budget)
-    return (
-        assemble(
-            sketch, builder, options, budget.limits.plan, format="dxf", metres_per_unit=factor, scale_source=source
-        ),
-    )
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
 @contextmanager
@@ -291,10 +287,9 @@ def _add_block(
     for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
         if part.dxftype() in _LINES | _FILLED:
             _add(part, context, inner, ReportBuilder(), sag, budget)
-    shapes = [*(area.shape for area in inner.areas), *(stroke.line for stroke in inner.strokes)]
-    if not shapes:
+    if not inner.shapes:
         return
-    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes))
+    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(inner.shapes))
     builder.use(context.layer, f"blocks: {context.role}")
     if isinstance(box, shapely.Polygon):
         drawing.areas.append(Area(box, context.layer, context.role))

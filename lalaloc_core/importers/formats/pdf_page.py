@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.drawing.shapes import (
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     DARK,
     Area,

@@ -18,23 +18,21 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import opening_line
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.trace import Trace, TracePart
 from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
-from lalaloc_core.importers.drawing.dimensions import check_areas
-from lalaloc_core.importers.drawing.leaves import (
+from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,
     take_leaves,
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
-from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
+from lalaloc_core.importers.drawing.drawing_scale import check_areas
+from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Enclosed, Gap, enclose
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing
 
-_MIN_ROOM_M2 = 0.6
 # Names in a room besides its own that are listed.
 _MAX_OTHERS = 5
 # Largest distance between parts of one symbol (leaf, frame, panes).

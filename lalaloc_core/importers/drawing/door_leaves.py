@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from lalaloc_core.importers.common.geometry import point_xy
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Stroke, Swing, fit_swing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, fit_swing
 
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
 LEAF_M = (0.45, 1.6)

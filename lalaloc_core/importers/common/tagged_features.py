@@ -19,11 +19,11 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.map_projection import projection
 from lalaloc_core.importers.common.opening_placement import WallLines
-from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.projection import projection
-from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
 
@@ -107,7 +107,7 @@ def import_features(
     by_level = _levels_with_rooms(by_level, is_indoor)
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
-        builder = ReportBuilder()
+        builder = ReportBuilder(format, metres_per_unit, source)
         sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
         if anchor is not None:
             sketch.north_deg = anchor.north_deg
@@ -118,15 +118,7 @@ def import_features(
             _add_to_sketch(feature, role, project(feature.shape), sketch, points, options, builder)
             budget.check_time()
         _add_points(points, sketch, builder)
-        return assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format=format,
-            metres_per_unit=metres_per_unit,
-            scale_source=source,
-        )
+        return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(by_level, options, budget.limits, make)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.common.options import METRES_PER_UNIT
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT
 
 # Usual ranges; a value outside gives a warning with the unit that would make it usual.
 USUAL_CEILING_M = (1.9, 6.0)

@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
 
 # Formats with a function `write` in their module.
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg", "ros"]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.importers.drawing.walls import Gap
+from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
