@@ -9,9 +9,7 @@ stored exactly once and usable, no other plan is stored, and the database has no
 from __future__ import annotations
 
 import json
-import os
 import random
-import signal
 import sqlite3
 import sys
 import tempfile
@@ -25,8 +23,7 @@ from typing import Any
 
 import httpx
 
-from benchmarks.harness import argument_parser, query_of
-from examples.launch import running_service
+from benchmarks.harness import argument_parser, query_of, started_service, wait_until
 from examples.truth import PLAN_PATH, read_poses
 from lalaloc_client import Client
 
@@ -78,11 +75,7 @@ class Uploads:
 
     def wait_for(self, count: int) -> None:
         """Wait until a number of uploads are answered."""
-        deadline = time.monotonic() + _TIMEOUT_S
-        while len(self.plan_ids) < count:
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"{len(self.plan_ids)} of {count} uploads are answered after {_TIMEOUT_S:g} s")
-            time.sleep(0.02)
+        wait_until(lambda: len(self.plan_ids) >= count, f"{count} uploads are answered", _TIMEOUT_S, 0.02)
 
 
 def main() -> int:
@@ -93,16 +86,15 @@ def main() -> int:
     options = parser.parse_args()
     rng, names = random.Random(0), [f"plan {number:04d}" for number in range(options.plans)]
     with tempfile.TemporaryDirectory() as data, ThreadPoolExecutor(_CLIENTS) as clients:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", "LALALOC_WORKERS": "0"}
         uploads, pending = Uploads(), []
         for life in range(options.kills + 1):
-            with running_service(0, settings) as service:
+            with started_service(Path(data), {"LALALOC_WORKERS": "0"}) as service:
                 uploads.url = service.url
                 pending = pending or [clients.submit(uploads.upload, name) for name in names]
                 if life < options.kills:
                     uploads.wait_for((life + 1) * options.plans // (options.kills + 1))
                     time.sleep(rng.uniform(0.0, 0.2))
-                    os.kill(service.process.pid, signal.SIGKILL)
+                    service.process.kill()
                     service.process.wait()
                     continue
                 try:

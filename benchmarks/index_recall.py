@@ -1,75 +1,38 @@
-"""Search among very many plans: speed and recall of the index of prototypes.
+"""Recall of the index of prototypes among very many plans, for `city.py` and `large_venue.py`.
 
-    python -m benchmarks.venues index --plans 2000 --queries 20 --exact 1e9
-    python -m benchmarks.venues index --plans 2500 --repeat 40 --queries 12 --exact 0
-    python -m benchmarks.venues search --plans 400 --queries 24
-
-Generated homes take the place of real ones; queries are rendered photographs of some of them, encoded by the model.
-Times are processor times of one thread.
-
-`index` compares the index with brute force. `--repeat` adds variants of each home: stretched along both axes, with
+Generated homes take the place of real ones, and variants of them that of more homes: stretched along both axes, with
 other ceilings, turned by quarters and mirrored at random. Their prototypes are computed from those of the home, exactly
-up to interpolation between azimuths. Brute force compares all prototypes under all hypotheses where that is at most
-`--exact` pairs (half a minute for every 100 million); beyond, it compares all of them by codes and the best million
-exactly. It aligns the best hundred thousand.
-
-`search` localises each query twice with the production search and LPO: among the plans that the index chooses, as the
-service does, and among all plans.
+up to interpolation between azimuths. Queries are rendered photographs of some homes, encoded by the model.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import argument_parser
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.encoders import Encoders
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import CameraHeight, Query
-from lalaloc_core.localise.search.pipeline import localise
-from lalaloc_core.localise.venue.index_search import ALIGNED, COMPARED, SCANNED, SearchLimits
-from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.venue.index_search import ALIGNED, SearchLimits
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from lalaloc_core.localise.venue.prototypes import (
-    AZIMUTHS,
-    most_probable,
-    packed_openings,
-    prototypes_of,
-    unpacked_openings,
-)
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
 from scripts.make_prototype_cells import grid_without_latents
-from service.query.venue_localiser import VENUE_CONFIG
-from service.settings import Settings
-from service.venues.prototype_file import BlockKey, PrototypeFile
-from service.venues.venue_plans import MAX_SEARCHED, most_poses
 
 _TEST = SPLIT_NUMBERS["test"]
-_FIRST = 20
 # Variants are longer and wider by at most this share.
 _MAX_STRETCH = 0.1
-# Pairs that brute force compares exactly where it compares all pairs by codes.
-_MAX_COMPARED = 1_000_000
-# Pairs that brute force aligns.
-_MAX_ALIGNED = 100_000
 _STEP_M = 0.5
 # Homes that `recall` generates at most; further plans are variants of them. Ranks within which it counts right plans.
 _HOMES, _RANKS = 2500, (1, 20, 128)
-
-_Figures = defaultdict[str, defaultdict[str, list[Any]]]
 
 
 def prototypes(plans: int, seed: int) -> list[np.ndarray]:
@@ -170,126 +133,3 @@ def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[
         }
         for name, values in columns.items()
     }
-
-
-def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
-    """Print times and recall of the index."""
-    blocks = repeated(prototypes(options.plans, options.seed), options.repeat, np.random.default_rng(options.seed))
-    count = np.array([len(block) for block in blocks])
-    print(f"{len(blocks)} plans, {count.sum()} prototypes of {blocks[0].itemsize} bytes")
-    weights, config = bundle.manifest.evidence, MatchingConfig()
-    figures: _Figures = defaultdict(lambda: defaultdict(list))
-    with tempfile.TemporaryDirectory() as folder:
-        path, cells = Path(folder) / "prototypes.bin", shipped_cells()
-        keys = [BlockKey(number, "0" * 64) for number in range(len(blocks))]
-        begin = time.process_time()
-        file = PrototypeFile(path, cells_version=cells.version, limit_bytes=2**40)
-        file.add(dict(zip(keys, blocks, strict=True)))
-        written = time.process_time()
-        file.close()
-        file = PrototypeFile(path, cells_version=cells.version, limit_bytes=2**40)
-        opened = time.process_time()
-        found = file.find(keys)
-        first = np.array([found[key][0] for key in keys])
-        index = PlanIndex.build(file.rows(), first, count, step_m=_STEP_M, cells=cells)
-        built = time.process_time()
-        index.prepare()
-        print(
-            f"written in {written - begin:.2f} s, opened in {opened - written:.2f} s, index in {built - opened:.2f} s, "
-            f"its codes in {time.process_time() - built:.2f} s, {index.nbytes / 1e6:.0f} MB",
-            flush=True,
-        )
-        homes = np.linspace(0, options.plans - 1, options.queries).astype(int).tolist()
-        for number, name, query in queries(bundle, homes, options.seed):
-            pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
-            reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
-            limits = SearchLimits(compared=compared, scanned=10**15, aligned=_MAX_ALIGNED)
-            exact = _ranked(index.whole.log_masses(query, weights, config, limits))
-            for scanned in options.scanned:
-                begin, began = time.process_time(), time.perf_counter()
-                fewer = SearchLimits(compared=options.compared, scanned=int(scanned))
-                mass = index.whole.log_masses(query, weights, config, fewer)
-                columns = figures[f"{name}, {scanned:,.0f} pairs by codes"]
-                columns["ms"].append(1e3 * (time.process_time() - begin))
-                columns["ms of wall clock"].append(1e3 * (time.perf_counter() - began))
-                ranked = _ranked(mass)
-                columns["right plan in the first 20"].append(number in ranked[:_FIRST])
-                columns["right plan in the first 128"].append(number in ranked[:128])
-                shared = np.intersect1d(ranked[:_FIRST], exact[:_FIRST])
-                columns[f"{reference}: recall of 20"].append(len(shared) / _FIRST)
-                columns[f"{reference}: its first in the first 20"].append(exact[0] in ranked[:_FIRST])
-                columns[f"{reference}: right plan in the first 20"].append(number in exact[:_FIRST])
-        file.close()
-    for name, columns in figures.items():
-        print(f"{name}, n = {options.queries}")
-        for column, values in columns.items():
-            if column.startswith("ms"):
-                print(f"  {column}: p50 {np.median(values):.0f}, p95 {np.percentile(values, 95):.0f}")
-            else:
-                print(f"  {column}: {np.mean(values):.1%} of {len(values)}")
-
-
-def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
-    """Print shares of right plans and times of the full search."""
-    limit, encoders, refiner = Settings.load().grids.max_grid_poses, Encoders(bundle, threads=1), local_refiner(bundle)
-    homes = [home_of(_TEST, options.seed, number)[0] for number in range(options.plans)]
-    plans, grids = [home.plan for home in homes], [grid_without_latents(home) for home in homes]
-    parts = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]
-    index, poses = PlanIndex.from_prototypes(parts, shipped_cells()), np.array([len(grid.poses) for grid in grids])
-
-    def best_plan(query: Query, chosen: list[int]) -> int:
-        merged = MergedPlans.of([plans[k] for k in chosen], [grids[k] for k in chosen], query.camera_height.height_m)
-        answer = localise(merged.plan, merged.grid, encoders, query, refiner=refiner, config=VENUE_CONFIG)
-        return chosen[merged.in_own_plan(answer.candidates[0])[0]]
-
-    figures: _Figures = defaultdict(lambda: defaultdict(list))
-    photographed = np.linspace(0, options.plans - 1, options.queries).astype(int).tolist()
-    for number, name, query in queries(bundle, photographed, options.seed):
-        begin = time.process_time()
-        mass = index.whole.log_masses(query, bundle.manifest.evidence, MatchingConfig())
-        chosen = most_probable(mass, poses, max_plans=MAX_SEARCHED, max_poses=most_poses(query, limit)).tolist()
-        indexed = time.process_time()
-        by_index = best_plan(query, chosen)
-        searched = time.process_time()
-        by_all = best_plan(query, list(range(options.plans)))
-        columns = figures[name]
-        columns["plans searched"].append(len(chosen))
-        columns["right plan among them"].append(number in chosen)
-        columns["right plan first by the index alone"].append(number == int(mass.argmax()))
-        columns["right plan first by index and full search"].append(number == by_index)
-        columns["right plan first by full search of all"].append(number == by_all)
-        columns["the same first plan"].append(by_index == by_all)
-        times_s = [indexed - begin, searched - indexed, time.process_time() - searched]
-        columns["s of index, of full search, of full search of all"].append(times_s)
-    for name, columns in figures.items():
-        print(f"{name}, n = {options.queries}")
-        for column, values in columns.items():
-            print(f"  {column}: {np.round(np.mean(values, axis=0), 3)}")
-
-
-def _ranked(mass: np.ndarray) -> np.ndarray:
-    return np.argsort(-mass, kind="stable")
-
-
-def main() -> None:
-    """Measure the index or the search."""
-    parser = argument_parser(__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    index = commands.add_parser("index", help="index of prototypes against brute force")
-    search = commands.add_parser("search", help="index and full search against full search of all plans")
-    for command, plans, count in ((index, 2000, 20), (search, 400, 24)):
-        command.add_argument("--bundle", type=Path, default=Path("models/default"))
-        command.add_argument("--plans", type=int, default=plans, help="generated homes")
-        command.add_argument("--queries", type=int, default=count)
-        command.add_argument("--seed", type=int, default=0)
-    index.add_argument("--repeat", type=int, default=1, help="plans made of each home, itself included")
-    index.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares exactly")
-    index.add_argument("--scanned", type=float, nargs="+", default=[SCANNED], help="pairs it compares by codes")
-    index.add_argument("--exact", type=float, default=1e9, help="maximum pairs that brute force compares per query")
-    options = parser.parse_args()
-    measure = measure_index if options.command == "index" else measure_search
-    measure(options, Bundle.open(options.bundle))
-
-
-if __name__ == "__main__":
-    main()

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from benchmarks.harness import argument_parser
+from benchmarks.harness import argument_parser, print_table_head
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
@@ -76,10 +76,8 @@ def main() -> None:
     arguments = parser.parse_args()
     bundle = Bundle.open(arguments.bundle)
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
-    print(
-        "| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | brute force agrees |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    head = "area m², rooms, poses, read, ready, grid and a pose, known, unknown, retrieval, brute force agrees"
+    print_table_head(*head.split(", "))
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
         print(_measure(building, bundle, renderers, arguments.queries, oracle=area_m2 <= arguments.oracle), flush=True)

@@ -11,7 +11,7 @@ the venue, added again, replaced and deleted: each time, the first query must be
 service is killed and started again.
 
 Next to the time of the wall clock stands the processor time of the service and its workers, which other work on the
-machine hardly changes. `--photographs` adds the recall of the index among generated homes, as in `benchmarks.venues`.
+machine hardly changes. `--photographs` adds the recall of the index among generated homes (`benchmarks.index_recall`).
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from typing import Any
 
 import httpx
 import numpy as np
-import psutil
 
-from benchmarks.harness import Service, argument_parser, query_of, resident_mb, upload_example_plan
-from benchmarks.venues import recall
-from examples.launch import ROOT, running_service
+from benchmarks import harness
+from benchmarks.index_recall import recall
+from examples.launch import ROOT
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, VenuePlan
 from lalaloc_core.bundle import Bundle
@@ -64,7 +63,7 @@ def upload(client: httpx.Client, documents: Sequence[dict[str, Any]]) -> list[st
         return [response.raise_for_status().json()["id"] for response in responses]
 
 
-def upload_files(service: Service, shown: str, documents: Sequence[dict[str, Any]]) -> str:
+def upload_files(service: harness.Service, shown: str, documents: Sequence[dict[str, Any]]) -> str:
     """Upload plans in files that extend a venue, which begins with a stored plan; return its id."""
     files = [documents[first : first + _FILE] for first in range(0, len(documents), _FILE)]
     with Client(service.url, timeout_s=300.0) as client, ThreadPoolExecutor(_CLIENTS) as threads:
@@ -102,35 +101,24 @@ def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
 class Stopwatch:
     """Wall clock and processor time of a service and its workers since the stopwatch was made."""
 
-    def __init__(self, service: Service) -> None:
-        self._process, self._wall, self._cpu = service.process, time.perf_counter(), _cpu_s(service.process)
+    def __init__(self, service: harness.Service) -> None:
+        self._process, self._wall, self._cpu = service.process, time.perf_counter(), harness.cpu_s(service.process)
 
     def figures(self) -> dict[str, float]:
         """Return the times in ms."""
-        wall, cpu = time.perf_counter() - self._wall, _cpu_s(self._process) - self._cpu
+        wall, cpu = time.perf_counter() - self._wall, harness.cpu_s(self._process) - self._cpu
         return {"wall_ms": round(1e3 * wall), "cpu_ms": round(1e3 * cpu)}
-
-
-def _cpu_s(process: psutil.Process) -> float:
-    total = 0.0
-    for part in (process, *process.children(recursive=True)):
-        try:
-            times = part.cpu_times()
-        except psutil.NoSuchProcess:
-            continue
-        total += times.user + times.system
-    return total
 
 
 class Venue:
     """Venue of the benchmark, and its client."""
 
-    def __init__(self, service: Service, client: httpx.Client, venue_id: str) -> None:
+    def __init__(self, service: harness.Service, client: httpx.Client, venue_id: str) -> None:
         self.service, self.client, self.id = service, client, venue_id
 
     def localise(self, pose: TruePose, *, heading: bool) -> dict[str, Any]:
         """Localise an example panorama, with or without its heading; return the answer and the times."""
-        query, watch = query_of(pose, venue_id=self.id), Stopwatch(self.service)
+        query, watch = harness.query_of(pose, venue_id=self.id), Stopwatch(self.service)
         if not heading:
             del query["data"]["heading_deg"]
         answer = self.client.post("/localise", **query).raise_for_status().json()
@@ -158,16 +146,15 @@ def _median(figures: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 @contextmanager
-def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[Service, httpx.Client]]:
+def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[harness.Service, httpx.Client]]:
     limits = {"LALALOC_MAX_FLOORPLANS": f"{plans + 10}", "LALALOC_MAX_VENUE_PLANS": f"{plans + 10}"}
     # 7.5 kB per home, and some to spare.
     limits["LALALOC_VENUE_CACHE_BYTES"] = f"{max(2**27, 10_000 * plans)}"
-    environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", "PYTHONPATH": str(checkout), **limits}
     with (
-        running_service(0, environment, checkout) as started,
-        httpx.Client(base_url=started.url, timeout=300.0) as client,
+        harness.started_service(Path(data), limits, checkout) as service,
+        httpx.Client(base_url=service.url, timeout=300.0) as client,
     ):
-        yield Service(started.url, "", Path(data), psutil.Process(started.process.pid)), client
+        yield service, client
 
 
 def _queries(venue: Venue, plan_id: str) -> dict[str, Any]:
@@ -202,8 +189,8 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
     with tempfile.TemporaryDirectory() as data:
         with _running(data, plans, checkout) as (service, client):
             resident = report["resident_mb"]
-            resident["empty"] = round(resident_mb(service.process))
-            shown, watch = upload_example_plan(service.url), Stopwatch(service)
+            resident["empty"] = round(harness.resident_mb(service.process))
+            shown, watch = harness.upload_example_plan(service.url), Stopwatch(service)
             documents = [random_home(number) for number in range(plans - 1)]
             if one_by_one:
                 venue_id = upload_one_by_one(client, shown, documents)
@@ -212,16 +199,16 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
             report["uploaded"] = watch.figures()
             ready = wait_until_ready(client, venue_id)
             report["until_ready"] = watch.figures()
-            resident["ready"] = round(resident_mb(service.process))
+            resident["ready"] = round(harness.resident_mb(service.process))
             with Client(service.url) as paging:
                 listed = [(plan.level, plan.floorplan_id) for plan in paging.venue_plans(venue_id, page_size=_PAGE)]
             venue = Venue(service, client, venue_id)
             report["queries"] = _queries(venue, shown)
-            resident["localised"] = round(resident_mb(service.process))
+            resident["localised"] = round(harness.resident_mb(service.process))
             if not changes:
                 return report
             report["changes"] = _changes(venue, shown)
-            again = upload_example_plan(service.url)
+            again = harness.upload_example_plan(service.url)
             added = {"plans": [{"floorplan_id": again, "level": 0}]}
             report["changes"]["uploaded"] = venue.changed(
                 "PATCH", f"/venues/{venue_id}", again, is_found=True, json=added
@@ -232,7 +219,7 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
             started = time.perf_counter()
             first = Venue(service, client, venue_id).localise(read_poses()[0], heading=True)
             report["after_kill"] = {"started_ms": round(1e3 * (started - begin)), "first_query": _times(first)}
-            report["resident_mb"]["after_kill"] = round(resident_mb(service.process))
+            report["resident_mb"]["after_kill"] = round(harness.resident_mb(service.process))
     report["expected"] = {
         "all plans are ready": ready["plans_ready"] == plans,
         "pages list every plan once, in order": listed == sorted(set(listed)) and len(listed) == plans,
@@ -245,7 +232,7 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
 
 def main() -> int:
     """Measure; return 1 when a plan is missing or an answer is wrong."""
-    parser = argument_parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=10_000)
     parser.add_argument("--photographs", type=int, default=0, help="photographs of the recall; 0 leaves it out")
     parser.add_argument("--one-by-one", action="store_true", help="upload every plan in a request of its own")
