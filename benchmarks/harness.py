@@ -219,9 +219,8 @@ def form(fields: tuple[tuple[str, str], ...], files: tuple[tuple[str, bytes], ..
 def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
     """Return the query with an example panorama, its heading and its camera height, as body and media type."""
     poses = read_poses()
-    pose = poses[number % len(poses)]
-    fields = {"floorplan_id": plan_id, "heading_deg": pose.heading_deg, "camera_height_m": pose.camera_height_m}
-    return form(tuple((name, str(value)) for name, value in fields.items()), (("panorama", pose.picture.read_bytes()),))
+    query = query_of(poses[number % len(poses)], floorplan_id=plan_id)
+    return form(tuple(query["data"].items()), (("panorama", query["files"]["panorama"][1]),))
 
 
 @dataclass(frozen=True)
