@@ -26,7 +26,7 @@ HEAD_BYTES = 65536
 _START = rb"(?:\xef\xbb\xbf)?\s*"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Format:
     """Description of a file format.
 
@@ -89,117 +89,34 @@ def _xml(element: str) -> re.Pattern[bytes]:
     return re.compile(_START + rb"(?=<(?:\?xml|!--|!DOCTYPE|[A-Za-z])).*?(?:<|:)" + name, re.DOTALL)
 
 
-_DRAWN_SCALE = {"metres_per_pixel", "known_distance"}
+def _format(name: str, title: str, media_type: str, suffix: str, options: str, **more: Any) -> Format:
+    return Format(name, title, media_type, suffix, frozenset(options.split()), **more)
 
-FORMATS: Mapping[str, Format] = {
-    record.name: record
-    for record in (
-        Format(
-            name="native",
-            title="native JSON",
-            media_type="application/json",
-            suffix="json",
-            options=frozenset({"units", "y_axis", "level"}),
-        ),
-        Format(
-            name="geojson",
-            title="GeoJSON",
-            media_type="application/geo+json",
-            suffix="geojson",
-            options=frozenset({"units", "y_axis", "level", "layers"}),
-        ),
-        Format(
-            name="osm",
-            title="OpenStreetMap (XML, Overpass JSON)",
-            media_type="application/vnd.openstreetmap.data+xml",
-            suffix="osm",
-            options=frozenset({"level", "layers"}),
-            magic=_xml("osm"),
-            keys=frozenset({"elements"}),
-        ),
-        Format(
-            name="roomplan",
-            title="RoomPlan",
-            media_type="application/json",
-            suffix="json",
-            options=frozenset({"level"}),
-            keys=frozenset({"walls", "doors", "windows"}),
-        ),
-        Format(
-            name="imdf",
-            title="IMDF",
-            media_type="application/zip",
-            suffix="imdf.zip",
-            options=frozenset({"level", "layers"}),
-            magic=re.compile(rb"PK\x03\x04"),
-        ),
-        Format(
-            name="ros",
-            title="ROS map (zip archive of YAML and PGM)",
-            media_type="application/zip",
-            suffix="map.zip",
-            options=frozenset({"metres_per_pixel"}),
-            # A picture of a map, or its YAML file.
-            magic=re.compile(rb"P[25]\s|(?:[a-z_]+:[^\n]*\n|\s|#[^\n]*\n)*image:"),
-        ),
-        Format(
-            name="dxf",
-            title="DXF",
-            media_type="image/vnd.dxf",
-            suffix="dxf",
-            options=frozenset({"units", "layers", "y_axis", *_DRAWN_SCALE}),
-            magic=re.compile(
-                rb"AutoCAD Binary DXF|" + _START + rb"(?:999\r?\n[^\n]*\n\s*)*0\r?\n\s*SECTION", re.DOTALL
-            ),
-        ),
-        Format(
-            name="dwg",
-            title="DWG (with a converter)",
-            media_type="image/vnd.dwg",
-            suffix="dwg",
-            options=frozenset({"units", "layers", "y_axis", *_DRAWN_SCALE}),
-            magic=re.compile(rb"AC10\d\d"),
-        ),
-        Format(
-            name="indoorgml",
-            title="IndoorGML",
-            media_type="application/gml+xml",
-            suffix="gml",
-            options=frozenset({"units", "level"}),
-            magic=_xml("IndoorFeatures"),
-        ),
-        Format(
-            name="svg",
-            title="SVG",
-            media_type="image/svg+xml",
-            suffix="svg",
-            options=frozenset({"units", "scale", "layers", "y_axis", *_DRAWN_SCALE}),
-            magic=_xml("svg"),
-        ),
-        Format(
-            name="ifc",
-            title="IFC",
-            media_type="application/x-step",
-            suffix="ifc",
-            options=frozenset({"level"}),
-            magic=re.compile(_START + rb"ISO-10303-21"),
-            extra="ifc",
-        ),
-        Format(
-            name="picture",
-            title="PNG and JPEG",
-            media_type="image/png",
-            suffix="png",
-            options=frozenset({"scale", *_DRAWN_SCALE}),
-            magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff"),
-        ),
-        Format(
-            name="pdf",
-            title="PDF",
-            media_type="application/pdf",
-            suffix="pdf",
-            options=frozenset({"scale", "page", *_DRAWN_SCALE}),
-            magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL),
-        ),
-    )
-}
+
+_GML, _OSM = "application/gml+xml", "application/vnd.openstreetmap.data+xml"
+_SCALE = "metres_per_pixel known_distance"
+_DXF = rb"AutoCAD Binary DXF|" + _START + rb"(?:999\r?\n[^\n]*\n\s*)*0\r?\n\s*SECTION"
+# A picture of a map, or its YAML file.
+_ROS = rb"P[25]\s|(?:[a-z_]+:[^\n]*\n|\s|#[^\n]*\n)*image:"
+_FORMATS = (
+    _format("native", "native JSON", "application/json", "json", "units y_axis level"),
+    _format("geojson", "GeoJSON", "application/geo+json", "geojson", "units y_axis level layers"),
+    _format("osm", "OpenStreetMap (XML, Overpass JSON)", _OSM, "osm", "level layers", magic=_xml("osm"),
+            keys=frozenset({"elements"})),
+    _format("roomplan", "RoomPlan", "application/json", "json", "level", keys=frozenset({"walls", "doors", "windows"})),
+    _format("imdf", "IMDF", "application/zip", "imdf.zip", "level layers", magic=re.compile(rb"PK\x03\x04")),
+    _format("ros", "ROS map (zip archive of YAML and PGM)", "application/zip", "map.zip", "metres_per_pixel",
+            magic=re.compile(_ROS)),
+    _format("dxf", "DXF", "image/vnd.dxf", "dxf", f"units layers y_axis {_SCALE}", magic=re.compile(_DXF, re.DOTALL)),
+    _format("dwg", "DWG (with a converter)", "image/vnd.dwg", "dwg", f"units layers y_axis {_SCALE}",
+            magic=re.compile(rb"AC10\d\d")),
+    _format("indoorgml", "IndoorGML", _GML, "gml", "units level", magic=_xml("IndoorFeatures")),
+    _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis {_SCALE}", magic=_xml("svg")),
+    _format("ifc", "IFC", "application/x-step", "ifc", "level", magic=re.compile(_START + rb"ISO-10303-21"),
+            extra="ifc"),
+    _format("picture", "PNG and JPEG", "image/png", "png", f"scale {_SCALE}",
+            magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff")),
+    _format("pdf", "PDF", "application/pdf", "pdf", f"scale page {_SCALE}",
+            magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL)),
+)  # fmt: skip
+FORMATS: Mapping[str, Format] = {record.name: record for record in _FORMATS}

@@ -55,6 +55,15 @@ def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float,
     return point_xy(0.5 * (corners[0] + corners[3])), point_xy(0.5 * (corners[1] + corners[2]))
 
 
+def side_lengths(shape: BaseGeometry) -> tuple[float, float]:
+    """Return the shorter and the longer side of the smallest rectangle around a shape."""
+    points = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
+    if len(points) < 4:
+        return 0.0, float(shape.length)
+    first, second = np.linalg.norm(points[1] - points[0]), np.linalg.norm(points[2] - points[1])
+    return float(min(first, second)), float(max(first, second))
+
+
 def label_position(room: shapely.Polygon) -> tuple[float, float]:
     """Return the centre of the largest circle in a room."""
     return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])

@@ -31,7 +31,7 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
     Raises:
         InvalidFloorPlanError: the document is invalid, or its coordinates cannot be converted.
     """
-    features = parse_features(document, budget)
+    features = list(parse_features(document, budget))
     units = document.get("units") if isinstance(document, Mapping) else None
     if units is not None and options.units is None:
         # `write` adds this member to plans without an anchor.
@@ -50,16 +50,12 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     return json.dumps(collection | {"features": features}, ensure_ascii=False).encode()
 
 
-def parse_features(document: Any, budget: Budget) -> list[Feature]:
-    """Return the features of a GeoJSON document that have a geometry.
+def parse_features(document: Any, budget: Budget) -> Iterator[Feature]:
+    """Yield the features of a GeoJSON document that have a geometry.
 
     Raises:
         InvalidFloorPlanError: the document or a geometry is invalid.
     """
-    return list(_features(document, budget))
-
-
-def _features(document: Any, budget: Budget) -> Iterator[Feature]:
     if not isinstance(document, Mapping):
         raise InvalidFloorPlanError(f"the GeoJSON is of type {type(document).__name__}; it must be an object")
     kind = document.get("type")

@@ -18,7 +18,7 @@ from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.common.tagged_features import import_features
+from lalaloc_core.importers.common.tagged_features import import_features, in_english
 from lalaloc_core.importers.formats.geojson import Projector, parse_features, plan_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
@@ -124,8 +124,7 @@ def _levels(document: Any) -> dict[str, Level]:
 
 
 def _text(value: Any) -> str | None:
-    if isinstance(value, Mapping):
-        value = value.get("en") or next(iter(value.values()), None)
+    value = in_english(value)
     return value[:200] if isinstance(value, str) and value.strip() else None
 
 

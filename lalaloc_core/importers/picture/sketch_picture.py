@@ -76,7 +76,8 @@ def sketch_picture(
     """
     ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)
     budget.check_time()
-    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
+    hypotheses = (dark_walls(ink), True), (outlined_walls(ink), False)
+    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
     if not readings:
         builder.use("ink", "ignored (no possible walls)", 1)
         return Sketch()
@@ -105,10 +106,6 @@ def sketch_picture(
         )
     # A missed or misclassified opening would count against the right pose.
     return Sketch(rooms=rooms, openings=openings, opening_kinds=(), drawn=best.enclosed.walls.envelope)
-
-
-def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
-    return (dark_walls(ink), True), (outlined_walls(ink), False)
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
