@@ -1,4 +1,4 @@
-"""Recall of the index of prototypes among very many plans, for `city.py` and `large_venue.py`.
+"""Recall of the index of prototypes among very many plans, which `city.py` prints.
 
 Generated homes take the place of real ones, and variants of them that of more homes: stretched along both axes, with
 other ceilings, turned by quarters and mirrored at random. Their prototypes are computed from those of the home, exactly

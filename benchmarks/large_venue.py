@@ -1,17 +1,14 @@
-"""Venue with many floor plans: upload, queries, changes of one plan, a crash, memory and recall, over HTTP.
+"""Venue with many floor plans: upload, queries, changes of one plan, a crash and memory, over HTTP.
 
     python -m benchmarks.large_venue --plans 10000
-    python -m benchmarks.large_venue --plans 10000 --photographs 300
-    python -m benchmarks.large_venue --plans 10000 --one-by-one
 
 The plans are random homes of two rooms and the example flat. They are uploaded in files of 200 plans, which extend the
-venue, or one by one. All example panoramas are localised in the venue, whose
-answer must name the flat. The pages of the venue must list every plan once and in order. Then the flat is removed from
-the venue, added again, replaced and deleted: each time, the first query must be answered by the new state. At last the
-service is killed and started again.
+venue. All example panoramas are localised in the venue, whose answer must name the flat. The pages of the venue must
+list every plan once and in order. Then the flat is removed from the venue, added again, replaced and deleted: each
+time, the first query must be answered by the new state. At last the service is killed and started again.
 
 Next to the time of the wall clock stands the processor time of the service and its workers, which other work on the
-machine hardly changes. `--photographs` adds the recall of the index among generated homes (`benchmarks.index_recall`).
+machine hardly changes.
 """
 
 from __future__ import annotations
@@ -31,11 +28,9 @@ import httpx
 import numpy as np
 
 from benchmarks import harness
-from benchmarks.index_recall import recall
 from examples.launch import ROOT
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, VenuePlan
-from lalaloc_core.bundle import Bundle
 
 _CLIENTS, _PAGE, _ROUNDS, _FILE = 4, 500, 3, 200
 _TIMEOUT_S = 7200.0
@@ -234,12 +229,7 @@ def main() -> int:
     """Measure; return 1 when a plan is missing or an answer is wrong."""
     parser = harness.argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=10_000)
-    parser.add_argument("--photographs", type=int, default=0, help="photographs of the recall; 0 leaves it out")
-    parser.add_argument("--one-by-one", action="store_true", help="upload every plan in a request of its own")
-    options = parser.parse_args()
-    report = measure(options.plans, one_by_one=options.one_by_one)
-    if options.photographs:
-        report["recall"] = recall(Bundle.open(Path("models/default")), options.plans, options.photographs)
+    report = measure(parser.parse_args().plans)
     print(json.dumps(report, indent=2))
     return int(not all(report["expected"].values()))
 

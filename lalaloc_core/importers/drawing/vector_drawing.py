@@ -17,7 +17,7 @@ from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.common.vocabulary import Role
 
 # Fills of lower luminance (of 255) can be walls.
-DARK = 110.0
+_DARK = 110.0
 # Straight pieces per curve.
 CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
@@ -142,6 +142,6 @@ def fit_swing(
     return Swing(point_xy(hinge), point_xy(first), point_xy(last), layer)
 
 
-def luminance(red: float, green: float, blue: float) -> float:
-    """Return the luminance of a colour, 0 to 255 like its channels (ITU-R BT.601)."""
-    return 0.299 * red + 0.587 * green + 0.114 * blue
+def is_dark(red: float, green: float, blue: float) -> bool:
+    """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
+    return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK

@@ -30,13 +30,12 @@ from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
-    DARK,
     Area,
     Drawing,
     Lettering,
     Stroke,
     fit_swing,
-    luminance,
+    is_dark,
 )
 
 # Attribute of the root element with the scale of exported drawings.
@@ -248,7 +247,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     name = _name_of(element, context)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = is_filled and _luminance_of(fill) < DARK
+    is_wall = is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
@@ -263,12 +262,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
             drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, context.role, float(width or 0.0)))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
     for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_dark))
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
-
-
-def _luminance_of(colour: Any) -> float:
-    return luminance(float(colour.red), float(colour.green), float(colour.blue))
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
