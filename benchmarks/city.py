@@ -170,11 +170,11 @@ def accuracy(checkouts: Sequence[Path], options: argparse.Namespace) -> Iterator
         yield (
             "photographs: located, heading known; unknown",
             "-0.3 points",
-            [_located(folder, options.photographs) for folder in checkouts],
+            [_located_shares(folder, options.photographs) for folder in checkouts],
         )
 
 
-def _located(checkout: Path, photographs: Path) -> str:
+def _located_shares(checkout: Path, photographs: Path) -> str:
     with tempfile.TemporaryDirectory() as out:
         _lalaloc(checkout, "photographs", "--data", str(photographs.resolve()), "--out", out)
         galleries = json.loads((Path(out) / "photographs.json").read_text(encoding="utf-8"))["galleries"]

@@ -103,7 +103,7 @@ class Decoder:
         return np.hstack([scaled, np.sqrt(2.0) * np.cos(scaled @ self._waves + self._phases)])
 
 
-def explained(found: np.ndarray, pictures: np.ndarray, mean: np.ndarray) -> dict[str, float]:
+def explained_shares(found: np.ndarray, pictures: np.ndarray, mean: np.ndarray) -> dict[str, float]:
     """Return the share of variance that is explained, of brightness and of colour."""
     shares = {}
     for name, axes in (("brightness", _OPPONENT[:1]), ("colour", _OPPONENT[1:])):
@@ -129,7 +129,7 @@ def main() -> None:
         rng = np.random.default_rng(options.seed)
         decoder = Decoder(windows(features[..., first:]), pictures.reshape(-1, _ROWS * 3), rng)
         drawn[name] = decoder(windows(tested[..., first:])).reshape(truth.shape)
-        shares = explained(drawn[name], truth, mean)
+        shares = explained_shares(drawn[name], truth, mean)
         print(f"{name}: " + ", ".join(f"{share:.1%} of the variance of {what}" for what, share in shares.items()))
     if options.out is not None:
         shown = range(0, len(truth), len(truth) // 4 + 1)

@@ -110,7 +110,7 @@ def home(number: int) -> dict[str, Any]:
     return {"name": f"home {number:05d}", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [room]}
 
 
-def created(answer: Answer) -> str:
+def created_id(answer: Answer) -> str:
     """Return the id in an answer.
 
     Raises:
@@ -123,9 +123,9 @@ def created(answer: Answer) -> str:
 
 def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     """Store homes and a venue of them; return its id and entity tag, and the ids of the homes."""
-    ids = [created(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
+    ids = [created_id(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
     answer = caller.send("POST", "/venues", _venue(ids))
-    return created(answer), answer.etag, ids
+    return created_id(answer), answer.etag, ids
 
 
 def _body(document: Mapping[str, Any]) -> bytes:

@@ -48,7 +48,7 @@ def prototypes(plans: int, seed: int) -> list[np.ndarray]:
     return blocks
 
 
-def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> list[np.ndarray]:
+def repeat_with_variants(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return each plan and variants of it."""
     found = list(blocks)
     for number in range(1, times):
@@ -109,7 +109,7 @@ def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[
         seed: seed of the homes.
     """
     homes = min(plans, _HOMES)
-    blocks = repeated(prototypes(homes, seed), plans // homes, np.random.default_rng(seed))
+    blocks = repeat_with_variants(prototypes(homes, seed), plans // homes, np.random.default_rng(seed))
     count = np.array([len(block) for block in blocks])
     rows, cells = np.concatenate(blocks), shipped_cells()
     index = PlanIndex.build(rows, np.cumsum(count) - count, count, step_m=_STEP_M, cells=cells)

@@ -82,7 +82,7 @@ def main() -> None:
 def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int) -> _Row:
     encoders = Encoders(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
-    read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
+    read_s, plan = _time_of(lambda: FloorPlan.from_dict(document, limits))
     grids: list[PoseGrid] = []
 
     def prepare() -> None:
@@ -90,7 +90,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
         grid.binned(plan)
         grids.append(grid)
 
-    ready_s, _ = _timed(prepare)
+    ready_s, _ = _time_of(prepare)
     grid, rng = grids[0], np.random.default_rng(5)
     homes = rng.integers(len(building.homes), size=count)
     shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
@@ -101,7 +101,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     retrieved = []
 
     def localise_shot(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
-        query = _encoded(encoders, image, shot, known=known)
+        query = _encode(encoders, image, shot, known=known)
         localise(plan, grid, encoders, query, refiner=refiner)
 
     for number, (image, shot) in enumerate(zip(images, shots, strict=True)):
@@ -109,10 +109,10 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
             if not number:
                 localise_shot(image, shot, known=known)
             spent[known].append(
-                _timed(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
+                _time_of(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
             )
-        query = _encoded(encoders, image, shot, known=False)
-        retrieved.append(_timed(lambda query=query: grid_costs(plan, grid, query, weights, config))[0])
+        query = _encode(encoders, image, shot, known=False)
+        retrieved.append(_time_of(lambda query=query: grid_costs(plan, grid, query, weights, config))[0])
     known_ms, unknown_ms, retrieve_ms = (
         1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)
     )
@@ -120,11 +120,11 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms)
 
 
-def _encoded(encoders: Encoders, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
+def _encode(encoders: Encoders, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
     return encoders.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
 
 
-def _timed(work: Callable[[], _T]) -> tuple[float, _T]:
+def _time_of(work: Callable[[], _T]) -> tuple[float, _T]:
     begin = time.process_time()
     done = work()
     return time.process_time() - begin, done

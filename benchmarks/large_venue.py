@@ -119,7 +119,7 @@ class Venue:
         answer = self.client.post("/localise", **query).raise_for_status().json()
         return {"answer": answer, **watch.figures()}
 
-    def changed(self, method: str, path: str, plan_id: str, *, is_found: bool, **content: Any) -> dict[str, Any]:
+    def change(self, method: str, path: str, plan_id: str, *, is_found: bool, **content: Any) -> dict[str, Any]:
         """Change one plan; return the times until a query was answered, and whether `plan_id` was as it should be."""
         watch = Stopwatch(self.service)
         self.client.request(method, path, **content).raise_for_status()
@@ -170,11 +170,11 @@ def _changes(venue: Venue, plan_id: str) -> dict[str, Any]:
     shown = json.loads(PLAN_PATH.read_text())
     member = {"floorplan_id": plan_id, "level": 0}
     return {
-        "removed": venue.changed("PATCH", path, plan_id, is_found=False, json={"remove": [plan_id]}),
-        "added": venue.changed("PATCH", path, plan_id, is_found=True, json={"plans": [member]}),
-        "replaced": venue.changed("PUT", own, plan_id, is_found=False, json=random_home(0)),
-        "replaced again": venue.changed("PUT", own, plan_id, is_found=True, json=shown),
-        "deleted": venue.changed("DELETE", own, plan_id, is_found=False),
+        "removed": venue.change("PATCH", path, plan_id, is_found=False, json={"remove": [plan_id]}),
+        "added": venue.change("PATCH", path, plan_id, is_found=True, json={"plans": [member]}),
+        "replaced": venue.change("PUT", own, plan_id, is_found=False, json=random_home(0)),
+        "replaced again": venue.change("PUT", own, plan_id, is_found=True, json=shown),
+        "deleted": venue.change("DELETE", own, plan_id, is_found=False),
     }
 
 
@@ -205,7 +205,7 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
             report["changes"] = _changes(venue, shown)
             again = harness.upload_example_plan(service.url)
             added = {"plans": [{"floorplan_id": again, "level": 0}]}
-            report["changes"]["uploaded"] = venue.changed(
+            report["changes"]["uploaded"] = venue.change(
                 "PATCH", f"/venues/{venue_id}", again, is_found=True, json=added
             )
             service.process.kill()

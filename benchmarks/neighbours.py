@@ -41,7 +41,7 @@ from benchmarks.heaviest import (
     Load,
     Stored,
     building,
-    created,
+    created_id,
     missing_routes,
     store_venue,
 )
@@ -190,10 +190,10 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
         settings = _SETTINGS | {"LALALOC_MAX_IMPORT_S": "600"}
         with harness.started_service(data, settings) as service:
             light, heavy = harness.Caller(service.url, keys["light"]), harness.Caller(service.url, keys["heavy"])
-            light_plan_id = created(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
+            light_plan_id = created_id(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
             venue_id, _, member_ids = store_venue(heavy, homes)
             bodies = {name: json.dumps(documents[name]()).encode() for name in plans}
-            plan_ids = {name: created(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
+            plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
             _wait_until_ready(service.url)
             venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
             stored = {

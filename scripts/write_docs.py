@@ -57,10 +57,10 @@ def documents() -> dict[Path, str]:
     """Return the up-to-date text of every document that has generated tables."""
     paths = sorted((ROOT / "docs").rglob("*.md"))
     texts = {path: path.read_text(encoding="utf-8") for path in paths}
-    return {path: _PART.sub(_filled, text) for path, text in texts.items() if _PART.search(text)}
+    return {path: _PART.sub(_fill, text) for path, text in texts.items() if _PART.search(text)}
 
 
-def _filled(part: re.Match[str]) -> str:
+def _fill(part: re.Match[str]) -> str:
     return f"<!-- begin: {part[1]} -->\n{TABLES[part[1]]()}\n<!-- end: {part[1]} -->"
 
 
