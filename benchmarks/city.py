@@ -7,8 +7,8 @@
 Each checkout runs the service of its own code with this interpreter; set-up uses its own. Single plans are measured
 with both services at once, in turns (`benchmarks.pairs`), a venue over HTTP in one after the other
 (`benchmarks.large_venue`, the older one by single uploads), and the index among generated homes with near-copies in
-this process (`benchmarks.venues`): before and after stand for without and with alignment there. `--only accuracy` needs
-`--photographs` and compares the answers of both on validation homes and photographs.
+this process (`benchmarks.index_recall`): before and after stand for without and with alignment there. `--only accuracy`
+needs `--photographs` and compares the answers of both on validation homes and photographs.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import argument_parser
+from benchmarks.harness import argument_parser, print_table_head, table_row
+from benchmarks.index_recall import recall
 from benchmarks.large_venue import measure
 from benchmarks.pairs import bursts_of, differences_of, running_checkout
-from benchmarks.venues import recall
 from lalaloc_core.bundle import Bundle, default_bundle
 
 # Figure, aim, and one value per checkout.
@@ -170,11 +170,11 @@ def accuracy(checkouts: Sequence[Path], options: argparse.Namespace) -> Iterator
         yield (
             "photographs: located, heading known; unknown",
             "-0.3 points",
-            [_located(folder, options.photographs) for folder in checkouts],
+            [_located_shares(folder, options.photographs) for folder in checkouts],
         )
 
 
-def _located(checkout: Path, photographs: Path) -> str:
+def _located_shares(checkout: Path, photographs: Path) -> str:
     with tempfile.TemporaryDirectory() as out:
         _lalaloc(checkout, "photographs", "--data", str(photographs.resolve()), "--out", out)
         galleries = json.loads((Path(out) / "photographs.json").read_text(encoding="utf-8"))["galleries"]
@@ -212,10 +212,10 @@ def main() -> None:
     if len(options.checkouts) > 2:
         parser.error(f"checkouts are {len(options.checkouts)} folders; give one or two")
     checkouts = [folder.resolve() for folder in options.checkouts]
-    print(f"| figure | aim | {' | '.join(folder.name for folder in checkouts)} |\n|---|---|{'---|' * len(checkouts)}")
+    print_table_head("figure", "aim", *(folder.name for folder in checkouts))
     for part in options.only or _PARTS:
         for name, aim, cells in _PARTS[part](checkouts, options):
-            print(f"| {name} | {aim} | {' | '.join(cells)} |", flush=True)
+            print(table_row(name, aim, *cells), flush=True)
 
 
 if __name__ == "__main__":

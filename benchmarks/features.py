@@ -11,7 +11,6 @@ the room alone (all outputs other than the ring): the difference is what the rin
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import cv2
@@ -104,7 +103,7 @@ class Decoder:
         return np.hstack([scaled, np.sqrt(2.0) * np.cos(scaled @ self._waves + self._phases)])
 
 
-def explained(found: np.ndarray, pictures: np.ndarray, mean: np.ndarray) -> dict[str, float]:
+def explained_shares(found: np.ndarray, pictures: np.ndarray, mean: np.ndarray) -> dict[str, float]:
     """Return the share of variance that is explained, of brightness and of colour."""
     shares = {}
     for name, axes in (("brightness", _OPPONENT[:1]), ("colour", _OPPONENT[1:])):
@@ -114,17 +113,13 @@ def explained(found: np.ndarray, pictures: np.ndarray, mean: np.ndarray) -> dict
 
 
 def main() -> None:
-    """Print the shares; write pictures if asked to."""
+    """Fit and test both decoders; print the shares, and write pictures if asked to."""
     parser = argument_parser(__doc__)
     parser.add_argument("--homes", type=int, default=300, help="homes to learn from; a quarter as many are tested")
     parser.add_argument("--out", type=Path, metavar="PICTURE", help="photographs and what was recovered of them")
     parser.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the homes (default: %(default)s)")
-    run(parser.parse_args())
-
-
-def run(options: argparse.Namespace) -> None:
-    """Fit and test both decoders."""
+    options = parser.parse_args()
     bundle = Bundle.open(options.bundle)
     features, pictures, channels = photographs(bundle, "train", options.homes, options.seed)
     tested, truth, _ = photographs(bundle, "test", max(options.homes // 4, 1), options.seed)
@@ -134,7 +129,7 @@ def run(options: argparse.Namespace) -> None:
         rng = np.random.default_rng(options.seed)
         decoder = Decoder(windows(features[..., first:]), pictures.reshape(-1, _ROWS * 3), rng)
         drawn[name] = decoder(windows(tested[..., first:])).reshape(truth.shape)
-        shares = explained(drawn[name], truth, mean)
+        shares = explained_shares(drawn[name], truth, mean)
         print(f"{name}: " + ", ".join(f"{share:.1%} of the variance of {what}" for what, share in shares.items()))
     if options.out is not None:
         shown = range(0, len(truth), len(truth) // 4 + 1)

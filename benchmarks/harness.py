@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import http.client
+import io
 import json
 import math
 import os
@@ -15,17 +16,19 @@ import tempfile
 import threading
 import time
 import urllib.request
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import httpx
 import psutil
+from PIL import Image
 
 from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
@@ -42,25 +45,47 @@ def argument_parser(doc: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def print_table_head(*names: str) -> None:
+    """Print the head of a Markdown table."""
+    print(f"{table_row(*names)}\n|{'---|' * len(names)}", flush=True)
+
+
+def table_row(*cells: object) -> str:
+    """Return a row of a Markdown table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def plain_picture(width: int, height: int, format: str, mode: str = "RGB", **options: Any) -> bytes:
+    """Return a picture of one grey in a file format."""
+    buffer = io.BytesIO()
+    Image.new(mode, (width, height), 90 if mode == "L" else (90, 90, 90)).save(buffer, format, **options)
+    return buffer.getvalue()
+
+
 @dataclass(frozen=True)
 class Service:
-    """Running service with the example plan, ready, and the server's process."""
+    """Running service that is ready, the server's process, its data folder, and the example plan if it is stored."""
 
     url: str
-    plan_id: str
-    data: Path
     process: psutil.Process
+    data: Path
+    plan_id: str = ""
 
 
 @contextmanager
-def example_service(settings: Mapping[str, str] | None = None) -> Iterator[Service]:
+def started_service(data: Path, settings: Mapping[str, str] | None = None, checkout: Path = ROOT) -> Iterator[Service]:
+    """Run the service of a checkout in one process, with a data folder."""
+    # The folder's own packages come before installed ones.
+    environment = {"LALALOC_DATA_DIR": str(data), "LALALOC_LOG_LEVEL": "error", "PYTHONPATH": str(checkout)}
+    with running_service(0, environment | dict(settings or {}), checkout) as started:
+        yield Service(started.url, psutil.Process(started.process.pid), data)
+
+
+@contextmanager
+def example_service(settings: Mapping[str, str] | None = None, checkout: Path = ROOT) -> Iterator[Service]:
     """Run the service in one process, with the example plan and a temporary data folder."""
-    with tempfile.TemporaryDirectory() as data:
-        environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", **(settings or {})}
-        with running_service(0, environment) as service:
-            yield Service(
-                service.url, upload_example_plan(service.url), Path(data), psutil.Process(service.process.pid)
-            )
+    with tempfile.TemporaryDirectory() as data, started_service(Path(data), settings, checkout) as service:
+        yield replace(service, plan_id=upload_example_plan(service.url))
 
 
 @contextmanager
@@ -75,16 +100,24 @@ def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[tup
         url = f"http://127.0.0.1:{port}"
         try:
             # The processes share the port, so only several answers in a row show that all are ready.
-            ready, deadline = 0, time.monotonic() + _START_S
-            while ready < 10 * processes:
-                ready = ready + 1 if _is_ready(url) else 0
-                if time.monotonic() > deadline:
-                    raise TimeoutError(f"the service is not ready after {_START_S:g} s")
-                time.sleep(0.05)
+            wait_until(lambda: all(_is_ready(url) for _ in range(10 * processes)), "the service is ready", _START_S)
             yield url, process
         finally:
             os.killpg(process.pid, signal.SIGTERM)
             process.wait(_STOP_S)
+
+
+def wait_until(is_true: Callable[[], bool], condition: str, timeout_s: float, pause_s: float = 0.05) -> None:
+    """Wait until a condition holds.
+
+    Raises:
+        TimeoutError: it does not within `timeout_s`.
+    """
+    deadline = time.monotonic() + timeout_s
+    while not is_true():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"it does not hold after {timeout_s:g} s that {condition}")
+        time.sleep(pause_s)
 
 
 def free_port() -> int:
@@ -186,9 +219,8 @@ def form(fields: tuple[tuple[str, str], ...], files: tuple[tuple[str, bytes], ..
 def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
     """Return the query with an example panorama, its heading and its camera height, as body and media type."""
     poses = read_poses()
-    pose = poses[number % len(poses)]
-    fields = {"floorplan_id": plan_id, "heading_deg": pose.heading_deg, "camera_height_m": pose.camera_height_m}
-    return form(tuple((name, str(value)) for name, value in fields.items()), (("panorama", pose.picture.read_bytes()),))
+    query = query_of(poses[number % len(poses)], floorplan_id=plan_id)
+    return form(tuple(query["data"].items()), (("panorama", query["files"]["panorama"][1]),))
 
 
 @dataclass(frozen=True)
@@ -251,7 +283,7 @@ class LoadResult:
         times = [f"{value:.0f} ms" for value in answered.percentiles_ms().values()]
         share = f"{lpo / max(answered.count, 1):.0%}"
         figures = (f"{answered.per_second:.1f}", *times, share, self.refused.count + self.failures)
-        return f"| {' | '.join(map(str, (*cells, *figures)))} |"
+        return table_row(*cells, *figures)
 
 
 def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, *, pause_s: float = 1.0) -> LoadResult:
@@ -296,59 +328,70 @@ def _locust(
             process.wait()
 
 
-class HealthWatch:
+class _Watch(ABC):
+    """Check that is repeated in a thread while a block runs."""
+
+    def __init__(self, pause_s: float) -> None:
+        self._pause_s, self._end = pause_s, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        self._check()
+        while not self._end.wait(self._pause_s):
+            self._check()
+
+    @abstractmethod
+    def _check(self) -> None: ...
+
+
+class HealthWatch(_Watch):
     """Health checks on new connections, as a load balancer sends them, while a block runs.
 
     A failed check makes `slowest_s` infinite.
     """
 
     def __init__(self, url: str, pause_s: float = 0.05) -> None:
-        self.slowest_s = 0.0
-        self._url, self._pause_s = url, pause_s
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        super().__init__(pause_s)
+        self._url, self.slowest_s = url, 0.0
 
-    def __enter__(self) -> HealthWatch:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            begin = time.perf_counter()
-            try:
-                with urllib.request.urlopen(f"{self._url}/healthz", timeout=_HEALTH_TIMEOUT_S) as response:
-                    response.read()
-            except OSError:
-                self.slowest_s = math.inf
-            self.slowest_s = max(self.slowest_s, time.perf_counter() - begin)
-            if self._end.wait(self._pause_s):
-                return
+    def _check(self) -> None:
+        begin = time.perf_counter()
+        try:
+            with urllib.request.urlopen(f"{self._url}/healthz", timeout=_HEALTH_TIMEOUT_S) as response:
+                response.read()
+        except OSError:
+            self.slowest_s = math.inf
+        self.slowest_s = max(self.slowest_s, time.perf_counter() - begin)
 
 
-class MemoryWatch:
+class MemoryWatch(_Watch):
     """Peak resident memory (MB) of a service and its workers while a block runs."""
 
     def __init__(self, process: psutil.Process) -> None:
+        super().__init__(0.02)
         self._process = process
         self.before = self.highest = service_memory_mb(process)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run)
 
-    def __enter__(self) -> MemoryWatch:
-        self._thread.start()
-        return self
+    def _check(self) -> None:
+        self.highest = max(self.highest, service_memory_mb(self._process))
 
-    def __exit__(self, *_error: object) -> None:
-        self._end.set()
-        self._thread.join()
 
-    def _run(self) -> None:
-        while not self._end.wait(0.02):
-            self.highest = max(self.highest, service_memory_mb(self._process))
+def cpu_s(process: psutil.Process) -> float:
+    """Return the CPU time (s, user and system) of a service and its workers."""
+    total_s = 0.0
+    for part in (process, *process.children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):
+            times = part.cpu_times()
+            total_s += times.user + times.system
+    return total_s
 
 
 def service_memory_mb(process: psutil.Process) -> float:

@@ -7,25 +7,23 @@ an entry scales with a size, so that the benchmark sends the largest one and the
 from __future__ import annotations
 
 import base64
-import io
 import itertools
 import json
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 from urllib.parse import urlencode
 
 import yaml
-from PIL import Image
 
-from benchmarks.harness import Answer, Caller, form
+from benchmarks.harness import Answer, Caller, form, plain_picture
 from examples.launch import ROOT
 from examples.truth import read_poses
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportLimits, export_plan
+from lalaloc_core.importers import EXPORT_FORMATS, ImportLimits, export_plan
 
 # Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
@@ -112,7 +110,7 @@ def home(number: int) -> dict[str, Any]:
     return {"name": f"home {number:05d}", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [room]}
 
 
-def created(answer: Answer) -> str:
+def created_id(answer: Answer) -> str:
     """Return the id in an answer.
 
     Raises:
@@ -125,9 +123,9 @@ def created(answer: Answer) -> str:
 
 def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     """Store homes and a venue of them; return its id and entity tag, and the ids of the homes."""
-    ids = [created(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
+    ids = [created_id(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
     answer = caller.send("POST", "/venues", _venue(ids))
-    return created(answer), answer.etag, ids
+    return created_id(answer), answer.etag, ids
 
 
 def _body(document: Mapping[str, Any]) -> bytes:
@@ -168,9 +166,8 @@ def _svg(kibibytes: int) -> bytes:
 @cache
 def _jpeg(kilopixels: int) -> bytes:
     """Return a grey progressive JPEG."""
-    height, buffer = math.isqrt(500 * kilopixels), io.BytesIO()
-    Image.new("L", (2 * height, height), 90).save(buffer, "JPEG", progressive=True)
-    return buffer.getvalue()
+    height = math.isqrt(500 * kilopixels)
+    return plain_picture(2 * height, height, "JPEG", "L", progressive=True)
 
 
 @cache
@@ -287,14 +284,17 @@ def _levels_body(rooms: int) -> tuple[bytes, str]:
     return form((("ceiling_height_m", "2.5"),), (("file", content),))
 
 
+def _delete_with_plans(caller: Caller, venue: str) -> None:
+    plans = caller.send("GET", f"{venue}/plans?limit=500").json()["plans"]
+    caller.send("DELETE", venue)
+    for plan in plans:
+        caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
+
+
 def _post_levels(caller: Caller, _stored: Stored, size: int) -> None:
     answer = caller.send("POST", "/venues", *_levels_body(size))
     if answer.status == 201:
-        path = f"/venues/{answer.json()['id']}"
-        plans = caller.send("GET", f"{path}/plans?limit=500").json()["plans"]
-        caller.send("DELETE", path)
-        for plan in plans:
-            caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
+        _delete_with_plans(caller, f"/venues/{answer.json()['id']}")
 
 
 @cache
@@ -306,14 +306,10 @@ def _homes_body(homes: int) -> tuple[bytes, str]:
 def _extend_venue(caller: Caller, _stored: Stored, size: int) -> None:
     body = _homes_body(size)
     answer = caller.send("POST", "/venues", _venue([]))
-    if answer.status != 201:
-        return
-    path = f"/venues/{answer.json()['id']}"
-    caller.send("PATCH", path, *body)
-    plans = caller.send("GET", f"{path}/plans?limit=500").json()["plans"]
-    caller.send("DELETE", path)
-    for plan in plans:
-        caller.send("DELETE", f"/floorplans/{plan['floorplan_id']}")
+    if answer.status == 201:
+        path = f"/venues/{answer.json()['id']}"
+        caller.send("PATCH", path, *body)
+        _delete_with_plans(caller, path)
 
 
 def _put_venue(caller: Caller, stored: Stored, _size: int) -> None:
@@ -334,15 +330,8 @@ def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
         caller.send("DELETE", path)
 
 
-def _follow_session(caller: Caller, stored: Stored, _size: int) -> None:
-    _follow(caller, {"floorplan_id": stored.plan_id})
-
-
-def _follow_session_in_venue(caller: Caller, stored: Stored, _size: int) -> None:
-    _follow(caller, {"venue_id": stored.venue_id})
-
-
-def _follow(caller: Caller, place: dict[str, str]) -> None:
+def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool = False) -> None:
+    place = {"venue_id": stored.venue_id} if venue else {"floorplan_id": stored.plan_id}
     answer = caller.send("POST", "/sessions", _body(place))
     if answer.status == 201:
         path = f"/sessions/{answer.json()['id']}"
@@ -364,57 +353,37 @@ def _administer(caller: Caller, _stored: Stored, _size: int) -> None:
     caller.send("PATCH", "/admin/tenants/new", _body({"cpu_share": 1.0}))
 
 
+def _read(
+    path: str, title: str = "", size: int = 0, plan: str = VERTICES_PLAN, *, conditional: bool = False, **query: object
+) -> Load:
+    """Return the load of one GET, by default titled like the plan; values of the query that are None are the size."""
+    work = _get(path, conditional=conditional, **query)
+    return Load((f"GET {path}",), (title or plan) + ", conditional" * conditional, work, size, plan)
+
+
+_PLAN, _VENUE = "/floorplans/{floorplan_id}", "/venues/{venue_id}"
+_SESSION, _KEY = "/sessions/{session_id}", "/admin/keys/{key_id}"
+_SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
 LOADS = (
-    Load(("GET /floorplans",), "pages of 500", _get("/floorplans", limit=None), 500),
-    Load(("GET /floorplans/{floorplan_id}",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}")),
+    _read("/floorplans", "pages of 500", 500, limit=None),
+    _read(_PLAN),
+    _read(_PLAN, conditional=True),
+    _read(f"{_PLAN}/original"),
+    *(_read(f"{_PLAN}/export", f"{kind}, {VERTICES_PLAN}", format=kind) for kind in EXPORT_FORMATS),
+    _read(f"{_PLAN}/preview.svg"),
+    _read(f"{_PLAN}/mesh.glb", plan=ROOMS_PLAN),
+    _read(f"{_PLAN}/localisability", plan=ROOMS_PLAN),
+    _read(f"{_PLAN}/localisability.svg"),
+    _read(f"{_PLAN}/layout", plan=ROOMS_PLAN),
     Load(
-        ("GET /floorplans/{floorplan_id}",),
-        f"{VERTICES_PLAN}, conditional",
-        _get("/floorplans/{floorplan_id}", conditional=True),
-    ),
-    Load(("GET /floorplans/{floorplan_id}/original",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}/original")),
-    *(
-        Load(
-            ("GET /floorplans/{floorplan_id}/export",),
-            f"{kind}, {VERTICES_PLAN}",
-            _get("/floorplans/{floorplan_id}/export", format=kind),
-        )
-        for kind in ("native", "geojson", "imdf", "dxf", "svg", "ros")
-    ),
-    Load(
-        ("GET /floorplans/{floorplan_id}/preview.svg",), VERTICES_PLAN, _get("/floorplans/{floorplan_id}/preview.svg")
-    ),
-    Load(
-        ("GET /floorplans/{floorplan_id}/mesh.glb",),
-        ROOMS_PLAN,
-        _get("/floorplans/{floorplan_id}/mesh.glb"),
-        plan=ROOMS_PLAN,
-    ),
-    *(
-        Load(
-            (f"GET /floorplans/{{floorplan_id}}/{name}",), plan, _get(f"/floorplans/{{floorplan_id}}/{name}"), plan=plan
-        )
-        for name, plan in (("localisability", ROOMS_PLAN), ("localisability.svg", VERTICES_PLAN))
-    ),
-    Load(
-        ("GET /floorplans/{floorplan_id}/layout",),
-        ROOMS_PLAN,
-        _get("/floorplans/{floorplan_id}/layout"),
-        plan=ROOMS_PLAN,
-    ),
-    Load(
-        ("GET /floorplans/{floorplan_id}/events", "POST /floorplans"),
+        (f"GET {_PLAN}/events", "POST /floorplans"),
         "64 streams of plans in preparation",
         _follow_events,
         9_600,
         connections=64,
     ),
-    Load(
-        ("POST /floorplans", "DELETE /floorplans/{floorplan_id}"),
-        "homes of one room",
-        _post_and_delete(lambda _size: _body(home(0))),
-    ),
+    Load(("POST /floorplans", f"DELETE {_PLAN}"), "homes of one room", _post_and_delete(lambda _size: _body(home(0)))),
     Load(("POST /floorplans",), VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
     Load(("POST /floorplans",), ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
     Load(
@@ -426,21 +395,16 @@ LOADS = (
     ),
     Load(("POST /floorplans",), "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
     Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
-    Load(("PUT /floorplans/{floorplan_id}",), ROOMS_PLAN, _put_plan, 10_000),
-    Load(("POST /venues", "DELETE /venues/{venue_id}"), "{homes} homes", _post_venue),
+    Load((f"PUT {_PLAN}",), ROOMS_PLAN, _put_plan, 10_000),
+    Load(("POST /venues", f"DELETE {_VENUE}"), "{homes} homes", _post_venue),
     Load(("POST /venues",), "file of 200 levels × 50 rooms", _post_levels, 10_000),
-    Load(("PATCH /venues/{venue_id}",), "file of 200 homes", _extend_venue, 200),
-    Load(("GET /venues",), "pages of 500", _get("/venues", limit=None), 500),
-    Load(("GET /venues/{venue_id}",), "{homes} homes", _get("/venues/{venue_id}")),
-    Load(("GET /venues/{venue_id}",), "{homes} homes, conditional", _get("/venues/{venue_id}", conditional=True)),
-    Load(("PUT /venues/{venue_id}",), "{homes} homes", _put_venue),
-    Load(("PATCH /venues/{venue_id}",), "{homes} homes, then a query in the venue", _change_and_search_venue),
-    Load(
-        ("GET /venues/{venue_id}/plans",),
-        "{homes} homes, pages of 500",
-        _get("/venues/{venue_id}/plans", limit=None),
-        500,
-    ),
+    Load((f"PATCH {_VENUE}",), "file of 200 homes", _extend_venue, 200),
+    _read("/venues", "pages of 500", 500, limit=None),
+    _read(_VENUE, "{homes} homes"),
+    _read(_VENUE, "{homes} homes", conditional=True),
+    Load((f"PUT {_VENUE}",), "{homes} homes", _put_venue),
+    Load((f"PATCH {_VENUE}",), "{homes} homes, then a query in the venue", _change_and_search_venue),
+    _read(f"{_VENUE}/plans", "{homes} homes, pages of 500", 500, limit=None),
     Load(("POST /localise",), VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
     Load(("POST /localise",), "{homes} homes", _localise(venue_id="{venue}"), connections=16),
     Load(
@@ -460,21 +424,12 @@ LOADS = (
         connections=44,
     ),
     Load(
-        (
-            "POST /sessions",
-            "POST /sessions/{session_id}/photographs",
-            "GET /sessions/{session_id}",
-            "DELETE /sessions/{session_id}",
-        ),
+        (*_SESSIONS, f"GET {_SESSION}", f"DELETE {_SESSION}"),
         f"two photographs, {ROOMS_PLAN}",
         _follow_session,
         plan=ROOMS_PLAN,
     ),
-    Load(
-        ("POST /sessions", "POST /sessions/{session_id}/photographs"),
-        "two photographs, {homes} homes",
-        _follow_session_in_venue,
-    ),
+    Load(_SESSIONS, "two photographs, {homes} homes", partial(_follow_session, venue=True)),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(
@@ -485,17 +440,14 @@ LOADS = (
     Load(
         (
             "POST /admin/keys",
-            "POST /admin/keys/{key_id}/rotation",
-            "GET /admin/keys/{key_id}",
-            "DELETE /admin/keys/{key_id}",
+            f"POST {_KEY}/rotation",
+            f"GET {_KEY}",
+            f"DELETE {_KEY}",
             "PATCH /admin/tenants/{tenant}",
         ),
         "keys and limits",
         _administer,
     ),
-    *(
-        Load((f"GET /admin/{name}",), "pages of 500", _get(f"/admin/{name}", limit=None), 500)
-        for name in ("keys", "tenants", "audit")
-    ),
-    *(Load((f"GET /{name}",), "–", _get(f"/{name}")) for name in ("healthz", "readyz", "metrics", "limits", "usage")),
+    *(_read(f"/admin/{name}", "pages of 500", 500, limit=None) for name in ("keys", "tenants", "audit")),
+    *(_read(f"/{name}", "–") for name in ("healthz", "readyz", "metrics", "limits", "usage")),
 )

@@ -30,7 +30,7 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from benchmarks.harness import HealthWatch, MemoryWatch, argument_parser, example_service, service_memory_mb
+from benchmarks import harness
 from service.settings import Settings
 
 _MAX_HEALTH_S, _MAX_ANSWER_S, _TIMEOUT_S, _SETTLE_TIMEOUT_S = 1.0, 10.0, 90.0, 20.0
@@ -70,14 +70,14 @@ class Attack:
 
 def main() -> int:
     """Send everything; return 1 when a limit is exceeded or an attack succeeds."""
-    argument_parser(__doc__).parse_args()
+    harness.argument_parser(__doc__).parse_args()
     failed = False
-    with example_service() as service:
-        memory_before = service_memory_mb(service.process)
-        print("| request | bytes | statuses | seconds | slowest health check | memory |\n|---|---|---|---|---|---|")
+    with harness.example_service() as service:
+        memory_before = harness.service_memory_mb(service.process)
+        harness.print_table_head("request", "bytes", "statuses", "seconds", "slowest health check", "memory")
         for attack in _attacks(service.url, service.plan_id):
             begin = time.perf_counter()
-            with HealthWatch(service.url) as health, MemoryWatch(service.process) as memory:
+            with harness.HealthWatch(service.url) as health, harness.MemoryWatch(service.process) as memory:
                 statuses = Counter(attack.send())
             seconds, risen_mb = time.perf_counter() - begin, memory.highest - memory.before
             failed |= any(status in (0, 500, 502, 504) for status in statuses) or health.slowest_s > _MAX_HEALTH_S
@@ -87,9 +87,12 @@ def main() -> int:
             failed |= seconds > _MAX_ANSWER_S and not (attack.is_slow or accepted)
             failed |= risen_mb > (_MAX_DECODING_MB if accepted else _MAX_MB)
             shown = ", ".join(f"{count} x {status}" for status, count in sorted(statuses.items()))
-            row = (attack.name, f"{attack.size_bytes:,}", shown, f"{seconds:.1f}", f"{health.slowest_s:.2f} s")
-            print(f"| {' | '.join(row)} | {risen_mb:+.0f} MB |", flush=True)
-        left_mb = service_memory_mb(service.process) - memory_before
+            times = f"{seconds:.1f}", f"{health.slowest_s:.2f} s"
+            print(
+                harness.table_row(attack.name, f"{attack.size_bytes:,}", shown, *times, f"{risen_mb:+.0f} MB"),
+                flush=True,
+            )
+        left_mb = harness.service_memory_mb(service.process) - memory_before
         failed |= left_mb > _MAX_LEFT_MB
         print(f"\nMemory after all requests: {left_mb:+.0f} MB against before.")
     return int(failed)
@@ -112,12 +115,15 @@ def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
     yield panorama("PNG with a header of 2^31 x 2^30 pixels", _png(1 << 31, 1 << 30, full=False))
     yield panorama("JPEG with a header of 65,500 x 32,750 pixels", _jpeg_with_size(65_500, 32_750))
     yield panorama(
-        "WebP of 16,383 x 8,191 pixels of one colour", _encoded(16_383, 8_191, "WEBP", lossless=True, method=0)
+        "WebP of 16,383 x 8,191 pixels of one colour",
+        harness.plain_picture(16_383, 8_191, "WEBP", lossless=True, method=0),
     )
-    yield panorama("PNG of 14,140 x 7,070 pixels, the largest allowed", _encoded(14_140, 7_070, "PNG"), accepted=True)
+    yield panorama(
+        "PNG of 14,140 x 7,070 pixels, the largest allowed", harness.plain_picture(14_140, 7_070, "PNG"), accepted=True
+    )
     yield panorama("WebP of 9,000 frames", _animation(9_000), accepted=True)
     yield panorama("PNG with 100 MB of compressed text", _png_with_text(100_000_000))
-    jpeg = _encoded(256, 128, "JPEG")
+    jpeg = harness.plain_picture(256, 128, "JPEG")
     yield panorama("JPEG of 5 million empty comments", jpeg[:2] + _segment(0xFE, b"") * 5_000_000 + jpeg[2:])
     exif = _segment(0xE1, b"Exif\0\0" + bytes(60_000))
     yield panorama("JPEG of 640 segments of Exif", jpeg[:2] + exif * 640 + jpeg[2:])
@@ -163,7 +169,7 @@ def _png(width: int, height: int, *, full: bool) -> bytes:
 
 
 def _png_with_text(size: int) -> bytes:
-    plain = _encoded(256, 128, "PNG")
+    plain = harness.plain_picture(256, 128, "PNG")
     # The header has 8 + 25 bytes.
     return plain[:33] + _chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a" * size, 9)) + plain[33:]
 
@@ -174,7 +180,7 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 
 def _jpeg_with_size(width: int, height: int) -> bytes:
     """Return a small JPEG with another size in its header."""
-    content = bytearray(_encoded(256, 128, "JPEG"))
+    content = bytearray(harness.plain_picture(256, 128, "JPEG"))
     place = content.index(b"\xff\xc0") + 5
     content[place : place + 4] = struct.pack(">HH", height, width)
     return bytes(content)
@@ -189,12 +195,6 @@ def _animation(frames: int) -> bytes:
     # Equal frames would be merged.
     shades = [Image.new("RGB", (128, 64), (k % 256, k // 256, 0)) for k in range(frames)]
     shades[0].save(buffer, "WEBP", save_all=True, append_images=shades[1:], duration=1, lossless=True, method=0)
-    return buffer.getvalue()
-
-
-def _encoded(width: int, height: int, name: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    Image.new("RGB", (width, height), (90, 90, 90)).save(buffer, name, **options)
     return buffer.getvalue()
 
 

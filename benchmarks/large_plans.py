@@ -2,8 +2,7 @@
 
 Buildings are generated homes side by side, with corridors between them and halls full of columns
 (`learn.synth.homes.buildings`); photographs are of their homes. Times are processor times of one thread, so that the
-machine need not be idle; memory is that of the pose grid with everything that queries derive from it. `--oracle` also
-compares every query with all poses, headings and heights at all azimuths, which takes minutes for large buildings.
+machine need not be idle; memory is that of the pose grid with everything that queries derive from it.
 """
 
 from __future__ import annotations
@@ -11,24 +10,24 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
-from benchmarks.harness import argument_parser
+from benchmarks.harness import argument_parser, print_table_head
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
-from lalaloc_core.learn.synth.homes.plans import VALIDATION
+from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid
+from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search.pipeline import localise
 from lalaloc_core.localise.search.retrieval import grid_costs
@@ -54,14 +53,12 @@ class _Row:
     known_ms: float
     unknown_ms: float
     retrieve_ms: float
-    same: list[bool] = field(default_factory=list)
 
     def __str__(self) -> str:
-        agree = f"{sum(self.same)} of {len(self.same)}" if self.same else "-"
         return (
             f"| {self.plan.area_m2:,.0f} | {len(self.plan.rooms):,} | {self.poses:,} | {self.read_s:.2f} s "
             f"| {self.ready_s:.2f} s | {self.megabytes:.1f} MB, {1e3 * self.megabytes / self.poses:.2f} kB "
-            f"| {self.known_ms:.0f} ms | {self.unknown_ms:.0f} ms | {self.retrieve_ms:.0f} ms | {agree} |"
+            f"| {self.known_ms:.0f} ms | {self.unknown_ms:.0f} ms | {self.retrieve_ms:.0f} ms |"
         )
 
 
@@ -72,23 +69,20 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=8, help="photographs per building")
     parser.add_argument("--bundle", type=Path, default=default_bundle())
     parser.add_argument("--textures", type=Path, help="folder of textures")
-    parser.add_argument("--oracle", type=float, default=0.0, help="compare with brute force up to this area (m²)")
     arguments = parser.parse_args()
     bundle = Bundle.open(arguments.bundle)
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
-    print(
-        "| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | brute force agrees |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    head = "area m², rooms, poses, read, ready, grid and a pose, known, unknown, retrieval"
+    print_table_head(*head.split(", "))
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
-        print(_measure(building, bundle, renderers, arguments.queries, oracle=area_m2 <= arguments.oracle), flush=True)
+        print(_measure(building, bundle, renderers, arguments.queries), flush=True)
 
 
-def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int, *, oracle: bool) -> _Row:
+def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int) -> _Row:
     encoders = PhotographEncoder(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
-    read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
+    read_s, plan = _time_of(lambda: FloorPlan.from_dict(document, limits))
     grids: list[PoseGrid] = []
 
     def prepare() -> None:
@@ -96,7 +90,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
         grid.binned(plan)
         grids.append(grid)
 
-    ready_s, _ = _timed(prepare)
+    ready_s, _ = _time_of(prepare)
     grid, rng = grids[0], np.random.default_rng(5)
     homes = rng.integers(len(building.homes), size=count)
     shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
@@ -104,10 +98,10 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
     images = [renderers.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
     spent: dict[bool, list[float]] = {True: [], False: []}
-    retrieved, same = [], []
+    retrieved = []
 
     def localise_shot(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
-        query = _encoded(encoders, image, shot, known=known)
+        query = _encode(encoders, image, shot, known=known)
         localise(plan, grid, encoders, query, refiner=refiner)
 
     for number, (image, shot) in enumerate(zip(images, shots, strict=True)):
@@ -115,28 +109,22 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
             if not number:
                 localise_shot(image, shot, known=known)
             spent[known].append(
-                _timed(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
+                _time_of(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
             )
-        query = _encoded(encoders, image, shot, known=False)
-        seconds, found = _timed(lambda query=query: grid_costs(plan, grid, query, weights, config))
-        retrieved.append(seconds)
-        if oracle:
-            every, _ = MatchingCost(plan, query, config.grid_reach * _STEP_M, weights, config).costs(grid.layouts(plan))
-            best = int(found.cost[: found.compared].argmin())
-            hypothesis, pose = np.unravel_index(int(every.argmin()), every.shape)
-            same.append((int(found.hypothesis[best]), int(found.pose[best])) == (int(hypothesis), int(pose)))
+        query = _encode(encoders, image, shot, known=False)
+        retrieved.append(_time_of(lambda query=query: grid_costs(plan, grid, query, weights, config))[0])
     known_ms, unknown_ms, retrieve_ms = (
         1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)
     )
     megabytes = grid_bytes(grid) / 1e6
-    return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms, same)
+    return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms)
 
 
-def _encoded(encoders: PhotographEncoder, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
+def _encode(encoders: PhotographEncoder, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
     return encoders.spheres.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
 
 
-def _timed(work: Callable[[], _T]) -> tuple[float, _T]:
+def _time_of(work: Callable[[], _T]) -> tuple[float, _T]:
     begin = time.process_time()
     done = work()
     return time.process_time() - begin, done

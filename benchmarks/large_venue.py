@@ -1,17 +1,14 @@
-"""Venue with many floor plans: upload, queries, changes of one plan, a crash, memory and recall, over HTTP.
+"""Venue with many floor plans: upload, queries, changes of one plan, a crash and memory, over HTTP.
 
     python -m benchmarks.large_venue --plans 10000
-    python -m benchmarks.large_venue --plans 10000 --photographs 300
-    python -m benchmarks.large_venue --plans 10000 --one-by-one
 
 The plans are random homes of two rooms and the example flat. They are uploaded in files of 200 plans, which extend the
-venue, or one by one. All example panoramas are localised in the venue, whose
-answer must name the flat. The pages of the venue must list every plan once and in order. Then the flat is removed from
-the venue, added again, replaced and deleted: each time, the first query must be answered by the new state. At last the
-service is killed and started again.
+venue. All example panoramas are localised in the venue, whose answer must name the flat. The pages of the venue must
+list every plan once and in order. Then the flat is removed from the venue, added again, replaced and deleted: each
+time, the first query must be answered by the new state. At last the service is killed and started again.
 
 Next to the time of the wall clock stands the processor time of the service and its workers, which other work on the
-machine hardly changes. `--photographs` adds the recall of the index among generated homes, as in `benchmarks.venues`.
+machine hardly changes.
 """
 
 from __future__ import annotations
@@ -29,14 +26,11 @@ from typing import Any
 
 import httpx
 import numpy as np
-import psutil
 
-from benchmarks.harness import Service, argument_parser, query_of, resident_mb, upload_example_plan
-from benchmarks.venues import recall
-from examples.launch import ROOT, running_service
+from benchmarks import harness
+from examples.launch import ROOT
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, VenuePlan
-from lalaloc_core.bundle import Bundle
 
 _CLIENTS, _PAGE, _ROUNDS, _FILE = 4, 500, 3, 200
 _TIMEOUT_S = 7200.0
@@ -64,7 +58,7 @@ def upload(client: httpx.Client, documents: Sequence[dict[str, Any]]) -> list[st
         return [response.raise_for_status().json()["id"] for response in responses]
 
 
-def upload_files(service: Service, shown: str, documents: Sequence[dict[str, Any]]) -> str:
+def upload_files(service: harness.Service, shown: str, documents: Sequence[dict[str, Any]]) -> str:
     """Upload plans in files that extend a venue, which begins with a stored plan; return its id."""
     files = [documents[first : first + _FILE] for first in range(0, len(documents), _FILE)]
     with Client(service.url, timeout_s=300.0) as client, ThreadPoolExecutor(_CLIENTS) as threads:
@@ -102,41 +96,30 @@ def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
 class Stopwatch:
     """Wall clock and processor time of a service and its workers since the stopwatch was made."""
 
-    def __init__(self, service: Service) -> None:
-        self._process, self._wall, self._cpu = service.process, time.perf_counter(), _cpu_s(service.process)
+    def __init__(self, service: harness.Service) -> None:
+        self._process, self._wall, self._cpu = service.process, time.perf_counter(), harness.cpu_s(service.process)
 
     def figures(self) -> dict[str, float]:
         """Return the times in ms."""
-        wall, cpu = time.perf_counter() - self._wall, _cpu_s(self._process) - self._cpu
+        wall, cpu = time.perf_counter() - self._wall, harness.cpu_s(self._process) - self._cpu
         return {"wall_ms": round(1e3 * wall), "cpu_ms": round(1e3 * cpu)}
-
-
-def _cpu_s(process: psutil.Process) -> float:
-    total = 0.0
-    for part in (process, *process.children(recursive=True)):
-        try:
-            times = part.cpu_times()
-        except psutil.NoSuchProcess:
-            continue
-        total += times.user + times.system
-    return total
 
 
 class Venue:
     """Venue of the benchmark, and its client."""
 
-    def __init__(self, service: Service, client: httpx.Client, venue_id: str) -> None:
+    def __init__(self, service: harness.Service, client: httpx.Client, venue_id: str) -> None:
         self.service, self.client, self.id = service, client, venue_id
 
     def localise(self, pose: TruePose, *, heading: bool) -> dict[str, Any]:
         """Localise an example panorama, with or without its heading; return the answer and the times."""
-        query, watch = query_of(pose, venue_id=self.id), Stopwatch(self.service)
+        query, watch = harness.query_of(pose, venue_id=self.id), Stopwatch(self.service)
         if not heading:
             del query["data"]["heading_deg"]
         answer = self.client.post("/localise", **query).raise_for_status().json()
         return {"answer": answer, **watch.figures()}
 
-    def changed(self, method: str, path: str, plan_id: str, *, is_found: bool, **content: Any) -> dict[str, Any]:
+    def change(self, method: str, path: str, plan_id: str, *, is_found: bool, **content: Any) -> dict[str, Any]:
         """Change one plan; return the times until a query was answered, and whether `plan_id` was as it should be."""
         watch = Stopwatch(self.service)
         self.client.request(method, path, **content).raise_for_status()
@@ -158,16 +141,15 @@ def _median(figures: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 @contextmanager
-def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[Service, httpx.Client]]:
+def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[harness.Service, httpx.Client]]:
     limits = {"LALALOC_MAX_FLOORPLANS": f"{plans + 10}", "LALALOC_MAX_VENUE_PLANS": f"{plans + 10}"}
     # 7.5 kB per home, and some to spare.
     limits["LALALOC_VENUE_CACHE_BYTES"] = f"{max(2**27, 10_000 * plans)}"
-    environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", "PYTHONPATH": str(checkout), **limits}
     with (
-        running_service(0, environment, checkout) as started,
-        httpx.Client(base_url=started.url, timeout=300.0) as client,
+        harness.started_service(Path(data), limits, checkout) as service,
+        httpx.Client(base_url=service.url, timeout=300.0) as client,
     ):
-        yield Service(started.url, "", Path(data), psutil.Process(started.process.pid)), client
+        yield service, client
 
 
 def _queries(venue: Venue, plan_id: str) -> dict[str, Any]:
@@ -188,11 +170,11 @@ def _changes(venue: Venue, plan_id: str) -> dict[str, Any]:
     shown = json.loads(PLAN_PATH.read_text())
     member = {"floorplan_id": plan_id, "level": 0}
     return {
-        "removed": venue.changed("PATCH", path, plan_id, is_found=False, json={"remove": [plan_id]}),
-        "added": venue.changed("PATCH", path, plan_id, is_found=True, json={"plans": [member]}),
-        "replaced": venue.changed("PUT", own, plan_id, is_found=False, json=random_home(0)),
-        "replaced again": venue.changed("PUT", own, plan_id, is_found=True, json=shown),
-        "deleted": venue.changed("DELETE", own, plan_id, is_found=False),
+        "removed": venue.change("PATCH", path, plan_id, is_found=False, json={"remove": [plan_id]}),
+        "added": venue.change("PATCH", path, plan_id, is_found=True, json={"plans": [member]}),
+        "replaced": venue.change("PUT", own, plan_id, is_found=False, json=random_home(0)),
+        "replaced again": venue.change("PUT", own, plan_id, is_found=True, json=shown),
+        "deleted": venue.change("DELETE", own, plan_id, is_found=False),
     }
 
 
@@ -202,8 +184,8 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
     with tempfile.TemporaryDirectory() as data:
         with _running(data, plans, checkout) as (service, client):
             resident = report["resident_mb"]
-            resident["empty"] = round(resident_mb(service.process))
-            shown, watch = upload_example_plan(service.url), Stopwatch(service)
+            resident["empty"] = round(harness.resident_mb(service.process))
+            shown, watch = harness.upload_example_plan(service.url), Stopwatch(service)
             documents = [random_home(number) for number in range(plans - 1)]
             if one_by_one:
                 venue_id = upload_one_by_one(client, shown, documents)
@@ -212,18 +194,18 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
             report["uploaded"] = watch.figures()
             ready = wait_until_ready(client, venue_id)
             report["until_ready"] = watch.figures()
-            resident["ready"] = round(resident_mb(service.process))
+            resident["ready"] = round(harness.resident_mb(service.process))
             with Client(service.url) as paging:
                 listed = [(plan.level, plan.floorplan_id) for plan in paging.venue_plans(venue_id, page_size=_PAGE)]
             venue = Venue(service, client, venue_id)
             report["queries"] = _queries(venue, shown)
-            resident["localised"] = round(resident_mb(service.process))
+            resident["localised"] = round(harness.resident_mb(service.process))
             if not changes:
                 return report
             report["changes"] = _changes(venue, shown)
-            again = upload_example_plan(service.url)
+            again = harness.upload_example_plan(service.url)
             added = {"plans": [{"floorplan_id": again, "level": 0}]}
-            report["changes"]["uploaded"] = venue.changed(
+            report["changes"]["uploaded"] = venue.change(
                 "PATCH", f"/venues/{venue_id}", again, is_found=True, json=added
             )
             service.process.kill()
@@ -232,7 +214,7 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
             started = time.perf_counter()
             first = Venue(service, client, venue_id).localise(read_poses()[0], heading=True)
             report["after_kill"] = {"started_ms": round(1e3 * (started - begin)), "first_query": _times(first)}
-            report["resident_mb"]["after_kill"] = round(resident_mb(service.process))
+            report["resident_mb"]["after_kill"] = round(harness.resident_mb(service.process))
     report["expected"] = {
         "all plans are ready": ready["plans_ready"] == plans,
         "pages list every plan once, in order": listed == sorted(set(listed)) and len(listed) == plans,
@@ -245,14 +227,9 @@ def measure(plans: int, *, one_by_one: bool = False, checkout: Path = ROOT, chan
 
 def main() -> int:
     """Measure; return 1 when a plan is missing or an answer is wrong."""
-    parser = argument_parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=10_000)
-    parser.add_argument("--photographs", type=int, default=0, help="photographs of the recall; 0 leaves it out")
-    parser.add_argument("--one-by-one", action="store_true", help="upload every plan in a request of its own")
-    options = parser.parse_args()
-    report = measure(options.plans, one_by_one=options.one_by_one)
-    if options.photographs:
-        report["recall"] = recall(Bundle.open(Path("models/default")), options.plans, options.photographs)
+    report = measure(parser.parse_args().plans)
     print(json.dumps(report, indent=2))
     return int(not all(report["expected"].values()))
 

@@ -25,7 +25,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -33,7 +33,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.harness import Caller, Rehearsal, argument_parser, example_query
+from benchmarks import harness
 from benchmarks.heaviest import (
     LOADS,
     ROOMS_PLAN,
@@ -41,11 +41,10 @@ from benchmarks.heaviest import (
     Load,
     Stored,
     building,
-    created,
+    created_id,
     missing_routes,
     store_venue,
 )
-from examples.launch import running_service
 from examples.truth import PLAN_PATH
 from service.security import Permission
 from service.security.keys import hash_of, key_text, new_secret
@@ -58,7 +57,6 @@ _SETTINGS = {
     "LALALOC_RATE_PER_MINUTE": "0",
     "LALALOC_RATE_BURST": "0",
     "LALALOC_KEEP_ANSWERS_S": "3600",
-    "LALALOC_LOG_LEVEL": "error",
 }
 _TOO_MANY = frozenset({0, 429, 503, 507})
 _ACCEPTED = frozenset({200, 201, 204, 304})
@@ -111,7 +109,7 @@ class Row:
 
 def main() -> int:
     """Measure and print the table; return 1 when a limit is exceeded."""
-    parser = argument_parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument(
         "--rows", default="", help="measure the rows whose 'route, input' match this regular expression"
     )
@@ -169,7 +167,7 @@ def _line(row: Mapping[str, Any]) -> str:
     ratios = f"{row['p50_ratio']:.1f}, {row['p99_ratio']:.1f}"
     routes = ", ".join(f"`{route}`" for route in row["routes"])
     cells = (routes, row["title"], row["connections"], *times, ratios, row["beside"]["failed"], answers)
-    return f"| {' | '.join(map(str, cells))} | {row['busy_s']:.1f} s |"
+    return harness.table_row(*cells, f"{row['busy_s']:.1f} s")
 
 
 def _holds(row: Row, refusals: frozenset[int]) -> bool:
@@ -189,13 +187,13 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
         data.mkdir()
         keys = {tenant: _new_key(data, tenant) for tenant in ("heavy", "light")}
         # Reading the plans is not measured, and must not fail on a busy machine.
-        settings = _SETTINGS | {"LALALOC_DATA_DIR": str(data), "LALALOC_MAX_IMPORT_S": "600"}
-        with running_service(0, settings) as service:
-            light, heavy = Caller(service.url, keys["light"]), Caller(service.url, keys["heavy"])
-            light_plan_id = created(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
+        settings = _SETTINGS | {"LALALOC_MAX_IMPORT_S": "600"}
+        with harness.started_service(data, settings) as service:
+            light, heavy = harness.Caller(service.url, keys["light"]), harness.Caller(service.url, keys["heavy"])
+            light_plan_id = created_id(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
             venue_id, _, member_ids = store_venue(heavy, homes)
             bodies = {name: json.dumps(documents[name]()).encode() for name in plans}
-            plan_ids = {name: created(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
+            plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
             _wait_until_ready(service.url)
             venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
             stored = {
@@ -218,11 +216,13 @@ def _new_key(data: Path, tenant: str) -> str:
 
 
 def _wait_until_ready(url: str) -> None:
-    caller, deadline = Caller(url), time.monotonic() + _READY_TIMEOUT_S
-    while preparing := caller.send("GET", "/readyz").json()["plans_preparing"]:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{preparing} plans are not ready after {_READY_TIMEOUT_S:g} s")
-        time.sleep(0.2)
+    caller = harness.Caller(url)
+    harness.wait_until(
+        lambda: not caller.send("GET", "/readyz").json()["plans_preparing"],
+        "all plans are ready",
+        _READY_TIMEOUT_S,
+        0.2,
+    )
 
 
 def _groups(loads: Iterable[Load]) -> Iterator[list[Load]]:
@@ -240,9 +240,8 @@ def _measure(loads: Sequence[Load], template: Template, seconds: float) -> Itera
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
         shutil.copytree(template.data, data)
-        with running_service(0, _SETTINGS | {"LALALOC_DATA_DIR": str(data)}) as service:
-            process = psutil.Process(service.process.pid)
-            probe = _Probe(service.url, template)
+        with harness.started_service(data, _SETTINGS) as service:
+            process, probe = service.process, _Probe(service.url, template)
             for _ in range(_WARM_QUERIES):
                 probe.ask()
             _idle_after(process)
@@ -271,13 +270,13 @@ class _Probe:
     """Queries of the light tenant, one after the other."""
 
     def __init__(self, url: str, template: Template) -> None:
-        self._caller = Caller(url, template.light_key)
+        self._caller = harness.Caller(url, template.light_key)
         self._plan_id = template.light_plan_id
         self._numbers = itertools.count()
 
     def ask(self) -> float:
         """Return the duration (s) of one query; infinite if it failed."""
-        query = example_query(next(self._numbers), self._plan_id)
+        query = harness.example_query(next(self._numbers), self._plan_id)
         begin = time.perf_counter()
         status = self._caller.send("POST", "/localise", *query).status
         if status != 200:
@@ -344,12 +343,12 @@ def _send_flood(url: str, key: str, number: int, size: int, stored: Stored, pipe
             time.sleep(_PAUSE_S)
 
     def repeat() -> None:
-        caller = Caller(url, key, count)
+        caller = harness.Caller(url, key, count)
         while True:
             load.work(caller, stored, size)
 
     # The bodies are made before they are needed.
-    load.work(Rehearsal(url), stored, size)
+    load.work(harness.Rehearsal(url), stored, size)
     for _ in range(load.connections):
         threading.Thread(target=repeat, daemon=True).start()
     pipe.send("begun")
@@ -362,21 +361,11 @@ def _idle_after(process: psutil.Process) -> float:
     """Wait until the service computes nothing, for 10 s at most; return the time (s)."""
     begin = time.monotonic()
     while (waited_s := time.monotonic() - begin) < _IDLE_TIMEOUT_S:
-        before_s = _cpu_s(process)
+        before_s = harness.cpu_s(process)
         time.sleep(_IDLE_WINDOW_S)
-        if _cpu_s(process) - before_s < _IDLE_SHARE * _IDLE_WINDOW_S:
+        if harness.cpu_s(process) - before_s < _IDLE_SHARE * _IDLE_WINDOW_S:
             break
     return waited_s
-
-
-def _cpu_s(process: psutil.Process) -> float:
-    """Return the CPU time of a service and its workers."""
-    total_s = 0.0
-    for part in (process, *process.children(recursive=True)):
-        with suppress(psutil.NoSuchProcess):
-            times = part.cpu_times()
-            total_s += times.user + times.system
-    return total_s
 
 
 if __name__ == "__main__":

@@ -11,11 +11,8 @@ differences. Exits with 1 if an answer of one checkout is more than 1e-6 m, degr
 
 from __future__ import annotations
 
-import os
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,12 +23,11 @@ from typing import Any
 
 import httpx
 import numpy as np
-import psutil
 
-from benchmarks.harness import UNLIMITED, argument_parser, free_port, query_of, upload_example_plan
+from benchmarks import harness
 from examples.truth import read_poses
 
-_START_S, _TIMEOUT_S, _WARM_UP = 180.0, 60.0, 20
+_TIMEOUT_S, _WARM_UP = 60.0, 20
 _TOLERANCE = 1e-6
 
 
@@ -40,15 +36,13 @@ class Checkout:
     """Running service of a checkout, with the example plan."""
 
     name: str
-    url: str
-    process: psutil.Process
-    plan_id: str
+    service: harness.Service
     answers: dict[tuple[bool, int], dict[str, Any]] = field(default_factory=dict)
 
     def ask(self, client: httpx.Client, number: int, *, known: bool) -> float:
         """Localise an example panorama; return the duration (s)."""
         poses = read_poses()
-        query = query_of(poses[number % len(poses)], floorplan_id=self.plan_id)
+        query = harness.query_of(poses[number % len(poses)], floorplan_id=self.service.plan_id)
         if not known:
             del query["data"]["heading_deg"]
         begin = time.perf_counter()
@@ -59,20 +53,17 @@ class Checkout:
 
     def burst(self, queries: int, clients: int, *, known: bool) -> Burst:
         """Answer queries of several clients; return CPU time per query, duration and rate."""
-        before_s, begin = self._cpu_s(), time.perf_counter()
+        before_s, begin = harness.cpu_s(self.service.process), time.perf_counter()
         with ThreadPoolExecutor(clients) as threads:
             parts = threads.map(lambda first: self._series(range(first, queries, clients), known=known), range(clients))
             durations_s = [duration for part in parts for duration in part]
         wall_s = time.perf_counter() - begin
-        return Burst(1e3 * (self._cpu_s() - before_s) / queries, [1e3 * s for s in durations_s], queries / wall_s)
+        spent_s = harness.cpu_s(self.service.process) - before_s
+        return Burst(1e3 * spent_s / queries, [1e3 * s for s in durations_s], queries / wall_s)
 
     def _series(self, numbers: Sequence[int], *, known: bool) -> list[float]:
-        with httpx.Client(base_url=self.url, timeout=_TIMEOUT_S) as client:
+        with httpx.Client(base_url=self.service.url, timeout=_TIMEOUT_S) as client:
             return [self.ask(client, number, known=known) for number in numbers]
-
-    def _cpu_s(self) -> float:
-        times = [part.cpu_times() for part in (self.process, *self.process.children(recursive=True))]
-        return sum(part.user + part.system for part in times)
 
 
 @dataclass(frozen=True)
@@ -86,7 +77,7 @@ class Burst:
 
 def main() -> int:
     """Measure; return 1 when answers differ."""
-    parser = argument_parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("checkouts", nargs=2, type=Path, help="folders of the checkouts, the one before first")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--queries", type=int, default=80, help="queries of each checkout and round")
@@ -94,8 +85,7 @@ def main() -> int:
     options = parser.parse_args()
     with ExitStack() as stack:
         checkouts = [stack.enter_context(running_checkout(folder.resolve())) for folder in options.checkouts]
-        print("| heading | clients | checkout | CPU per query | p50 | p99 | queries/s |", flush=True)
-        print("|---|---|---|---|---|---|---|", flush=True)
+        harness.print_table_head("heading", "clients", "checkout", "CPU per query", "p50", "p99", "queries/s")
         for known in (True, False):
             for clients in options.clients:
                 for row in _rows(checkouts, options.rounds, options.queries, clients, known=known):
@@ -128,8 +118,8 @@ def bursts_of(
 def _rows(checkouts: Sequence[Checkout], rounds: int, queries: int, clients: int, *, known: bool) -> Iterator[str]:
     for name, burst in bursts_of(checkouts, rounds, queries, clients, known=known).items():
         p50, p99 = np.quantile(burst.durations_ms, [0.5, 0.99])
-        heading, rate = "known" if known else "unknown", burst.per_second
-        yield f"| {heading} | {clients} | {name} | {burst.cpu_ms:.1f} ms | {p50:.0f} ms | {p99:.0f} ms | {rate:.1f} |"
+        times = f"{burst.cpu_ms:.1f} ms", f"{p50:.0f} ms", f"{p99:.0f} ms"
+        yield harness.table_row("known" if known else "unknown", clients, name, *times, f"{burst.per_second:.1f}")
 
 
 def differences_of(before: Checkout, after: Checkout) -> dict[str, float]:
@@ -147,32 +137,8 @@ def differences_of(before: Checkout, after: Checkout) -> dict[str, float]:
 @contextmanager
 def running_checkout(folder: Path) -> Iterator[Checkout]:
     """Run the service of the checkout in a folder, with a temporary data folder and the example plan."""
-    port = free_port()
-    url = f"http://127.0.0.1:{port}"
-    command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
-    with tempfile.TemporaryDirectory() as data:
-        environment = os.environ | UNLIMITED | {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
-        # The folder's own packages come before installed ones.
-        environment["PYTHONPATH"] = str(folder)
-        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
-        try:
-            _wait_until_ready(url, process)
-            yield Checkout(str(folder.name), url, psutil.Process(process.pid), upload_example_plan(url))
-        finally:
-            process.terminate()
-            process.wait(_START_S)
-
-
-def _wait_until_ready(url: str, process: subprocess.Popen[bytes]) -> None:
-    deadline = time.monotonic() + _START_S
-    while process.poll() is None and time.monotonic() < deadline:
-        try:
-            if httpx.get(f"{url}/readyz", timeout=_TIMEOUT_S).status_code == httpx.codes.OK:
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.2)
-    raise RuntimeError(f"the service at {url} was not ready within {_START_S:g} s: see its messages above")
+    with harness.example_service(harness.UNLIMITED, folder) as service:
+        yield Checkout(folder.name, service)
 
 
 if __name__ == "__main__":

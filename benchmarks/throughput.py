@@ -24,7 +24,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.harness import UNLIMITED, argument_parser, free_port, run_load, upload_example_plan, uvicorn_service
+from benchmarks import harness
 from service.settings import Settings
 
 _CLIENTS = (1, 2, 4, 8, 16)
@@ -34,7 +34,7 @@ _OBJECT_STORE_BYTES = 200 * 2**20
 
 def main() -> int:
     """Measure; return 1 when an answer was wrong."""
-    parser = argument_parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="duration for each number of clients")
     parser.add_argument("--clients", type=int, nargs="*", default=_CLIENTS)
     parser.add_argument("--processes", type=int, nargs="*", default=(1, 2), help="processes of uvicorn")
@@ -43,22 +43,21 @@ def main() -> int:
     options = parser.parse_args()
     services = {f"{count} processes": _uvicorn(count) for count in options.processes}
     services |= {f"{count} Ray nodes": _ray_service(count) for count in options.ray_nodes}
-    print("| service | clients | queries/s | p50 | p95 | p99 | stage `lpo` | refused or failed |", flush=True)
-    print("|---|---|---|---|---|---|---|---|", flush=True)
+    harness.print_table_head("service", "clients", "queries/s", "p50", "p95", "p99", "stage `lpo`", "refused or failed")
     failures = 0
     for name, service in services.items():
         with service as (url, kill):
             plans = max(options.clients) if name.endswith("nodes") else 1
-            plan_ids = [upload_example_plan(url) for _ in range(plans)]
-            run_load(url, plan_ids, 4, 5.0)
+            plan_ids = [harness.upload_example_plan(url) for _ in range(plans)]
+            harness.run_load(url, plan_ids, 4, 5.0)
             for clients in options.clients:
-                result = run_load(url, plan_ids[:clients], clients, options.seconds)
+                result = harness.run_load(url, plan_ids[:clients], clients, options.seconds)
                 failures += result.failures
                 print(result.row(name, clients), flush=True)
             if options.kill and not name.startswith("1 "):
                 timer = threading.Timer(0.5 * options.seconds, kill)
                 timer.start()
-                result = run_load(url, plan_ids, max(options.clients), options.seconds)
+                result = harness.run_load(url, plan_ids, max(options.clients), options.seconds)
                 timer.join()
                 print(result.row(f"{name}, one killed", max(options.clients)), flush=True)
     return int(failures > 0)
@@ -67,11 +66,11 @@ def main() -> int:
 @contextmanager
 def _uvicorn(processes: int) -> Iterator[tuple[str, Callable[[], None]]]:
     """Run the service in processes; yield its address, and how to kill one of them."""
-    cores, settings = Settings.load().cores, dict(UNLIMITED)
+    cores, settings = Settings.load().cores, dict(harness.UNLIMITED)
     if processes > 1:
         settings["LALALOC_WORKERS"] = str(max(cores.workers // processes, 1))
         settings["LALALOC_COMPUTE_THREADS"] = str(max(cores.compute_threads // processes, 1))
-    with uvicorn_service(processes, settings) as (url, server):
+    with harness.uvicorn_service(processes, settings) as (url, server):
         # The last child is a worker; the first one tracks resources of all.
         yield url, lambda: psutil.Process(server.pid).children()[-1].kill()
 
@@ -93,7 +92,7 @@ def _ray_service(nodes: int) -> Iterator[tuple[str, Callable[[], None]]]:
     try:
         others = [cluster.add_node(**node) for _ in range(nodes - 1)]
         ray.init(address=cluster.address, log_to_driver=False)
-        port = free_port()
+        port = harness.free_port()
         serve.start(http_options={"host": "127.0.0.1", "port": port})
         with tempfile.TemporaryDirectory() as data:
             settings = Settings(data_dir=Path(data), log_level="error", max_queries=64, lpo_queue=64)

@@ -1,7 +1,8 @@
-"""Render the example panoramas and a phone photograph, and write the panoramas' true poses.
+"""Render the example panoramas and a phone photograph, write the panoramas' true poses, and draw pictures for docs/.
 
 Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
-hand, and no training data contains its plan, furniture or lighting.
+hand, and no training data contains its plan, furniture or lighting. The pictures are those of
+docs/how-to/take-photographs.md: a usable sphere, a tilted one, and an incomplete one.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.sphere_levelling import level
 
 HEIGHT, WIDTH = 512, 1024
 # Rays per pixel and axis, for smooth edges.
@@ -87,6 +89,12 @@ _PHONE_PITCH, _PHONE_ROLL = math.radians(-4.0), math.radians(1.5)
 _PHONE_SPHERE, _PHONE_SIZE = (1536, 3072), (1280, 960)
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
+# Pictures for docs/: rotation of a tilted camera, and the part of a sphere in a phone's panorama mode.
+_PICTURES = FOLDER.parent / "docs" / "images"
+_PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_QUALITY = 768, 384, 85
+_PITCH, _ROLL = math.radians(8.0), math.radians(6.0)
+_PHONE_ROWS = slice(_PICTURE_HEIGHT // 3, 2 * _PICTURE_HEIGHT // 3)
+
 
 def main() -> None:
     """Render every view of the flat and write the true poses."""
@@ -99,6 +107,7 @@ def main() -> None:
         print(FOLDER / view.file)
     write_poses([true_pose(home.plan, view) for view in VIEWS])
     _write_phone_photograph(home, materials)
+    _write_pictures()
 
 
 def _write_phone_photograph(home: Home, materials: MaterialLibrary) -> None:
@@ -110,6 +119,21 @@ def _write_phone_photograph(home: Home, materials: MaterialLibrary) -> None:
     exif.get_ifd(_EXIF_IFD)[_FOCAL_LENGTH_35MM] = _PHONE_FOCAL_MM
     Image.fromarray(pixels).save(FOLDER / PHONE.file, quality=_JPEG_QUALITY, optimize=True, exif=exif)
     print(FOLDER / PHONE.file)
+
+
+def _write_pictures() -> None:
+    _PICTURES.mkdir(exist_ok=True)
+    with Image.open(FOLDER / "kitchen.jpg") as picture:
+        size = _PICTURE_WIDTH, _PICTURE_HEIGHT
+        sphere = np.asarray(picture.convert("RGB").resize(size, Image.Resampling.LANCZOS))
+    pictures = {
+        "sphere": sphere,
+        "tilted": level(sphere, pitch=_PITCH, roll=_ROLL),
+        "phone": sphere[_PHONE_ROWS, : 2 * _PICTURE_WIDTH // 3],
+    }
+    for name, pixels in pictures.items():
+        path = _PICTURES / f"{name}.jpg"
+        Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=_PICTURE_QUALITY, optimize=True)
 
 
 def example_home() -> Home:

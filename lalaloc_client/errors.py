@@ -111,19 +111,14 @@ class OverloadedError(ProblemError):
     """The service is overloaded, or the key's rate limit is exceeded."""
 
 
-_BY_STATUS: dict[int, type[ProblemError]] = {
-    400: InvalidError,
-    401: UnauthorisedError,
-    403: UnauthorisedError,
-    404: NotFoundError,
-    409: ConflictError,
-    412: ConflictError,
-    413: InvalidError,
-    415: InvalidError,
-    422: InvalidError,
-    429: OverloadedError,
-    503: OverloadedError,
+_STATUSES: Mapping[type[ProblemError], tuple[int, ...]] = {
+    InvalidError: (400, 413, 415, 422),
+    UnauthorisedError: (401, 403),
+    NotFoundError: (404,),
+    ConflictError: (409, 412),
+    OverloadedError: (429, 503),
 }
+_BY_STATUS = {status: kind for kind, statuses in _STATUSES.items() for status in statuses}
 
 
 def problem_of(response: httpx.Response) -> ProblemError:

@@ -119,7 +119,7 @@ class OnDeviceModel:
                 content,
                 sphere_size=sphere_size(manifest),
                 patch_size=patch_size(manifest),
-                stated=_stated(options),
+                stated=_stated_camera(options),
             )
             return self._encoder.features(view)
         except InvalidPhotographError as error:
@@ -132,7 +132,7 @@ def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], 
     return camera, cast("QueryOptions", {name: value for name, value in options.items() if name not in _CAMERA})
 
 
-def _stated(options: Mapping[str, Any]) -> StatedCamera:
+def _stated_camera(options: Mapping[str, Any]) -> StatedCamera:
     from lalaloc_core.photograph import Intrinsics, StatedCamera
 
     intrinsics = options.get("intrinsics")

@@ -33,8 +33,8 @@ PictureFormat = Literal["png", "svg"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
-NDJSON = "application/x-ndjson"
-_JSON, _FILE, _PHOTO = "application/json", "application/octet-stream", "photo"
+JSON, NDJSON = "application/json", "application/x-ndjson"
+_FILE, _PHOTO = "application/octet-stream", "photo"
 _JPEG_QUALITY = 95
 # First bytes of a file of features.
 _FEATURES = b"LLFT"
@@ -126,7 +126,7 @@ def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[s
         raise ValueError(f"base_url is '{base_url}'; it must begin with http:// or https:// and name a host")
     if not timeout_s > 0.0:
         raise ValueError(f"timeout_s is {timeout_s}; it must be greater than 0")
-    headers = {"Accept": _JSON, "User-Agent": "lalaloc-client"}
+    headers = {"Accept": JSON, "User-Agent": "lalaloc-client"}
     if api_key is not None:
         if not (api_key.isascii() and api_key.isprintable()) or not api_key or " " in api_key:
             # The message leaves the value out: a mistyped key is still mostly the secret.
@@ -168,7 +168,7 @@ def json_request(
     safety: Safety = Safety.ANY,
 ) -> Request:
     """Return a request with a JSON body."""
-    headers = {"Content-Type": _JSON, **_headers(if_match, idempotency_key)}
+    headers = {"Content-Type": JSON, **_headers(if_match, idempotency_key)}
     content = json.dumps(document, allow_nan=False).encode()
     return Request(method, path, headers=headers, content=content, safety=_safety(if_match, safety))
 
@@ -196,7 +196,7 @@ def plan_request(
         name = os.path.basename(document) if is_file else default
         media, content = _form("file", [(name, content)], options or {})
     else:
-        media = _JSON if isinstance(document, Mapping) else _FILE
+        media = JSON if isinstance(document, Mapping) else _FILE
     headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}
     return Request(method, path, headers=headers, content=content, safety=_safety(if_match))
 
@@ -208,7 +208,7 @@ def query_request(
     options: QueryOptions | ViewOptions | None = None,
     *,
     params: Mapping[str, str] | None = None,
-    accept: str = _JSON,
+    accept: str = JSON,
     streamed: bool = False,
 ) -> Request:
     """Return a query; repeating it is safe, as it stores nothing. Streamed queries state the names of the files.
@@ -271,7 +271,7 @@ def geopose_request(
         readings["geolocationReadings"] = [common | place]
     document = {"id": uuid.uuid4().hex, "timestamp": now_ms, "type": "geopose", "sensors": sensors}
     body = json.dumps(document | {"sensorReadings": readings}).encode()
-    return Request("POST", "/geopose", params, {"Content-Type": _JSON}, body)
+    return Request("POST", "/geopose", params, {"Content-Type": JSON}, body)
 
 
 def preview_params(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +32,13 @@ _PHOTOGRAPHS = {"sphere": "sphere", "phone": "80°", "three_phone": "three of 80
 
 def accuracy_table() -> str:
     """Return accuracy and calibration of the shipped model on synthetic homes as a Markdown table."""
-    rows = [
-        "| queries | < 1 m [95 %] | < 10 cm | median | heading < 2° | calibration error | n |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, title in _ACCURACY_ROWS.items():
         scores = _bench()["accuracy"][name]
         error = scores["expected_calibration_error"]
         median = f"{scores['median_cm']:.1f} cm" if scores["median_cm"] >= 0.01 else "< 0.01 cm"
         rows.append(
-            _row(
+            (
                 title,
                 _share_and_interval(scores),
                 _percent(scores["within_10cm"]),
@@ -50,7 +48,7 @@ def accuracy_table() -> str:
                 f"{scores['n']}",
             )
         )
-    return "\n".join(rows)
+    return table("queries | < 1 m [95 %] | < 10 cm | median | heading < 2° | calibration error | n", rows)
 
 
 _TERM_ROWS = {
@@ -65,15 +63,12 @@ _TERM_ROWS = {
 
 def terms_table() -> str:
     """Return the share within 1 m with and without terms of the matching cost as a Markdown table."""
-    rows = [
-        "| terms | test, known heading | test, unknown | out-of-distribution, known | out-of-distribution, unknown |",
-        "|---|---|---|---|---|",
-    ]
-    homes = _bench()["terms"]
+    rows, homes = [], _bench()["terms"]
     for name, title in _TERM_ROWS.items():
         cells = (homes[split][name][heading] for split in homes for heading in ("known_heading", "unknown_heading"))
-        rows.append(_row(title, *(_percent(scores["within_1m"]) for scores in cells)))
-    return "\n".join(rows)
+        rows.append((title, *(_percent(scores["within_1m"]) for scores in cells)))
+    head = "terms | test, known heading | test, unknown | out-of-distribution, known | out-of-distribution, unknown"
+    return table(head, rows)
 
 
 _VIEW_ROWS = {
@@ -113,14 +108,11 @@ def _share_and_interval(scores: dict[str, Any]) -> str:
 
 def views_table() -> str:
     """Return accuracy and calibration of views in furnished synthetic homes as a Markdown table."""
-    rows = [
-        "| views of furnished homes | < 1 m [95 %] | < 1 m and 30° | among five | median | calibration error | n |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, title in _VIEW_ROWS.items():
         scores = _bench()["views"][name]
         rows.append(
-            _row(
+            (
                 title,
                 _share_and_interval(scores),
                 _percent(scores["within_1m_30deg"]),
@@ -134,32 +126,32 @@ def views_table() -> str:
         scores = _bench()["turns"][name]
         shares = _percent(scores["within_1m"]), _percent(scores["within_1m_30deg"]), "–"
         error = f"{scores['expected_calibration_error']:.3f}"
-        rows.append(_row(title, *shares, f"{scores['median_cm']:.0f} cm", error, f"{scores['n']}"))
-    return "\n".join(rows)
+        rows.append((title, *shares, f"{scores['median_cm']:.0f} cm", error, f"{scores['n']}"))
+    head = "views of furnished homes | < 1 m [95 %] | < 1 m and 30° | among five | median | calibration error | n"
+    return table(head, rows)
 
 
 def uninformative_table() -> str:
     """Return the confidence of photographs that cannot tell the place as a Markdown table."""
-    rows = ["| photograph | confidence above 0.5 | median | highest | n |", "|---|---|---|---|---|"]
+    rows = []
     for name, title in _UNINFORMATIVE_ROWS.items():
         found = _bench()["uninformative"][name]
         values = _percent(found["above_half"]), f"{found['median']:.2f}", f"{found['highest']:.2f}", f"{found['n']}"
-        rows.append(_row(title, *values))
-    return "\n".join(rows)
+        rows.append((title, *values))
+    return table("photograph | confidence above 0.5 | median | highest | n", rows)
 
 
 def localisability_table() -> str:
     """Return predicted and found shares of photographs, as a Markdown table."""
-    rows = ["| photograph, heading | predicted | found | difference [95 %] | n |", "|---|---|---|---|---|"]
-    group = _bench()["localisability"]
+    rows, group = [], _bench()["localisability"]
     for name in CONDITIONS:
         photograph, heading = parts_of(name)
         found = group[name]
         low, high = found["interval"]
         difference = f"{100 * (found['predicted'] - found['found']):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
         shares = _percent(found["predicted"]), _percent(found["found"])
-        rows.append(_row(f"{_PHOTOGRAPHS[photograph]}, {heading}", *shares, difference, f"{group['n']}"))
-    return "\n".join(rows)
+        rows.append((f"{_PHOTOGRAPHS[photograph]}, {heading}", *shares, difference, f"{group['n']}"))
+    return table("photograph, heading | predicted | found | difference [95 %] | n", rows)
 
 
 def speed_table() -> str:
@@ -167,13 +159,11 @@ def speed_table() -> str:
     service = _bench()["service"]
     memory = ", ".join(f"{size:.0f} MB" for size in service["workers_resident_mb"])
     rows = [
-        "| what | measured |",
-        "|---|---|",
         *(_latency(title, service[name]) for name, title in _SPEED_ROWS.items()),
-        _row("memory: service with one plan; its LPO worker", f"{service['service_resident_mb']:.0f} MB; {memory}"),
-        _row("model bundle", f"{_bundle_mb():.1f} MB"),
+        ("memory: service with one plan; its LPO worker", f"{service['service_resident_mb']:.0f} MB; {memory}"),
+        ("model bundle", f"{_bundle_mb():.1f} MB"),
     ]
-    return "\n".join(rows)
+    return table("what | measured", rows)
 
 
 def neighbours_table() -> str:
@@ -190,8 +180,10 @@ def paper_tables() -> str:
     return "\n".join(markdown(TableResult.read(path)) for path in paths if path.exists()).rstrip()
 
 
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"
+def table(head: str, rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; the names of its columns are separated by " | "."""
+    lines = [f"| {' | '.join(cells)} |" for cells in rows]
+    return "\n".join([f"| {head} |", f"|{'---|' * len(head.split(' | '))}", *lines])
 
 
 def _percent(share: float) -> str:
@@ -207,10 +199,10 @@ def _bundle_mb() -> float:
     return sum(entry["bytes"] for entry in manifest["files"].values()) / 1e6
 
 
-def _latency(title: str, measured: dict[str, Any]) -> str:
+def _latency(title: str, measured: dict[str, Any]) -> tuple[str, str]:
     stages = measured["median_stage_ms"]
     parts = ", ".join(f"{name} {stages[name]:.0f}" for name in ("decode", "encode", "retrieve", "lpo"))
-    return _row(
+    return (
         f"`/localise`, {title}, one client: p50, p95 (median of stages)",
         f"{measured['p50_ms']:.0f} ms, {measured['p95_ms']:.0f} ms ({parts} ms)",
     )

@@ -47,10 +47,10 @@ def generated_files() -> dict[Path, str]:
         shutil.copytree(PACKAGE / "asynchronous", source)
         rule = Rule("/asynchronous/", "/blocking/", _NAMES)
         unasync_files([str(source / name) for name in _FILES], [rule])
-        return {PACKAGE / "blocking" / name: _polished(Path(folder), name) for name in _FILES}
+        return {PACKAGE / "blocking" / name: _polish(Path(folder), name) for name in _FILES}
 
 
-def _polished(folder: Path, name: str) -> str:
+def _polish(folder: Path, name: str) -> str:
     """Return a generated file with header, documentation and imports as they belong to the blocking client."""
     text = _HEADER.format(name=name) + (folder / "blocking" / name).read_text(encoding="utf-8")
     for asynchronous, blocking in _TEXTS.items():

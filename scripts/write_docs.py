@@ -21,6 +21,7 @@ from scripts.figures import (
     neighbours_table,
     paper_tables,
     speed_table,
+    table,
     terms_table,
     uninformative_table,
     views_table,
@@ -39,7 +40,7 @@ _OTHER_FOLDERS = {
     "models/default": ("The shipped model and its card.", "README.md"),
     "docker": ("Image, compose files, nginx, Kubernetes manifests, Grafana dashboard.", "compose.yaml"),
     "tests": (
-        "Tests, one folder per subject: `core/`, `plans/` (plan files), `service/`, `client/`, `web/`.",
+        "Tests, one folder per subject: `core/`, `importers/`, `service/`, `client/`, `web/`.",
         "test_boundaries.py",
     ),
 }
@@ -56,10 +57,10 @@ def documents() -> dict[Path, str]:
     """Return the up-to-date text of every document that has generated tables."""
     paths = sorted((ROOT / "docs").rglob("*.md"))
     texts = {path: path.read_text(encoding="utf-8") for path in paths}
-    return {path: _PART.sub(_filled, text) for path, text in texts.items() if _PART.search(text)}
+    return {path: _PART.sub(_fill, text) for path, text in texts.items() if _PART.search(text)}
 
 
-def _filled(part: re.Match[str]) -> str:
+def _fill(part: re.Match[str]) -> str:
     return f"<!-- begin: {part[1]} -->\n{TABLES[part[1]]()}\n<!-- end: {part[1]} -->"
 
 
@@ -69,18 +70,18 @@ def folder_map() -> str:
     Raises:
         FileNotFoundError: the first file of a folder does not exist.
     """
-    rows = ["| folder | purpose | begin with |", "|---|---|---|"]
+    rows = []
     for package in _PACKAGES:
         for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):
             docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
             summary = " ".join(docstring.split("\n\n")[0].split()).replace("|", "\\|")
             begin = re.search(r"Begin\s+with\s+`([^`]+)`", docstring)
-            rows.append(f"| `{path.parent.relative_to(ROOT)}/` | {summary} | {f'`{begin[1]}`' if begin else ''} |")
+            rows.append((f"`{path.parent.relative_to(ROOT)}/`", summary, f"`{begin[1]}`" if begin else ""))
     for folder, (purpose, first) in _OTHER_FOLDERS.items():
         if not (ROOT / folder / first).exists():
             raise FileNotFoundError(f"'{folder}/{first}' does not exist; correct _OTHER_FOLDERS")
-        rows.append(f"| `{folder}/` | {purpose} | `{first}` |")
-    return "\n".join(rows)
+        rows.append((f"`{folder}/`", purpose, f"`{first}`"))
+    return table("folder | purpose | begin with", rows)
 
 
 def metrics_table() -> str:
@@ -97,26 +98,26 @@ def metrics_table() -> str:
                 argument.value if isinstance(argument, ast.Constant) else None for argument in node.args[:2]
             )
             if kind and isinstance(name, str) and isinstance(meaning, str) and name.startswith("lalaloc_"):
-                metrics[f"{name}_total" if kind == "counter" else name] = f"{kind} | {meaning}"
-    rows = ["| metric | type | meaning |", "|---|---|---|"]
-    return "\n".join([*rows, *(f"| `{name}` | {row} |" for name, row in sorted(metrics.items()))])
+                metrics[f"{name}_total" if kind == "counter" else name] = (kind, meaning)
+    return table("metric | type | meaning", [(f"`{name}`", *row) for name, row in sorted(metrics.items())])
 
 
 def routes_table() -> str:
     """Return the routes of the HTTP API as a Markdown table."""
-    rows = ["| route | purpose |", "|---|---|"]
-    for route, operations in yaml.safe_load(openapi_text())["paths"].items():
-        for method, operation in operations.items():
-            rows.append(f"| `{method.upper()} {route}` | {operation['summary']} |")
-    return "\n".join(rows)
+    paths = yaml.safe_load(openapi_text())["paths"]
+    rows = [
+        (f"`{method.upper()} {route}`", operation["summary"])
+        for route, operations in paths.items()
+        for method, operation in operations.items()
+    ]
+    return table("route | purpose", rows)
 
 
 def problems_table() -> str:
     """Return the problem kinds of the HTTP API as a Markdown table."""
     kinds = {kind.slug: kind for kind in (*PROBLEMS.values(), *HTTP_PROBLEMS.values())}
-    rows = ["| kind | status | title |", "|---|---|---|"]
     ordered = sorted(kinds.values(), key=lambda kind: (kind.status, kind.slug))
-    return "\n".join([*rows, *(f"| `{kind.slug}` | {kind.status} | {kind.title} |" for kind in ordered)])
+    return table("kind | status | title", [(f"`{kind.slug}`", f"{kind.status}", kind.title) for kind in ordered])
 
 
 def commands() -> str:
@@ -143,9 +144,9 @@ def _section(parser: argparse.ArgumentParser) -> str:
         name = ", ".join(action.option_strings) or str(action.metavar or action.dest)
         choices = f"; one of {', '.join(map(str, action.choices))}" if action.choices else ""
         meaning = (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%").replace("|", "\\|")
-        rows.append(f"| `{name}` | {meaning}{choices} |")
-    table = ["| option | meaning |", "|---|---|", *rows] if rows else ["No options."]
-    return "\n".join([f"## {parser.prog}", "", *([parser.description, ""] if parser.description else []), *table])
+        rows.append((f"`{name}`", f"{meaning}{choices}"))
+    options = table("option | meaning", rows) if rows else "No options."
+    return "\n".join([f"## {parser.prog}", "", *([parser.description, ""] if parser.description else []), options])
 
 
 TABLES: dict[str, Callable[[], str]] = {

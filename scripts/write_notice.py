@@ -54,7 +54,7 @@ def licence_of(name: str) -> str | None:
     return ", ".join(named) or (text.splitlines()[0][:_MAX_NAME] if text else "see its files")
 
 
-def written() -> str:
+def notice_text() -> str:
     """Return NOTICE as it should be.
 
     Raises:
@@ -71,13 +71,13 @@ def written() -> str:
         if licence is None and not known:
             raise ValueError(f"{name} {version} is neither installed nor listed in NOTICE: install it first")
         lines.append(known[0] if licence is None else begin + licence)
-    pages = [f"    {name} {version}: {licence}" for name, version, licence in bundled()]
+    pages = [f"    {name} {version}: {licence}" for name, version, licence in npm_packages()]
     # Up to the next empty line: the list of the pages.
     after = after.partition("\n\n")[2] if after else ""
     return f"{before}{_BEGIN}" + "\n".join(lines) + f"\n{_END}" + "\n".join(pages) + "\n\n" + after
 
 
-def bundled() -> list[tuple[str, str, str]]:
+def npm_packages() -> list[tuple[str, str, str]]:
     """Return name, version and licence of the npm packages that the web pages contain."""
     lock = json.loads((ROOT / "web" / "package-lock.json").read_text(encoding="utf-8"))["packages"]
     found = [(name, lock[f"node_modules/{name}"]) for name in lock[""]["dependencies"]]
@@ -86,7 +86,7 @@ def bundled() -> list[tuple[str, str, str]]:
 
 def main() -> int:
     """Write NOTICE."""
-    atomic_write(NOTICE, written())
+    atomic_write(NOTICE, notice_text())
     return 0
 
 

@@ -49,7 +49,7 @@ LAYERS = {
     "lalaloc_core.importers.drawing": 3,
     "lalaloc_core.importers.picture": 4,
     "lalaloc_core.importers.formats": 5,
-    "lalaloc_core.importers.registry": 3,
+    "lalaloc_core.importers.format_table": 3,
     "lalaloc_core.importers": 6,
     # Training.
     "lalaloc_core.learn.metrics": 1,

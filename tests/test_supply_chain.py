@@ -72,7 +72,7 @@ def test_torch_lock_is_for_the_pinned_version() -> None:
 
 
 def test_notice_lists_the_licences_of_all_that_ships() -> None:
-    assert write_notice.written() == write_notice.NOTICE.read_text(encoding="utf-8"), "run `make notice`"
+    assert write_notice.notice_text() == write_notice.NOTICE.read_text(encoding="utf-8"), "run `make notice`"
 
 
 def test_licence_is_read_from_the_metadata() -> None:

@@ -38,6 +38,7 @@ from lalaloc_client.model import (
 )
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
+    JSON,
     NDJSON,
     PICTURE_MEDIA,
     Covariance,
@@ -60,6 +61,7 @@ from lalaloc_client.requests import (
 from lalaloc_client.retry import Safety
 from lalaloc_client.tracking import SessionOptions
 
+_SVG = PICTURE_MEDIA["svg"]
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 # Pause between two streams of events until the service sends its own, as it does at the start of each stream.
 _RECONNECT_S = 3.0
@@ -136,7 +138,7 @@ class AsyncClient(AsyncTransport):
 
     async def original(self, floorplan_id: str) -> bytes:
         """Return the file of a plan's current revision exactly as it was uploaded."""
-        return await self.content(Request("GET", f"{resource_path('floorplans', floorplan_id)}/original"))
+        return await self._part(floorplan_id, "original")
 
     async def preview(
         self,
@@ -153,31 +155,26 @@ class AsyncClient(AsyncTransport):
         drawn as the ellipse that contains 95 % of its positions.
         """
         params = preview_params(x_m, y_m, heading_deg, covariance_m2)
-        path = f"{resource_path('floorplans', floorplan_id)}/preview.svg"
-        return (await self.content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
+        return (await self._part(floorplan_id, "preview.svg", _SVG, **params)).decode()
 
     async def export(self, floorplan_id: str, file_format: str) -> bytes:
         """Return a plan as a file: `native`, `geojson`, `imdf` (for plans with an anchor), `dxf` or `svg`."""
-        path = f"{resource_path('floorplans', floorplan_id)}/export"
-        return await self.content(Request("GET", path, {"format": file_format}))
+        return await self._part(floorplan_id, "export", format=file_format)
 
     async def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
         """Return the walls and openings of a plan, room by room, from which a camera's view can be drawn.
 
         `revision` is an older revision, while the service keeps it. Default: the current one.
         """
-        path = f"{resource_path('floorplans', floorplan_id)}/layout"
-        return parse(Layout, await self.content(Request("GET", path, text_values({"revision": revision}))))
+        return parse(Layout, await self._part(floorplan_id, "layout", **text_values({"revision": revision})))
 
     async def mesh(self, floorplan_id: str) -> bytes:
         """Return floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""
-        path = f"{resource_path('floorplans', floorplan_id)}/mesh.glb"
-        return await self.content(Request("GET", path, headers={"Accept": "model/gltf-binary"}))
+        return await self._part(floorplan_id, "mesh.glb", "model/gltf-binary")
 
     async def localisability(self, floorplan_id: str) -> Localisability:
         """Return which photographs of a plan will be found, predicted from the plan and the model's measured errors."""
-        path = f"{resource_path('floorplans', floorplan_id)}/localisability"
-        return parse(Localisability, await self.content(Request("GET", path)))
+        return parse(Localisability, await self._part(floorplan_id, "localisability"))
 
     async def localisability_map(
         self,
@@ -186,9 +183,13 @@ class AsyncClient(AsyncTransport):
         heading: Literal["known", "unknown"] = "unknown",
     ) -> str:
         """Return an SVG drawing of the probability by place that a photograph is found."""
-        path = f"{resource_path('floorplans', floorplan_id)}/localisability.svg"
-        params = {"photograph": photograph, "heading": heading}
-        return (await self.content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
+        picture = await self._part(floorplan_id, "localisability.svg", _SVG, photograph=photograph, heading=heading)
+        return picture.decode()
+
+    async def _part(self, floorplan_id: str, name: str, accept: str = JSON, **params: str | list[str]) -> bytes:
+        """Return the content of a resource of a plan."""
+        path = f"{resource_path('floorplans', floorplan_id)}/{name}"
+        return await self.content(Request("GET", path, params, {"Accept": accept}))
 
     async def events(self, floorplan_id: str) -> AsyncIterator[PlanEvent]:
         """Yield the progress of a plan until it is ready, failed or deleted.

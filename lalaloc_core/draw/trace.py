@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from lalaloc_core.draw.canvas import INK, document, path, words
-from lalaloc_core.importers.common.trace import Trace, TracePart
+from lalaloc_core.importers.common.import_report import Trace, TracePart
 
 _SIZE, _MARGIN, _LEGEND, _LINE = 1600.0, 20.0, 190.0, 22.0
 # Colour of lines, fill, width (pixels) and meaning by part, in the order of drawing; Okabe and Ito's palette.

@@ -3,22 +3,22 @@
 `import_plan` and `import_plans` detect a file's format from its bytes. They return a document in the native format
 (docs/reference/plan-format.md) and a report of the layers used and the likely mistakes.
 
-registry.py  table of all formats
-formats/     one module per format: reader and writer (DXF: `formats/dxf.py`)
-drawing/     vector drawings of any format: walls, the rooms they enclose, door symbols
-picture/     scans and photographs of drawings
-common/      code that all importers share: options, limits, the sketch, and its conversion to a plan
+format_table.py  table of all formats
+formats/         one module per format: reader and writer (DXF: `formats/dxf.py`)
+drawing/         vector drawings of any format: walls, the rooms they enclose, door symbols
+picture/         scans and photographs of drawings
+common/          code that all importers share: options, limits, the sketch, and its conversion to a plan
 
 Begin with `importing.py`, which detects the format and calls its module. `lalaloc_core.floorplan` defines a plan.
 """
 
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, ImportLimits
-from lalaloc_core.importers.common.options import ImportOptions, KnownDistance
-from lalaloc_core.importers.common.report import ImportReport, LayerUse
+from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, ImportLimits
+from lalaloc_core.importers.common.import_options import ImportOptions, KnownDistance
+from lalaloc_core.importers.common.import_report import ImportReport, LayerUse, Trace
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.common.trace import Trace
+from lalaloc_core.importers.format_table import EXPORT_FORMATS, FORMATS, ExportFormat, Format
 from lalaloc_core.importers.importing import (
     begins_with_plans,
     building_name,
@@ -30,7 +30,6 @@ from lalaloc_core.importers.importing import (
     import_plans,
     is_json,
 )
-from lalaloc_core.importers.registry import EXPORT_FORMATS, FORMATS, ExportFormat, Format
 
 __all__ = [
     "DEFAULT_IMPORT_LIMITS",

@@ -14,11 +14,12 @@ from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
+from lalaloc_core.importers.common.archive import read_archive
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
-from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
-from lalaloc_core.importers.common.options import DEFAULT_OPTIONS, ImportOptions
-from lalaloc_core.importers.common.trace import Trace
-from lalaloc_core.importers.registry import EXPORT_FORMATS, FORMATS, HEAD_BYTES, Format
+from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
+from lalaloc_core.importers.common.import_options import DEFAULT_OPTIONS, ImportOptions
+from lalaloc_core.importers.common.import_report import Trace
+from lalaloc_core.importers.format_table import EXPORT_FORMATS, FORMATS, HEAD_BYTES, Format
 
 _GEOJSON_TYPES = {
     "FeatureCollection", "Feature", "Polygon", "MultiPolygon", "LineString", "MultiLineString", "Point", "MultiPoint",
@@ -136,7 +137,7 @@ def import_if_native(
 
 
 def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> bytes:
-    """Return a plan as a file; the bytes depend only on the plan, except for DXF, which contains the time.
+    """Return a plan as a file. Equal plans give equal bytes, whenever and wherever they are written.
 
     `anchor` places the plan's origin on Earth for IMDF and GeoJSON; by default it is the plan's own.
 
@@ -195,7 +196,6 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
     format = _format_by_magic(content)
     if format.name != "imdf":
         return format, content
-    from lalaloc_core.importers.formats.imdf import read_archive
     from lalaloc_core.importers.formats.ros import YAML_SUFFIXES
 
     files = read_archive(content, limits, suffixes=_IN_ARCHIVES)

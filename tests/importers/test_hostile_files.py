@@ -22,10 +22,10 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
-from lalaloc_core.importers.drawing import walls
-from lalaloc_core.importers.drawing.walls import enclose
+from lalaloc_core.importers.drawing import enclosed_rooms
+from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
 
@@ -256,15 +256,7 @@ def test_obstacles_are_compared_with_the_rooms_near_them(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(shapely.Polygon, "intersects", counted)
     options = ImportOptions(ceiling_height_m=2.5)
-    plan = assemble(
-        lined_up_rooms(40),
-        ReportBuilder(),
-        options,
-        DEFAULT_LIMITS,
-        format="dxf",
-        metres_per_unit=1.0,
-        scale_source="m",
-    )
+    plan = assemble(lined_up_rooms(40), ReportBuilder("dxf", 1.0, "m"), options, DEFAULT_LIMITS)
     assert all(len(room["holes"]) == 1 for room in plan.document["rooms"])
     assert len(compared) == 40
 
@@ -301,7 +293,7 @@ def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(np.linalg, "norm", counted)
     lines = [shapely.LineString([(0, y), (3, y)]) for k in range(50) for y in (2.0 * k, 2.0 * k + 0.2)]
-    joints = walls._joints(lines, walls.DEFAULT_WALLS)
+    joints = enclosed_rooms._joints(lines, enclosed_rooms.DEFAULT_WALLS)
     # A jamb at both ends of each wall, found from both of its faces.
     assert [joint.length for joint in joints] == pytest.approx([0.2] * 200)
     assert sum(compared) < 5 * 200

@@ -21,8 +21,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
-from lalaloc_core.importers.common.limits import Budget, ImportLimits
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.picture import lettering
 from lalaloc_core.importers.picture.lettering import read_texts
 from tests.importers.conftest import shapes

@@ -18,7 +18,7 @@ from lalaloc_core.importers import (
     import_plan,
     import_plans,
 )
-from lalaloc_core.importers.common.checks import check_document, likely_unit
+from lalaloc_core.importers.common.plausibility import check_document, likely_unit
 from tests.importers.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048

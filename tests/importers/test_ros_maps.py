@@ -19,7 +19,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, detect_format, export_plan, import_plan
-from lalaloc_core.importers.common.map_frame import MapFrame
+from lalaloc_core.importers.common.geometry import MapFrame
 from lalaloc_core.importers.formats.ros import write
 from tests.importers.conftest import FLAT, lines, shapes, zip_file
 

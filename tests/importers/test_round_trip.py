@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import subprocess
+import sys
 import zipfile
 
+import ezdxf
 import pytest
 import shapely
 
@@ -26,6 +30,32 @@ def test_exported_plan_is_imported_unchanged(flat: FloorPlan, format):
     assert shapely.LineString(walls[0]).hausdorff_distance(shapely.LineString([[6.5, 3.2], [7.5, 3.2]])) < 2e-3
     assert back.report.warnings == ()
     back.plan()
+
+
+def test_equal_plans_give_equal_bytes_in_every_process(flat: FloorPlan):
+    program = (
+        "import hashlib, json, sys\nfrom lalaloc_core.floorplan import FloorPlan\n"
+        "from lalaloc_core.importers import EXPORT_FORMATS, Anchor, export_plan\n"
+        f"plan, anchor = FloorPlan.from_dict(json.load(sys.stdin)), {ANCHOR!r}\n"
+        "print([hashlib.sha256(export_plan(plan, format, anchor)).hexdigest() for format in EXPORT_FORMATS])"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            input=json.dumps(flat.to_dict()),
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2", "3")
+    }
+    assert len(outputs) == 1
+
+
+def test_options_of_ezdxf_stay_as_they_are(flat: FloorPlan):
+    export_plan(flat, "dxf")
+    assert not ezdxf.options.write_fixed_meta_data_for_testing
 
 
 @pytest.mark.parametrize("format", ["geojson", "imdf"])

@@ -16,12 +16,12 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.checks import check_document
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.limits import ImportLimits
+from lalaloc_core.importers.common.import_limits import ImportLimits
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ImportReport, ReportBuilder
+from lalaloc_core.importers.common.plausibility import check_document
 from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, chosen_levels
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
@@ -69,17 +69,7 @@ class ImportedPlan:
         return FloorPlan.from_dict(self.document, limits)
 
 
-def assemble(
-    sketch: Sketch,
-    builder: ReportBuilder,
-    options: ImportOptions,
-    limits: PlanLimits,
-    *,
-    format: str,
-    metres_per_unit: float,
-    scale_source: str,
-    is_draft: bool = False,
-) -> ImportedPlan:
+def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, limits: PlanLimits) -> ImportedPlan:
     """Make a plan from a sketch in metres, y up.
 
     Outlines with more vertices than `limits` allows are simplified within 2 cm.
@@ -92,7 +82,7 @@ def assemble(
     rooms = [room for drawn in sketch.rooms for room in _clean(drawn, obstacles, limits, builder)]
     if not rooms:
         raise NoRoomError(
-            f"no room was found in the {format} file, which has {_contents(builder)}"
+            f"no room was found in the {builder.format} file, which has {_contents(builder)}"
             + (f" (tried: {'; '.join(builder.notes[:_MAX_NAMED])})" if builder.notes else "")
             + "; check layers, level and the scale"
         )
@@ -124,8 +114,7 @@ def assemble(
     builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
     # Validate now, while the error can still refer to the file.
     checked = (limits, FloorPlan.from_dict(document, limits))
-    report = builder.build(format, metres_per_unit, scale_source, is_draft=is_draft)
-    return ImportedPlan(document, report, sketch.level, anchor, checked)
+    return ImportedPlan(document, builder.build(), sketch.level, anchor, checked)
 
 
 def assemble_levels(

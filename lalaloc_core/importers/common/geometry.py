@@ -1,8 +1,10 @@
-"""Geometry helpers that several importers share."""
+"""Geometry that several importers share: polygons, ends of openings, and the frame of a map."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -53,6 +55,15 @@ def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float,
     return point_xy(0.5 * (corners[0] + corners[3])), point_xy(0.5 * (corners[1] + corners[2]))
 
 
+def side_lengths(shape: BaseGeometry) -> tuple[float, float]:
+    """Return the shorter and the longer side of the smallest rectangle around a shape."""
+    points = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
+    if len(points) < 4:
+        return 0.0, float(shape.length)
+    first, second = np.linalg.norm(points[1] - points[0]), np.linalg.norm(points[2] - points[1])
+    return float(min(first, second)), float(max(first, second))
+
+
 def label_position(room: shapely.Polygon) -> tuple[float, float]:
     """Return the centre of the largest circle in a room."""
     return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])
@@ -66,3 +77,30 @@ def cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
 def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, float]:
     """Return a point as two floats."""
     return float(point[0]), float(point[1])
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """Grid of a map.
+
+    Attributes:
+        resolution_m: size of a cell.
+        origin: place of the lower left corner (m) and the grid's counter-clockwise rotation in the map frame.
+        size: rows and columns.
+    """
+
+    resolution_m: float
+    origin: tuple[float, float, float]
+    size: tuple[int, int]
+
+    def to_map(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Convert points (m) from the lower left corner along the grid to the map frame."""
+        x, y, yaw = self.origin
+        c, s = math.cos(yaw), math.sin(yaw)
+        return points_m @ np.array([[c, s], [-s, c]]) + np.array([x, y])
+
+    def cells(self, row: int) -> Float[np.ndarray, "n 2"]:
+        """Return the centres of a row's cells in the map frame; rows are from the top."""
+        rows, columns = self.size
+        x, y = np.arange(columns), np.full(columns, rows - 1 - row)
+        return self.to_map((np.column_stack([x, y]) + 0.5) * self.resolution_m)

@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.import_options import ImportOptions
 
 OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]

@@ -8,7 +8,9 @@ repairs it if it is damaged. Block contents are counted before they are expanded
 from __future__ import annotations
 
 import io
+import threading
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,12 +32,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
-from lalaloc_core.importers.drawing.sketching import sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
@@ -51,6 +53,8 @@ _CLOSED = 1e-5
 # Layers of exported drawings, with their colours.
 _LAYERS = {"ROOM": 7, "COLUMN": 8, "WALL": 1, "DOOR": 3, "WINDOW": 5, "PASSAGE": 30, "ROOM-TEXT": 2}
 _INSUNITS_METRES = 6
+# Held while the options of ezdxf, which all threads share, are changed.
+_OPTIONS = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -69,26 +73,33 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """
     document = _open(content)
     _check_blocks(document, budget)
-    builder = ReportBuilder()
+    builder = ReportBuilder("dxf")
     drawing = _read_drawing(document, options, builder, budget)
-    factor, source = find_unit(document, drawing, options, builder)
+    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    drawing = drawing.scaled(factor, flip_y=options.y_axis == "down")
+    drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis == "down")
     sketch = sketch_drawing(drawing, builder, budget)
-    return (
-        assemble(
-            sketch, builder, options, budget.limits.plan, format="dxf", metres_per_unit=factor, scale_source=source
-        ),
-    )
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
+@contextmanager
+def _fixed_metadata() -> Iterator[None]:
+    """Let ezdxf write fixed times and ids, so that a plan always gives the same file."""
+    with _OPTIONS:
+        before = dxf_options.write_fixed_meta_data_for_testing
+        dxf_options.write_fixed_meta_data_for_testing = True
+        try:
+            yield
+        finally:
+            dxf_options.write_fixed_meta_data_for_testing = before
+
+
+@_fixed_metadata()
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return a plan as a DXF drawing in metres; heights, ids and the anchor are lost."""
-    # Without times and random ids, so that a plan always gives the same file.
-    dxf_options.write_fixed_meta_data_for_testing = True
     drawing = new_dxf("R2010")
     drawing.header["$INSUNITS"] = _INSUNITS_METRES
     for layer, colour in _LAYERS.items():
@@ -106,6 +117,9 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     for opening in document.get("openings", ()):
         start, end = opening["line"]
         space.add_line(start, end, dxfattribs={"layer": opening["kind"].upper()})
+    # ezdxf would add the classes in the order of a set, which differs between processes.
+    for kind in sorted(drawing.entitydb.dxf_types_in_use()):
+        drawing.classes.add_class(kind)
     text = io.StringIO()
     drawing.write(text)
     return text.getvalue().encode()
@@ -273,10 +287,9 @@ def _add_block(
     for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
         if part.dxftype() in _LINES | _FILLED:
             _add(part, context, inner, ReportBuilder(), sag, budget)
-    shapes = [*(area.shape for area in inner.areas), *(stroke.line for stroke in inner.strokes)]
-    if not shapes:
+    if not inner.shapes:
         return
-    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes))
+    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(inner.shapes))
     builder.use(context.layer, f"blocks: {context.role}")
     if isinstance(box, shapely.Polygon):
         drawing.areas.append(Area(box, context.layer, context.role))

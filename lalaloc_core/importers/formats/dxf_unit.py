@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from itertools import islice
 
-import shapely
 from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dimension import Dimension as DimensionEntity
 from ezdxf.lldxf.const import DXFError
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.checks import likely_unit
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.drawing.dimensions import Dimension, scale_by_dimensions
-from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.drawing.shapes import Drawing
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.plausibility import likely_unit
+from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
+from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
 # (metres, value of the option `units`) by $INSUNITS; DXF reference.
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
@@ -33,34 +31,26 @@ def find_unit(
     """
     code = document.header.get("$INSUNITS", 0)
     own_unit = _INSUNITS.get(code)
-    extent = _extent(drawing)
-    measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
-    if (
-        options.units is None
-        and options.known_distance is None
-        and options.metres_per_pixel is None
-        and own_unit is None
-        and measured is None
-    ):
-        fitting = likely_unit(extent, _USUAL_EXTENT_M)
-        hint = (
-            f"; it is {extent:g} units across and looks like {fitting}: units={fitting}"
-            if fitting
-            else f"; it is {extent:g} units across"
-        )
+    if not drawing.shapes:
         raise InvalidFloorPlanError(
-            f"the DXF gives no unit ($INSUNITS is {code}){hint}; set units to mm, cm, m, in or ft"
+            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
+        )
+    extent = drawing.extent
+    measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
+    fitting = likely_unit(extent, _USUAL_EXTENT_M)
+    given = (options.units, options.known_distance, options.metres_per_pixel, own_unit, measured)
+    if all(scale is None for scale in given):
+        hint = f" and looks like {fitting}: units={fitting}" if fitting else ""
+        raise InvalidFloorPlanError(
+            f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
+            "set units to mm, cm, m, in or ft"
         )
     own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     factor, source = drawing_scale(options, "the DXF", own=own)
     if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
-        fitting = likely_unit(extent, _USUAL_EXTENT_M)
-        hint = (
-            f"; it looks like {fitting}: set units={fitting}"
-            if fitting and own_unit and fitting != own_unit[1]
-            else "; check units"
-        )
-        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
+        is_other = fitting and own_unit and fitting != own_unit[1]
+        hint = f"it looks like {fitting}: set units={fitting}" if is_other else "check units"
+        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across; {hint}")
     return factor, source
 
 
@@ -80,13 +70,3 @@ def _dimensions(document: DxfDocument) -> list[Dimension]:
         text = entity.dxf.get("text", "")
         found.append((shown if text in ("", "<>") else text.replace("<>", shown), [length]))
     return found
-
-
-def _extent(drawing: Drawing) -> float:
-    shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
-    if not shapes:
-        raise InvalidFloorPlanError(
-            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
-        )
-    x0, y0, x1, y1 = shapely.total_bounds(shapes)
-    return float(max(x1 - x0, y1 - y0))

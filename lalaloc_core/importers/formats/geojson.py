@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +12,14 @@ import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
-from lalaloc_core.importers.common.features import Feature, import_features
-from lalaloc_core.importers.common.geojson_features import Projector, plan_features
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions, check_units
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions, check_units
+from lalaloc_core.importers.common.tagged_features import Feature, import_features
+
+# Decimals of exported degrees; the ninth is a tenth of a millimetre.
+_DECIMALS = 9
 
 
 def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -28,7 +31,7 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
     Raises:
         InvalidFloorPlanError: the document is invalid, or its coordinates cannot be converted.
     """
-    features = parse_features(document, budget)
+    features = list(parse_features(document, budget))
     units = document.get("units") if isinstance(document, Mapping) else None
     if units is not None and options.units is None:
         # `write` adds this member to plans without an anchor.
@@ -47,16 +50,12 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     return json.dumps(collection | {"features": features}, ensure_ascii=False).encode()
 
 
-def parse_features(document: Any, budget: Budget) -> list[Feature]:
-    """Return the features of a GeoJSON document that have a geometry.
+def parse_features(document: Any, budget: Budget) -> Iterator[Feature]:
+    """Yield the features of a GeoJSON document that have a geometry.
 
     Raises:
         InvalidFloorPlanError: the document or a geometry is invalid.
     """
-    return list(_features(document, budget))
-
-
-def _features(document: Any, budget: Budget) -> Iterator[Feature]:
     if not isinstance(document, Mapping):
         raise InvalidFloorPlanError(f"the GeoJSON is of type {type(document).__name__}; it must be an object")
     kind = document.get("type")
@@ -126,3 +125,51 @@ def _crs(document: Any) -> str | None:
     if not digits.isascii() or not digits.isdigit() or len(digits) > 6:
         raise InvalidFloorPlanError(f"the crs '{name[:100]}' is not an EPSG code; export the file in WGS84")
     return f"EPSG:{digits}"
+
+
+class Projector:
+    """Conversion from plan metres to the coordinates of a file: WGS84 with an anchor, else metres."""
+
+    def __init__(self, anchor: Anchor | None) -> None:
+        self._frame = None if anchor is None else LocalFrame(anchor.longitude, anchor.latitude)
+        turn = math.radians(0.0 if anchor is None else anchor.north_deg)
+        self._east = np.array([math.cos(turn), -math.sin(turn)])
+        self._north = np.array([math.sin(turn), math.cos(turn)])
+
+    def points(self, points_m: Sequence[Sequence[float]]) -> list[list[float]]:
+        """Return points in file coordinates."""
+        array = np.asarray(points_m, dtype=float)
+        if self._frame is None:
+            return array.round(6).tolist()
+        local = np.column_stack([array @ self._east, array @ self._north])
+        return self._frame.to_earth(local).round(_DECIMALS).tolist()
+
+    def polygon(self, rings: Sequence[Sequence[Sequence[float]]]) -> list[list[list[float]]]:
+        """Return closed rings in file coordinates."""
+        return [self.points([*ring, ring[0]]) for ring in rings]
+
+
+def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dict[str, Any]]:
+    """Return the rooms, walls and openings of a plan as GeoJSON features with an IMDF `feature_type`."""
+    found: list[dict[str, Any]] = []
+    for number, room in enumerate(document["rooms"]):
+        properties = {"feature_type": "unit", "name": room.get("name", f"room {number + 1}")}
+        properties |= {key: room[key] for key in ("type", "ceiling_height_m") if key in room and room[key] != "unknown"}
+        properties.setdefault("ceiling_height_m", document.get("ceiling_height_m"))
+        rings = projector.polygon([room["polygon"], *room.get("holes", ())])
+        feature = _to_feature("Polygon", rings, properties)
+        if "id" in room:
+            feature["id"] = room["id"]
+        found.append(feature)
+        for wall in room.get("walls", ()):
+            found.append(_to_feature("LineString", projector.points(wall), {"feature_type": "wall"}))
+    for opening in document.get("openings", ()):
+        properties = {"feature_type": "opening"} | {
+            key: opening[key] for key in ("kind", "name", "sill_m", "head_m") if key in opening
+        }
+        found.append(_to_feature("LineString", projector.points(opening["line"]), properties))
+    return found
+
+
+def _to_feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

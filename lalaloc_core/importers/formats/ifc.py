@@ -19,9 +19,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import role_from_name
 
@@ -59,7 +59,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
     def make(level: Level, content: tuple[Any, list[Any]]) -> ImportedPlan:
         storey, spaces = content
-        builder = ReportBuilder()
+        builder = ReportBuilder("ifc", _unit(model), "the model's unit")
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
         floor_m = _add_spaces(spaces, sketch, builder, meshes)
@@ -71,15 +71,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         _join_touching(sketch, builder)
         kinds = {opening.kind for opening in sketch.openings}
         sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
-        return assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format="ifc",
-            metres_per_unit=_unit(model),
-            scale_source="the model's unit",
-        )
+        return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(storeys, options, budget.limits, make)
 

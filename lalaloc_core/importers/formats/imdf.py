@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import uuid
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,37 +13,19 @@ import numpy as np
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
+from lalaloc_core.importers.common.archive import pack
 from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.features import import_features
-from lalaloc_core.importers.common.geojson_features import Projector, plan_features
-from lalaloc_core.importers.common.limits import Budget, ImportLimits
-from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.formats.geojson import parse_features
+from lalaloc_core.importers.common.tagged_features import import_features, in_english
+from lalaloc_core.importers.formats.geojson import Projector, parse_features, plan_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
-# Exported archives carry no time, so that equal plans give equal bytes.
-_EPOCH = (2000, 1, 1, 0, 0, 0)
 _NAMESPACE = uuid.UUID("2f6c1d58-2d0e-5c7e-9a41-6b0f6f1e7c11")
 _CATEGORIES = {"corridor": "walkway", "bathroom": "restroom", "stairs": "stairs", "office": "office",
                "kitchen": "kitchen", "meeting": "conferenceroom", "storage": "storage",
                "entrance": "lobby"}  # fmt: skip
-
-
-def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """Unpack the files with these suffixes (lower case) from a zip archive, in memory, without archives inside it.
-
-    Returns:
-        The files by name.
-
-    Raises:
-        InvalidFloorPlanError: the archive is damaged, encrypted or exceeds a limit.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            return _read_members(archive, limits, suffixes)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError) as error:
-        raise InvalidFloorPlanError(f"the archive is damaged: {error}; pack it again") from error
 
 
 def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -123,33 +102,6 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     return _write_archive(by_type)
 
 
-def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    members = archive.infolist()
-    if len(members) > limits.max_archive_files:
-        raise InvalidFloorPlanError(
-            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files); "
-            "pack only the files of the plan"
-        )
-    found: dict[str, bytes] = {}
-    remaining = limits.max_unpacked_bytes
-    for member in members:
-        if member.is_dir() or not member.filename.casefold().endswith(suffixes):
-            continue
-        if member.flag_bits & 0x1:
-            raise InvalidFloorPlanError(f"'{member.filename[:100]}' is encrypted; send the archive without a password")
-        # The sizes in the archive's directory can be forged, so the read itself is bounded.
-        with archive.open(member) as stream:
-            content = stream.read(remaining + 1)
-        remaining -= len(content)
-        if remaining < 0:
-            raise InvalidFloorPlanError(
-                f"the archive unpacks to more than {limits.max_unpacked_bytes} bytes (max_unpacked_bytes); "
-                "pack only the files of the plan"
-            )
-        found[member.filename] = content
-    return found
-
-
 def _read_member(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
     try:
         return read_json(files[name], budget.limits.max_depth, budget.limits.max_json_values)
@@ -172,8 +124,7 @@ def _levels(document: Any) -> dict[str, Level]:
 
 
 def _text(value: Any) -> str | None:
-    if isinstance(value, Mapping):
-        value = value.get("en") or next(iter(value.values()), None)
+    value = in_english(value)
     return value[:200] if isinstance(value, str) and value.strip() else None
 
 
@@ -181,11 +132,7 @@ def _write_archive(by_type: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
     for kind, features in by_type.items():
         files[f"{kind}.geojson"] = {"type": "FeatureCollection", "features": list(features)}
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), json.dumps(content, ensure_ascii=False))
-    return stream.getvalue()
+    return pack({name: json.dumps(content, ensure_ascii=False).encode() for name, content in files.items()})
 
 
 def _bounding_box(document: Mapping[str, Any]) -> list[list[float]]:

@@ -18,14 +18,14 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.geometry import opening_line, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.opening_placement import WallLines
-from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.safe_xml import local_name, read_xml
 from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.common.xml import read_xml
 
 # Kinds of cells: of the core, and of the module for navigation. Doors can be cells as well.
 _CELLS = {"CellSpace", "NavigableSpace", "GeneralSpace", "TransferSpace", "TransitionSpace"}
@@ -86,7 +86,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     levels = _levels(cells)
 
     def make(level: Level, members: list[_Cell]) -> ImportedPlan:
-        builder = ReportBuilder()
+        builder = ReportBuilder("indoorgml", factor, "the option units" if options.units else "the format: metres")
         sketch = Sketch(level=level if len(levels) > 1 else None, name=level.name if len(levels) > 1 else None)
         for cell in members:
             builder.use(cell.kind or "CellSpace", "rooms")
@@ -99,21 +99,13 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         on_level = [door for door in doors if lowest - _STOREY_M < door.low < lowest + _STOREY_M]
         _add_doors(on_level, lowest, sketch, builder, budget)
         sketch.opening_kinds = ("door",) if sketch.openings else None
-        return assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format="indoorgml",
-            metres_per_unit=factor,
-            scale_source="the option units" if options.units else "the format: metres",
-        )
+        return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(levels, options, budget.limits, make)
 
 
 def _cells(element: Element, factor: float, budget: Budget) -> Iterator[_Cell]:
-    kind = _tag(element)
+    kind = local_name(element)
     if kind not in _CELLS:
         return
     rings = [ring * factor for ring in _rings(element, "cellSpaceGeometry", budget)]
@@ -127,18 +119,20 @@ def _cells(element: Element, factor: float, budget: Budget) -> Iterator[_Cell]:
     )
     if shape.area > 0.0:
         height = high - low if high > low + _FLOOR_M else None
-        yield _Cell(shape, low, height, _name(element), _usage(element) or kind, _key(element))
+        yield _Cell(shape, low, height, _text(element, "name"), _text(element, "class") or kind, _key(element))
 
 
 def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_Door]:
     """Yield the doors: duals of transitions, connection boundaries, cells of doors, and lines of other transitions."""
-    boundaries = {_key(element): element for element in elements if _tag(element) in _BOUNDARIES}
+    boundaries = {_key(element): element for element in elements if local_name(element) in _BOUNDARIES}
     drawn = {
-        _key(element) for element in boundaries.values() if _tag(element) in ("ConnectionBoundary", "AnchorBoundary")
+        _key(element)
+        for element in boundaries.values()
+        if local_name(element) in ("ConnectionBoundary", "AnchorBoundary")
     }
     plain = []
     for element in elements:
-        if _tag(element) != "Transition":
+        if local_name(element) != "Transition":
             continue
         dual = _reference(element, "duality")
         if dual in boundaries and next(_rings(boundaries[dual], "cellSpaceBoundaryGeometry", budget), None) is not None:
@@ -148,7 +142,7 @@ def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_
     for key in sorted(key for key in drawn if key is not None):
         yield from _door(boundaries[key], "cellSpaceBoundaryGeometry", factor, budget, is_exact=True)
     for element in elements:
-        if _tag(element) in _DOOR_CELLS:
+        if local_name(element) in _DOOR_CELLS:
             yield from _door(element, "cellSpaceGeometry", factor, budget, is_exact=True)
     for element in plain:
         yield from _door(element, "geometry", factor, budget, is_exact=False)
@@ -160,7 +154,7 @@ def _door(element: Element, member: str, factor: float, budget: Budget, *, is_ex
         points = np.concatenate(rings)
         line = shapely.LineString(points[:, :2])
         shape = line.convex_hull if is_exact else line
-        yield _Door(shape, float(points[:, 2].min()), float(points[:, 2].max()), _name(element), is_exact)
+        yield _Door(shape, float(points[:, 2].min()), float(points[:, 2].max()), _text(element, "name"), is_exact)
 
 
 def _add_doors(doors: list[_Door], floor: float, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
@@ -176,7 +170,7 @@ def _add_doors(doors: list[_Door], floor: float, sketch: Sketch, builder: Report
             crossed = outlines.geometries[outlines.query(door.shape, predicate="intersects")]
             points = shapely.get_coordinates(shapely.intersection(crossed, door.shape))
             place = points.mean(axis=0) if len(points) else None
-            ends = None if place is None else walls.line_at((float(place[0]), float(place[1])), _USUAL_DOOR_M)
+            ends = None if place is None else walls.line_at(point_xy(place), _USUAL_DOOR_M)
             assumed += ends is not None
         builder.use("doors", "door" if ends is not None else "ignored (no place on a wall)")
         if ends is not None:
@@ -203,7 +197,7 @@ def _levels(cells: list[_Cell]) -> Mapping[str, tuple[Level, list[_Cell]]]:
 def _rings(element: Element, member: str, budget: Budget) -> Iterator[Float[np.ndarray, "n 3"]]:
     """Yield the positions of every outer ring or line in a member of an element, with z 0 where there is none."""
     for child in element:
-        if _tag(child) != member:
+        if local_name(child) != member:
             continue
         for part in child.iter():
             if _is_line(part):
@@ -214,16 +208,16 @@ def _rings(element: Element, member: str, budget: Budget) -> Iterator[Float[np.n
 
 def _is_line(element: Element) -> bool:
     """Return whether an element is a line, or the outer ring of a face; a solid has an exterior too."""
-    kind = _tag(element)
+    kind = local_name(element)
     return kind in ("LineString", "Curve") or (
-        kind == "exterior" and any(_tag(child) in ("LinearRing", "Ring") for child in element)
+        kind == "exterior" and any(local_name(child) in ("LinearRing", "Ring") for child in element)
     )
 
 
 def _positions(element: Element, budget: Budget) -> Float[np.ndarray, "n 3"]:
     found: list[list[float]] = []
     for part in element.iter():
-        if _tag(part) not in ("pos", "posList"):
+        if local_name(part) not in ("pos", "posList"):
             continue
         try:
             values = [float(text) for text in (part.text or "").split()]
@@ -246,13 +240,9 @@ def _dimension(part: Element, values: list[float]) -> int:
     stated = part.get("srsDimension")
     if stated in ("2", "3"):
         return int(stated)
-    if _tag(part) == "pos":
+    if local_name(part) == "pos":
         return 2 if len(values) == 2 else 3
     return 3 if len(values) % 3 == 0 else 2
-
-
-def _tag(element: Element) -> str:
-    return str(element.tag).rpartition("}")[2]
 
 
 def _key(element: Element) -> str | None:
@@ -261,21 +251,13 @@ def _key(element: Element) -> str | None:
 
 def _reference(element: Element, member: str) -> str | None:
     for child in element:
-        if _tag(child) == member:
+        if local_name(child) == member:
             for name, value in child.attrib.items():
                 if name.rpartition("}")[2] == "href":
                     return value.removeprefix("#")
     return None
 
 
-def _name(element: Element) -> str | None:
-    return _text(element, "name")
-
-
-def _usage(element: Element) -> str | None:
-    return _text(element, "class")
-
-
 def _text(element: Element, member: str) -> str | None:
-    found = next((child.text for child in element if _tag(child) == member and child.text), None)
+    found = next((child.text for child in element if local_name(child) == member and child.text), None)
     return None if found is None or not found.strip() else found.strip()[:200]

@@ -12,10 +12,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble_levels, clean_name
-from lalaloc_core.importers.common.checks import USUAL_CEILING_M, check_document, likely_unit
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.plausibility import USUAL_CEILING_M, check_document, likely_unit
 from lalaloc_core.importers.common.sketch import Level
 
 # JSON allows numbers of any size; larger ones are left for the validation to refuse.
@@ -92,8 +92,9 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
         plan["name"] = options.name
     if options.ceiling_height_m is not None:
         plan.setdefault("ceiling_height_m", options.ceiling_height_m)
-    builder = ReportBuilder()
     factor = METRES_PER_UNIT[units]
+    source = "units" if "units" in document or options.units else "the format: metres"
+    builder = ReportBuilder("native", factor, source)
     y_factor = -factor if y_axis == "down" else factor
     if factor != 1.0 or y_factor != factor:
         plan = _converted(plan, factor, y_factor)
@@ -107,8 +108,7 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
     for opening in plan.get("openings") or ():
         builder.use("openings", str(opening["kind"]))
     builder.warnings.extend(check_document(parsed.to_dict()))
-    report = builder.build("native", factor, "units" if "units" in document or options.units else "the format: metres")
-    return ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed))
+    return ImportedPlan(plan, builder.build(), anchor=parsed.anchor, checked=(limits, parsed))
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:

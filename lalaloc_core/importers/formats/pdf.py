@@ -15,18 +15,17 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.drawing.dimensions import drawn_scale
-from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.drawing.shapes import Area
-from lalaloc_core.importers.drawing.sketching import named_rooms, sketch_drawing
+from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
+from lalaloc_core.importers.drawing.sketch_drawing import named_rooms, sketch_drawing
+from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
-from lalaloc_core.importers.picture.sketching import sketch_picture
+from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _METRES_PER_POINT = 0.0254 / 72.0
 # A page with fewer lines, or with a larger share covered by pictures, is a scan.
@@ -47,26 +46,20 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     document, page = open_page(content, options.page)
     try:
         found = read_page(page, budget)
-        builder = ReportBuilder()
+        builder = ReportBuilder("pdf", is_draft=True)
         scan = _read_scan(page, found, builder, budget)
-        texts = [lettering.text for lettering in [*found.drawing.letterings, *scan.drawing.letterings]]
         # A unit of a PDF is always a point.
-        without_units = replace(options, units=None)
+        without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
         factor, source = drawing_scale(
-            without_units,
-            "the PDF",
-            paper_m_per_unit=_METRES_PER_POINT,
-            texts=texts,
-            dimensions=lambda: (
-                drawn_scale(found.drawing, budget.check_time) or drawn_scale(scan.drawing, budget.check_time)
-            ),
+            without_units, "the PDF", drawings, budget.check_time, paper_m_per_unit=_METRES_PER_POINT
         )
         # Marks of dimensions can be read as letters, so these are removed after the scale is known.
         _remove_letters(found)
         notes = list(builder.notes)
         sketch = _as_drawing(found, factor, builder, budget)
         if sketch is None or not sketch.rooms:
-            builder = ReportBuilder(notes=[*notes, f"page {options.page} was read as a picture"])
+            notes.append(f"page {options.page} was read as a picture")
+            builder = ReportBuilder("pdf", is_draft=True, notes=notes)
             sketch = _as_picture(page, found, factor, builder, budget)
             # Searchable scans contain text over the picture.
             own = found.drawing.scaled(factor, flip_y=False).letterings
@@ -74,17 +67,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             sketch.rooms = named_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
     finally:
         document.close()
-    plan = assemble(
-        sketch,
-        builder,
-        options,
-        budget.limits.plan,
-        format="pdf",
-        metres_per_unit=factor,
-        scale_source=source,
-        is_draft=True,
-    )
-    return (plan,)
+    builder.metres_per_unit, builder.scale_source = factor, source
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
 def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:

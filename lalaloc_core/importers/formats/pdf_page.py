@@ -15,16 +15,15 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.drawing.shapes import (
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
-    DARK,
     Area,
     Drawing,
     Lettering,
     Stroke,
     fit_swing,
-    luminance,
+    is_dark,
 )
 
 _MAX_FORM_DEPTH = 8
@@ -117,7 +116,7 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return
     is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
-    is_dark = is_filled and _fill_luminance(item) < DARK
+    is_wall = is_filled and _has_dark_fill(item)
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
     pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
@@ -136,9 +135,9 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
             drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen))
-    if is_filled and not is_dark and not is_stroked:
+    if is_filled and not is_wall and not is_stroked:
         return  # A coloured floor or a white background has no drawn outline.
-    drawing.areas += [Area(part, "", None, is_dark=is_dark) for part in even_odd_polygons(shells)]
+    drawing.areas += [Area(part, "", None, is_dark=is_wall) for part in even_odd_polygons(shells)]
 
 
 def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
@@ -186,11 +185,10 @@ def _applied(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndar
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _fill_luminance(item: Any) -> float:
+def _has_dark_fill(item: Any) -> bool:
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
-    if not pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) or alpha.value < 60:
-        return 255.0
-    return luminance(float(red.value), float(green.value), float(blue.value))
+    is_opaque = pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) and alpha.value >= 60
+    return bool(is_opaque) and is_dark(float(red.value), float(green.value), float(blue.value))
 
 
 def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:

@@ -12,15 +12,14 @@ from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.drawing.dimensions import check_scale, drawn_scale
-from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.drawing.shapes import Area
-from lalaloc_core.importers.drawing.sketching import named_rooms
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.drawing.drawing_scale import check_scale, drawing_scale, drawn_scale
+from lalaloc_core.importers.drawing.sketch_drawing import named_rooms
+from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.lettering import read_texts
-from lalaloc_core.importers.picture.sketching import sketch_picture
+from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _MIN_SIDE_PX = 64
 # A larger picture has a wrong scale.
@@ -34,16 +33,12 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         InvalidFloorPlanError: the picture is invalid, or the options give no scale.
     """
     gray, warmth, paper_m_per_pixel = _open(content, budget)
-    builder = ReportBuilder()
+    builder = ReportBuilder("picture", is_draft=True)
     texts = read_texts(gray, builder, budget)
     # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
     measured = drawn_scale(texts.drawing, budget.check_time)
-    factor, source = drawing_scale(
-        replace(options, units=None),
-        "the picture",
-        paper_m_per_unit=paper_m_per_pixel,
-        own=measured,
-        texts=[lettering.text for lettering in texts.drawing.letterings],
+    factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(
+        replace(options, units=None), "the picture", [texts.drawing], paper_m_per_unit=paper_m_per_pixel, own=measured
     )
     check_scale(factor, source, measured, builder)
     rows, columns = gray.shape
@@ -61,18 +56,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
     sketch.rooms = named_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
-    return (
-        assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format="picture",
-            metres_per_unit=factor,
-            scale_source=source,
-            is_draft=True,
-        ),
-    )
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
 def _open(

@@ -21,12 +21,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.drawing.walls import enclose
+from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 
 _OPENINGS: Mapping[str, OpeningKind] = {"doors": "door", "windows": "window", "openings": "passage"}
 # Walls that enclose less than this share of the floors have gaps; the floors' outlines are used then.
@@ -63,20 +63,12 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
         raise InvalidFloorPlanError("the RoomPlan scan has no walls and no floors; scan the room again")
 
     def make(level: Level, story: int) -> ImportedPlan:
-        builder = ReportBuilder()
+        builder = ReportBuilder("roomplan", 1.0, "the scan: metres")
         on_story = {key: [raw for raw in found if _story(raw) == story] for key, found in surfaces.items()}
         sketch = _sketch(on_story, builder, budget)
         if len(levels) > 1:
             sketch.level, sketch.name = level, level.name
-        return assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format="roomplan",
-            metres_per_unit=1.0,
-            scale_source="the scan: metres",
-        )
+        return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(levels, options, budget.limits, make)
 

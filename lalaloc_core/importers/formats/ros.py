@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import math
 import warnings
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,11 +19,12 @@ from jaxtyping import UInt8
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.values import is_number
+from lalaloc_core.importers.common.archive import pack
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.limits import DEFAULT_IMPORT_LIMITS, Budget
-from lalaloc_core.importers.common.map_frame import MapFrame
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.geometry import MapFrame
+from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 
 if TYPE_CHECKING:
     from lalaloc_core.importers.picture.occupancy import OccupancyGrid
@@ -38,8 +38,6 @@ _CELL_M, _MARGIN_M, _WALL_M = 0.05, 1.0, 0.15
 _MAX_CELLS = 4_000_000
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
-# Exported archives carry no time, so that equal plans give equal bytes.
-_EPOCH = (2000, 1, 1, 0, 0, 0)
 
 
 def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -58,7 +56,8 @@ def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Bu
 
     grid = _picture_alone(source, options, budget) if isinstance(source, bytes) else _open(source, budget)
     frame = grid.frame
-    builder = ReportBuilder()
+    scale_source = "the map's resolution" if isinstance(source, Mapping) else "metres_per_pixel"
+    builder = ReportBuilder("ros", frame.resolution_m, scale_source, is_draft=True)
     builder.use("occupied cells", "walls", int(grid.occupied.sum()))
     builder.use("free cells", "floor", int(grid.free.sum()))
     sketch = sketch_grid(grid, builder, budget)
@@ -69,18 +68,7 @@ def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Bu
             f"{rows * frame.resolution_m:.1f} m at {frame.resolution_m:g} m per cell; check the resolution, and close "
             "the walls in the picture"
         )
-    return (
-        assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format="ros",
-            metres_per_unit=frame.resolution_m,
-            scale_source="the map's resolution" if isinstance(source, Mapping) else "metres_per_pixel",
-            is_draft=True,
-        ),
-    )
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
 def read_frame(source: Mapping[str, bytes]) -> MapFrame:
@@ -104,15 +92,6 @@ def map_files(yaml_file: Path) -> dict[str, bytes]:
         return {yaml_file.name: content, picture.name: picture.read_bytes()}
     except OSError as error:
         raise InvalidFloorPlanError(f"'{error.filename}' cannot be read: {error.strerror}") from error
-
-
-def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return a zip archive of files."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), content, zipfile.ZIP_DEFLATED)
-    return stream.getvalue()
 
 
 def write(document: Mapping[str, Any], _anchor: Anchor | None, frame: MapFrame | None = None) -> bytes:

@@ -21,24 +21,22 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.options import ImportOptions
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.safe_xml import local_name, read_xml
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
-from lalaloc_core.importers.common.xml import read_xml
-from lalaloc_core.importers.drawing.dimensions import drawn_scale
-from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.drawing.shapes import (
+from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
+from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
-    DARK,
     Area,
     Drawing,
     Lettering,
     Stroke,
     fit_swing,
-    luminance,
+    is_dark,
 )
-from lalaloc_core.importers.drawing.sketching import sketch_drawing
 
 # Attribute of the root element with the scale of exported drawings.
 _SCALE_ATTRIBUTE = "data-metres-per-unit"
@@ -91,30 +89,21 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         InvalidFloorPlanError: the file is invalid, or neither the file nor the options give its scale.
     """
     root = read_xml(content, budget)
-    if root.tag.rpartition("}")[2] != "svg":
-        raise InvalidFloorPlanError(f"the root element is <{root.tag.rpartition('}')[2][:50]}>; it must be <svg>")
+    if local_name(root) != "svg":
+        raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     _drop_ignored(root)
     _check_uses(root, budget)
     paper_m, own = _size_on_paper(root), _own_scale(root)
-    builder = ReportBuilder()
+    builder = ReportBuilder("svg")
     drawing = _read_drawing(root, options, builder, budget)
-    texts = [lettering.text for lettering in drawing.letterings]
-    factor, source = drawing_scale(
-        options,
-        "the SVG",
-        paper_m_per_unit=paper_m,
-        own=own,
-        texts=texts,
-        dimensions=lambda: drawn_scale(drawing, budget.check_time),
+    builder.metres_per_unit, builder.scale_source = drawing_scale(
+        options, "the SVG", [drawing], budget.check_time, paper_m_per_unit=paper_m, own=own
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
-    drawing = drawing.scaled(factor, flip_y=options.y_axis != "up")
+    drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis != "up")
     sketch = sketch_drawing(drawing, builder, budget)
-    plan = assemble(
-        sketch, builder, options, budget.limits.plan, format="svg", metres_per_unit=factor, scale_source=source
-    )
-    return (plan,)
+    return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
@@ -159,7 +148,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 
 def _drop_ignored(root: Element) -> None:
     for parent in root.iter():
-        parent[:] = [child for child in parent if str(child.tag).rpartition("}")[2] not in _IGNORED_ELEMENTS]
+        parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
 
 
 def _check_uses(root: Element, budget: Budget) -> None:
@@ -179,7 +168,7 @@ def _check_uses(root: Element, budget: Budget) -> None:
         open_elements.add(element)
         total = 1 + len(element.get("d", "")) // _BYTES_PER_ENTITY + len(element.get("points", "")) // _BYTES_PER_ENTITY
         total += sum(size(child) for child in element)
-        if element.tag.rpartition("}")[2] == "use":
+        if local_name(element) == "use":
             target = by_id.get(element.get("href", element.get(_HREF, "#"))[1:])
             total += size(target) if target is not None else 0
         open_elements.discard(element)
@@ -258,7 +247,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     name = _name_of(element, context)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = is_filled and _luminance_of(fill) < DARK
+    is_wall = is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
@@ -273,12 +262,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
             drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, context.role, float(width or 0.0)))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
     for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_dark))
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
-
-
-def _luminance_of(colour: Any) -> float:
-    return luminance(float(colour.red), float(colour.green), float(colour.blue))
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:

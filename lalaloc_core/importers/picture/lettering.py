@@ -19,9 +19,9 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.report import ReportBuilder
-from lalaloc_core.importers.drawing.shapes import Drawing, Lettering, Stroke
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
 from lalaloc_core.importers.picture.ink import Ink, read_ink
 
 # Side (pixels) of a tile, which takes about 0.8 GB of address space, and longer side of the picture that is read.

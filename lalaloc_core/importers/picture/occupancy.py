@@ -10,13 +10,12 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, UInt8
 
-from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.map_frame import MapFrame
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.picture.ink import find_skew, turned
-from lalaloc_core.importers.picture.sketching import sketch_picture
+from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 # Cells are divided until they are this fine (m), because the picture importer expects walls of several pixels.
 _FINE_M = 0.0125

@@ -16,7 +16,7 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
@@ -204,7 +204,7 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
         return None
     begin = 0.5 * (wall.start + wall.end)
     reach = begin + width * outward
-    return Gap(shape, (float(begin[0]), float(begin[1])), (float(reach[0]), float(reach[1])), is_sure, is_between_ends)
+    return Gap(shape, point_xy(begin), point_xy(reach), is_sure, is_between_ends)
 
 
 def _faces_an_end(
@@ -325,7 +325,7 @@ def _from_single_lines(
             continue
         far = end + width * direction
         line = shapely.LineString([end, end + (width + 0.002) * direction])
-        gaps.append(Gap(line.buffer(0.001), (float(end[0]), float(end[1])), (float(far[0]), float(far[1]))))
+        gaps.append(Gap(line.buffer(0.001), point_xy(end), point_xy(far)))
     joints = [line.buffer(0.002) for line in (*corners, *(shapely.LineString([g.start, g.end]) for g in gaps))]
     walls = shapely.unary_union([line.buffer(0.002) for line in segments])
     distinct = {tuple(sorted((gap.start, gap.end))): gap for gap in gaps if gap.width >= config.narrowest_gap}

@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import LocalFrame, to_wgs84
-from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 
 _MAX_REACH_M = 5000.0
 

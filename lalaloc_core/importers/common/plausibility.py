@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.common.options import METRES_PER_UNIT
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT
 
 # Usual ranges; a value outside gives a warning with the unit that would make it usual.
 USUAL_CEILING_M = (1.9, 6.0)
@@ -52,18 +53,18 @@ def likely_unit(value: float, usual_m: tuple[float, float]) -> str | None:
     return min(fitting, key=lambda unit: abs(math.log(value * METRES_PER_UNIT[unit] / usual)), default=None)
 
 
-def unit_hint(subject: str, value: float, usual_m: tuple[float, float]) -> str | None:
-    """Return a warning about a length that is unusual in metres, None if it is usual."""
+def _unit_hints(subject: str, value: float, usual_m: tuple[float, float]) -> list[str]:
+    """Return a warning about a length if it is unusual in metres."""
     low, high = usual_m
     if low <= value <= high:
-        return None
+        return []
     unit = likely_unit(value, usual_m)
     advice = (
         f"it looks like {_UNIT_NAMES[unit]} (with units={unit} it is {value * METRES_PER_UNIT[unit]:.2f} m)"
         if unit is not None
         else "check the scale"
     )
-    return f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"
+    return [f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"]
 
 
 def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
@@ -73,16 +74,15 @@ def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list
     for name, height in zip(names, heights, strict=True):
         if height is not None:
             first_room.setdefault(float(height), name)
-    hints = [unit_hint(f"the ceiling of '{name}'", height, USUAL_CEILING_M) for height, name in first_room.items()]
-    return [hint for hint in hints if hint is not None][:_MAX_NAMED]
+    hints = [_unit_hints(f"the ceiling of '{name}'", height, USUAL_CEILING_M) for height, name in first_room.items()]
+    return list(chain.from_iterable(hints))[:_MAX_NAMED]
 
 
 def _door_warnings(document: Mapping[str, Any]) -> list[str]:
     widths = [_length(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == "door"]
     if not widths:
         return []
-    hint = unit_hint("the median width of doors", round(float(np.median(widths)), 4), USUAL_DOOR_M)
-    return [] if hint is None else [hint]
+    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), USUAL_DOOR_M)
 
 
 def _size_warnings(rooms: Sequence[shapely.Polygon]) -> list[str]:
@@ -91,8 +91,7 @@ def _size_warnings(rooms: Sequence[shapely.Polygon]) -> list[str]:
     # Median weighted by area, so that closets and ducts hardly count.
     side = float(np.sqrt(areas[np.searchsorted(np.cumsum(areas), 0.5 * areas.sum())]))
     low, high = (float(np.sqrt(area)) for area in _USUAL_ROOM_M2)
-    hint = unit_hint("the side of a typical room", round(side, 3), (low, high))
-    return [] if hint is None else [hint]
+    return _unit_hints("the side of a typical room", round(side, 3), (low, high))
 
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:

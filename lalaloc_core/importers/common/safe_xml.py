@@ -8,7 +8,12 @@ import defusedxml
 from defusedxml import ElementTree as SafeElementTree
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.import_limits import Budget
+
+
+def local_name(element: Element) -> str:
+    """Return the name of an element without its namespace."""
+    return str(element.tag).rpartition("}")[2]
 
 
 def read_xml(content: bytes, budget: Budget) -> Element:

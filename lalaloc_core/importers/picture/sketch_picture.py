@@ -12,14 +12,14 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.drawing.walls import Enclosed, Gap, WallConfig, enclose
-from lalaloc_core.importers.picture.gaps import GapContent, GapReader
+from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import Ink, read_ink
 from lalaloc_core.importers.picture.wall_mask import WallMask, dark_walls, outlined_walls, straightened, wall_polygons
-from lalaloc_core.importers.picture.windows import windows_in_walls
+from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
@@ -76,7 +76,8 @@ def sketch_picture(
     """
     ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)
     budget.check_time()
-    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
+    hypotheses = (dark_walls(ink), True), (outlined_walls(ink), False)
+    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
     if not readings:
         builder.use("ink", "ignored (no possible walls)", 1)
         return Sketch()
@@ -105,10 +106,6 @@ def sketch_picture(
         )
     # A missed or misclassified opening would count against the right pose.
     return Sketch(rooms=rooms, openings=openings, opening_kinds=(), drawn=best.enclosed.walls.envelope)
-
-
-def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
-    return (dark_walls(ink), True), (outlined_walls(ink), False)
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:

@@ -17,24 +17,22 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import opening_line
-from lalaloc_core.importers.common.limits import Budget
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.geometry import opening_line, side_lengths
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.trace import Trace, TracePart
 from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
-from lalaloc_core.importers.drawing.dimensions import check_areas
-from lalaloc_core.importers.drawing.leaves import (
+from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,
     take_leaves,
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
-from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, enclose
+from lalaloc_core.importers.drawing.drawing_scale import check_areas
+from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Enclosed, Gap, enclose
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing
 
-_MIN_ROOM_M2 = 0.6
 # Names in a room besides its own that are listed.
 _MAX_OTHERS = 5
 # Largest distance between parts of one symbol (leaf, frame, panes).
@@ -180,7 +178,7 @@ def _is_outline(shape: shapely.Polygon) -> bool:
 
 def _is_stroke_of_letter(shape: shapely.Polygon) -> bool:
     """Return whether a dark area is too small and thin for a wall or pillar, as letters that are drawn are."""
-    return _sides(shape)[1] < _LETTER_M and shape.buffer(-0.5 * _LETTER_STROKE_M).is_empty
+    return side_lengths(shape)[1] < _LETTER_M and shape.buffer(-0.5 * _LETTER_STROKE_M).is_empty
 
 
 def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
@@ -201,16 +199,7 @@ def _closers(drawing: Drawing) -> list[BaseGeometry]:
     panes = [stroke.line for stroke in drawing.strokes if stroke.role == "window"]
     hulls = [shapely.convex_hull(cluster) for cluster in clusters(panes, _SYMBOL_M)]
     windows: list[BaseGeometry] = [hull if hull.area > 0.0 else hull.buffer(0.002, cap_style="flat") for hull in hulls]
-    return [shape for shape in (*areas, *windows) if _sides(shape)[0] < 0.7]
-
-
-def _sides(shape: BaseGeometry) -> tuple[float, float]:
-    box = shapely.minimum_rotated_rectangle(shape)
-    points = shapely.get_coordinates(box)
-    if len(points) < 4:
-        return 0.0, float(shape.length)
-    first, second = np.linalg.norm(points[1] - points[0]), np.linalg.norm(points[2] - points[1])
-    return float(min(first, second)), float(max(first, second))
+    return [shape for shape in (*areas, *windows) if side_lengths(shape)[0] < 0.7]
 
 
 def named_rooms(
@@ -305,7 +294,7 @@ def _opening_of(kind: OpeningKind, cluster: BaseGeometry) -> list[SketchedOpenin
 
 
 def _is_frame(part: BaseGeometry) -> bool:
-    short, long = _sides(part)
+    short, long = side_lengths(part)
     return 0.02 <= short <= 0.6 and long >= max(1.3 * short, _OPENING_M[0])
 
 

@@ -1,17 +1,22 @@
-"""Report of an import: the use of every layer, the steps taken, and likely mistakes."""
+"""Report of an import: the use of every layer, the steps taken, and likely mistakes; and its trace, for a picture."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 
+TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
 # Corners of an area in metres.
 Outline = tuple[tuple[float, float], ...]
 # Limits the size of the report on a file full of mistakes.
 _MAX_LINES, _MAX_AREAS = 50, 20
+# Further shapes of a trace are left out: a picture would not show them.
+_MAX_SHAPES = 100_000
 # Detail (m) that outlines in reports leave out.
 _COARSE_M = 0.1
 
@@ -56,8 +61,15 @@ class ImportReport:
 
 @dataclass
 class ReportBuilder:
-    """Report under construction while a file is read; `no_room` are areas in metres inside walls, largest first."""
+    """Report under construction while a file is read.
 
+    The first four fields are those of `ImportReport`; `no_room` are areas in metres inside walls, largest first.
+    """
+
+    format: str = ""
+    metres_per_unit: float = 1.0
+    scale_source: str = ""
+    is_draft: bool = False
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     unsure: list[str] = field(default_factory=list)
@@ -68,20 +80,33 @@ class ReportBuilder:
         """Count entities of a layer by their use; "ignored" is a use too."""
         self.uses[layer or "(none)", used_as] += entities
 
-    def build(self, format: str, metres_per_unit: float, scale_source: str, *, is_draft: bool = False) -> ImportReport:
+    def build(self) -> ImportReport:
         """Return the finished report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
         return ImportReport(
-            format=format,
-            metres_per_unit=metres_per_unit,
-            scale_source=scale_source,
-            is_draft=is_draft,
+            format=self.format,
+            metres_per_unit=self.metres_per_unit,
+            scale_source=self.scale_source,
+            is_draft=self.is_draft,
             layers=tuple(layers[:_MAX_LINES]),
             notes=_bounded(self.notes),
             warnings=_bounded(self.warnings),
             unsure=_bounded(self.unsure),
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
         )
+
+
+@dataclass
+class Trace:
+    """Shapes of a drawing in metres, y up, with what they were taken for."""
+
+    shapes: list[tuple[TracePart, BaseGeometry]] = field(default_factory=list)
+
+    def add(self, part: TracePart, shapes: Iterable[BaseGeometry]) -> None:
+        """Add shapes of one kind."""
+        for shape in shapes:
+            if len(self.shapes) < _MAX_SHAPES and not shape.is_empty:
+                self.shapes.append((part, shape))
 
 
 def _bounded(lines: list[str]) -> tuple[str, ...]:

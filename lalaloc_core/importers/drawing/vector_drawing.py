@@ -13,10 +13,11 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.common.vocabulary import Role
 
 # Fills of lower luminance (of 255) can be walls.
-DARK = 110.0
+_DARK = 110.0
 # Straight pieces per curve.
 CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
@@ -87,12 +88,23 @@ class Drawing:
     swings: list[Swing] = field(default_factory=list)
     letterings: list[Lettering] = field(default_factory=list)
 
+    @property
+    def shapes(self) -> list[BaseGeometry]:
+        """Areas and lines."""
+        return [*(area.shape for area in self.areas), *(stroke.line for stroke in self.strokes)]
+
+    @property
+    def extent(self) -> float:
+        """Longer side of the box around areas and lines; NaN without any."""
+        x0, y0, x1, y1 = shapely.total_bounds(self.shapes)
+        return float(max(x1 - x0, y1 - y0))
+
     def scaled(self, factor: float, *, flip_y: bool) -> Drawing:
         """Return the drawing in metres, with y up."""
         factors = np.array([factor, -factor if flip_y else factor])
 
         def point(xy: tuple[float, float]) -> tuple[float, float]:
-            return float(xy[0] * factors[0]), float(xy[1] * factors[1])
+            return point_xy(xy * factors)
 
         def shape(geometry: BaseGeometry) -> BaseGeometry:
             return shapely.transform(geometry, lambda points: points * factors)
@@ -127,10 +139,9 @@ def fit_swing(
     if not angles_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= angles_deg[1]:
         return None
     hinge, first, last = centre + middle, points[0], points[-1]
-    return Swing((float(hinge[0]), float(hinge[1])), (float(first[0]), float(first[1])),
-                 (float(last[0]), float(last[1])), layer)  # fmt: skip
+    return Swing(point_xy(hinge), point_xy(first), point_xy(last), layer)
 
 
-def luminance(red: float, green: float, blue: float) -> float:
-    """Return the luminance of a colour, 0 to 255 like its channels (ITU-R BT.601)."""
-    return 0.299 * red + 0.587 * green + 0.114 * blue
+def is_dark(red: float, green: float, blue: float) -> bool:
+    """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
+    return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import shapely
@@ -19,11 +20,11 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
-from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.map_projection import projection
 from lalaloc_core.importers.common.opening_placement import WallLines
-from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.projection import projection
-from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
 
@@ -107,26 +108,17 @@ def import_features(
     by_level = _levels_with_rooms(by_level, is_indoor)
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
-        builder = ReportBuilder()
+        builder = ReportBuilder(format, metres_per_unit, source)
         sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
         if anchor is not None:
             sketch.north_deg = anchor.north_deg
         sketch.name = level.name if len(by_level) > 1 else None
-        points: list[_PointOpening] = []
+        drawer = _Drawer(sketch, options, builder)
         for feature in (*members, *on_any_level):
-            role = _indoor_role(feature) if is_indoor else _role(feature)
-            _add_to_sketch(feature, role, project(feature.shape), sketch, points, options, builder)
+            drawer.add(feature, _indoor_role(feature) if is_indoor else _role(feature), project(feature.shape))
             budget.check_time()
-        _add_points(points, sketch, builder)
-        return assemble(
-            sketch,
-            builder,
-            options,
-            budget.limits.plan,
-            format=format,
-            metres_per_unit=metres_per_unit,
-            scale_source=source,
-        )
+        drawer.add_points()
+        return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(by_level, options, budget.limits, make)
 
@@ -219,37 +211,83 @@ def _opening_role(properties: Mapping[str, Any], category: str) -> Role:
     return "passage" if "door" in properties and properties["door"] is None else "door"
 
 
-def _add_to_sketch(
-    feature: Feature,
-    role: Role,
-    shape: BaseGeometry,
-    sketch: Sketch,
-    points: list[_PointOpening],
-    options: ImportOptions,
-    builder: ReportBuilder,
-) -> None:
-    """Add a feature to the sketch by its role, or to `points` if it is an opening without a direction."""
-    properties = feature.properties
-    layer = _layer(properties)
-    if not options.includes_layer(layer, str(properties.get("category") or "")):
-        builder.use(layer, "ignored (not in the option layers)")
-    elif role == "room":
-        _add_rooms(feature, shape, layer, sketch, builder)
-    elif role == "obstacle":
-        parts = polygons_from_geometry(shape)
-        builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
-        sketch.obstacles += parts
-    elif role == "door" or role == "window" or role == "passage":
-        _add_opening(feature, role, shape, layer, sketch, points, builder)
-    elif role == "wall":
-        lines = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.LineString)]
-        pieces = [
-            shapely.LineString(pair) for line in lines for pair in zip(line.coords, line.coords[1:], strict=False)
-        ]
-        builder.use(layer, "free-standing walls", max(len(pieces), 1))
-        sketch.inner_walls += pieces
-    else:
-        builder.use(layer, "ignored")
+class _Drawer:
+    """Features as parts of a sketch."""
+
+    def __init__(self, sketch: Sketch, options: ImportOptions, builder: ReportBuilder) -> None:
+        self._sketch, self._options, self._builder = sketch, options, builder
+        self._points: list[_PointOpening] = []
+
+    def add(self, feature: Feature, role: Role, shape: BaseGeometry) -> None:
+        """Add a feature by its role; openings without a direction wait for `add_points`."""
+        properties, sketch, builder = feature.properties, self._sketch, self._builder
+        layer = _layer(properties)
+        if not self._options.includes_layer(layer, str(properties.get("category") or "")):
+            builder.use(layer, "ignored (not in the option layers)")
+        elif role == "room":
+            self._add_rooms(feature, shape, layer)
+        elif role == "obstacle":
+            parts = polygons_from_geometry(shape)
+            builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
+            sketch.obstacles += parts
+        elif role == "door" or role == "window" or role == "passage":
+            self._add_opening(feature, role, shape, layer)
+        elif role == "wall":
+            lines = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.LineString)]
+            pieces = [shapely.LineString(pair) for line in lines for pair in pairwise(line.coords)]
+            builder.use(layer, "free-standing walls", max(len(pieces), 1))
+            sketch.inner_walls += pieces
+        else:
+            builder.use(layer, "ignored")
+
+    def _add_rooms(self, feature: Feature, shape: BaseGeometry, layer: str) -> None:
+        properties, parts = feature.properties, polygons_from_geometry(shape)
+        self._builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
+        name = _name(properties)
+        kind = _room_type(properties, name)
+        ceiling_m = _number(properties, "ceiling_height_m", "ceiling_height", "height")
+        lowest_m, highest_m = DEFAULT_LIMITS.min_ceiling_height_m, DEFAULT_LIMITS.max_ceiling_height_m
+        if ceiling_m is not None and not lowest_m <= ceiling_m <= highest_m:
+            self._builder.warnings.append(
+                f"the height of '{name}' is {ceiling_m:g} m and was ignored; it must be between {lowest_m:g} and "
+                f"{highest_m:g} m"
+            )
+            ceiling_m = None
+        room_id = feature.id if len(parts) == 1 else None
+        self._sketch.rooms += [SketchedRoom(part, name, kind, ceiling_m, room_id) for part in parts]
+
+    def _add_opening(self, feature: Feature, kind: OpeningKind, shape: BaseGeometry, layer: str) -> None:
+        properties, name = feature.properties, _name(feature.properties)
+        sill_m, head_m = _number(properties, "sill_m"), _number(properties, "head_m")
+        if head_m is None and kind != "window":
+            head_m = _number(properties, "height")
+        if isinstance(shape, shapely.Point):
+            width_m = _number(properties, "width", "est_width")
+            if width_m is None or width_m <= 0.0:
+                width_m = _USUAL_WIDTH_M[kind]
+                self._builder.unsure.append(f"{kind}s drawn as points without a width; {width_m:g} m is assumed")
+            position, has_level = (shape.x, shape.y), bool(_levels_of(feature))
+            self._points.append(_PointOpening(kind, position, width_m, name, head_m, layer, has_level))
+            return
+        ends = opening_line(shape)
+        self._builder.use(layer, kind if ends is not None else "ignored (no length)")
+        if ends is not None:
+            self._sketch.openings.append(SketchedOpening(kind, *ends, name, sill_m, head_m))
+
+    def add_points(self) -> None:
+        """Add the openings drawn as points, each along the nearest wall."""
+        if not self._points:
+            return
+        walls = WallLines([room.shape for room in self._sketch.rooms])
+        lost = 0
+        for point in self._points:
+            ends = walls.line_at(point.position, point.width_m)
+            self._builder.use(point.layer, point.kind if ends is not None else "ignored (on no wall of the level)")
+            if ends is not None:
+                self._sketch.openings.append(SketchedOpening(point.kind, *ends, point.name, None, point.head_m))
+            lost += ends is None and point.has_level
+        if lost:
+            self._builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
 
 
 def _layer(properties: Mapping[str, Any]) -> str:
@@ -259,77 +297,20 @@ def _layer(properties: Mapping[str, Any]) -> str:
     return str(next((value for value in given if value), None) or next(openings, ""))[:100]
 
 
-def _add_rooms(feature: Feature, shape: BaseGeometry, layer: str, sketch: Sketch, builder: ReportBuilder) -> None:
-    properties, parts = feature.properties, polygons_from_geometry(shape)
-    builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
-    name = _name(properties)
-    kind = _room_type(properties, name)
-    ceiling_m = _number(properties, "ceiling_height_m", "ceiling_height", "height")
-    lowest_m, highest_m = DEFAULT_LIMITS.min_ceiling_height_m, DEFAULT_LIMITS.max_ceiling_height_m
-    if ceiling_m is not None and not lowest_m <= ceiling_m <= highest_m:
-        builder.warnings.append(
-            f"the height of '{name}' is {ceiling_m:g} m and was ignored; it must be between {lowest_m:g} and "
-            f"{highest_m:g} m"
-        )
-        ceiling_m = None
-    room_id = feature.id if len(parts) == 1 else None
-    sketch.rooms += [SketchedRoom(part, name, kind, ceiling_m, room_id) for part in parts]
-
-
-def _add_opening(
-    feature: Feature,
-    kind: OpeningKind,
-    shape: BaseGeometry,
-    layer: str,
-    sketch: Sketch,
-    points: list[_PointOpening],
-    builder: ReportBuilder,
-) -> None:
-    properties, name = feature.properties, _name(feature.properties)
-    sill_m, head_m = _number(properties, "sill_m"), _number(properties, "head_m")
-    if head_m is None and kind != "window":
-        head_m = _number(properties, "height")
-    if isinstance(shape, shapely.Point):
-        width_m = _number(properties, "width", "est_width")
-        if width_m is None or width_m <= 0.0:
-            width_m = _USUAL_WIDTH_M[kind]
-            builder.unsure.append(f"{kind}s drawn as points without a width; {width_m:g} m is assumed")
-        position = (shape.x, shape.y)
-        points.append(_PointOpening(kind, position, width_m, name, head_m, layer, bool(_levels_of(feature))))
-        return
-    ends = opening_line(shape)
-    builder.use(layer, kind if ends is not None else "ignored (no length)")
-    if ends is not None:
-        sketch.openings.append(SketchedOpening(kind, *ends, name, sill_m, head_m))
-
-
-def _add_points(points: Sequence[_PointOpening], sketch: Sketch, builder: ReportBuilder) -> None:
-    """Add the openings drawn as points, each along the nearest wall."""
-    if not points:
-        return
-    walls = WallLines([room.shape for room in sketch.rooms])
-    lost = 0
-    for point in points:
-        ends = walls.line_at(point.position, point.width_m)
-        builder.use(point.layer, point.kind if ends is not None else "ignored (on no wall of the level)")
-        if ends is not None:
-            sketch.openings.append(SketchedOpening(point.kind, *ends, point.name, None, point.head_m))
-        lost += ends is None and point.has_level
-    if lost:
-        builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
-
-
 def _name(properties: Mapping[str, Any]) -> str | None:
-    """Return the name of a feature; of IMDF's names by language the English one, else the first."""
+    """Return the name of a feature."""
     for key in ("name", "alt_name", "label", "ref", "title"):
-        value = properties.get(key)
-        if isinstance(value, Mapping):
-            value = value.get("en") or next(iter(value.values()), None)
+        value = in_english(properties.get(key))
         if isinstance(value, str) and value.strip():
             return value
         if isinstance(value, int) and not isinstance(value, bool):
             return str(value)
     return None
+
+
+def in_english(value: Any) -> Any:
+    """Return the English one of IMDF's texts by language, else the first; other values as they are."""
+    return value.get("en") or next(iter(value.values()), None) if isinstance(value, Mapping) else value
 
 
 def _room_type(properties: Mapping[str, Any], name: str | None) -> str | None:

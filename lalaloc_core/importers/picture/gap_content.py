@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.importers.drawing.walls import Gap
+from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
@@ -123,15 +123,11 @@ class GapReader:
         return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
 
     def _inked(self, points_m: Float[np.ndarray, "n 2"]) -> float:
-        return float(self._values(points_m, self._near).mean())
-
-    def _values(self, points_m: Float[np.ndarray, "n 2"], mask: np.ndarray) -> np.ndarray:
-        pixels = self._ink.to_pixels(points_m)
-        columns, rows = np.floor(pixels).astype(int).T
-        inside = (rows >= 0) & (rows < mask.shape[0]) & (columns >= 0) & (columns < mask.shape[1])
-        values = np.zeros(len(pixels), dtype=bool)
-        values[inside] = mask[rows[inside], columns[inside]]
-        return values
+        """Return the share of points near ink; there is none outside the picture."""
+        columns, rows = np.floor(self._ink.to_pixels(points_m)).astype(int).T
+        height, width = self._near.shape
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        return float(self._near[rows[inside], columns[inside]].sum() / len(rows))
 
 
 def _dips(profile: Float[np.ndarray, "n"]) -> list[int]:

@@ -1,24 +1,31 @@
-"""Scale of a drawing from its dimensions: lengths that are written at lines."""
+"""Scale of drawings: read from the options, the file, or its dimensions, which are lengths written at lines.
+
+The scale is never assumed.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
-from lalaloc_core.importers.drawing.shapes import Drawing
+from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
+_WRITTEN = re.compile(r"(?<![\d.,:])1\s?[:/]\s?(\d{1,4})(?![\d.,:])")
+# Common scales of building drawings.
+_USUAL = {10, 20, 25, 33, 48, 50, 64, 75, 96, 100, 125, 150, 192, 200, 250, 300, 400, 500, 1000}
 # "4.20", "4,205 m", "420", "4200 mm".
 _METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{2,5})\s*(m|cm|mm|)")
 _IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″])?")
-_UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 # Whole numbers without a unit are millimetres from here on, and centimetres or millimetres below it.
 _SURELY_MM = 1000
 _LENGTH_M = (0.2, 200.0)
@@ -39,6 +46,57 @@ _EXTENT_M = (3.0, 300.0)
 
 # Text of a dimension, and the lengths in units of the drawing that it may be about.
 Dimension = tuple[str, Sequence[float]]
+
+
+def drawing_scale(
+    options: ImportOptions,
+    subject: str,
+    drawings: Sequence[Drawing] = (),
+    check_time: Callable[[], None] = lambda: None,
+    *,
+    paper_m_per_unit: float | None = None,
+    own: tuple[float, str] | None = None,
+) -> tuple[float, str]:
+    """Return metres per unit of a drawing, and the source of that value.
+
+    The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
+    a unit has a length on paper, then the dimensions of the first drawing that has them. `subject` names the file in
+    the error message, and `check_time` raises an exception to stop.
+
+    Raises:
+        InvalidFloorPlanError: neither the options nor the file give a scale.
+    """
+    if options.known_distance is not None:
+        return options.known_distance.metres_per_unit, "option known_distance"
+    if options.metres_per_pixel is not None:
+        return options.metres_per_pixel, "option metres_per_pixel"
+    if options.scale is not None:
+        if paper_m_per_unit is None:
+            raise InvalidFloorPlanError(
+                f"{subject} has no size on paper, so scale=1:{options.scale:g} cannot be used; "
+                "set metres_per_pixel or known_distance instead"
+            )
+        return options.scale * paper_m_per_unit, "option scale"
+    if options.units is not None:
+        return METRES_PER_UNIT[options.units], "option units"
+    if own is not None:
+        return own
+    written = _written_scale(lettering.text for drawing in drawings for lettering in drawing.letterings)
+    if written is not None and paper_m_per_unit is not None:
+        return written * paper_m_per_unit, f"1:{written:g}, written in the drawing"
+    if measured := next(filter(None, (drawn_scale(drawing, check_time) for drawing in drawings)), None):
+        return measured
+    hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
+    raise InvalidFloorPlanError(
+        f"{subject} gives no scale{hint}: set scale (1:100), metres_per_pixel (metres per unit of the drawing) or "
+        "known_distance (x0, y0, x1, y1, metres)"
+    )
+
+
+def _written_scale(texts: Iterable[str]) -> int | None:
+    """Return the denominator of the only scale written on a drawing, None if there is none or several."""
+    found = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
+    return found.pop() if len(found) == 1 else None
 
 
 def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:
@@ -65,11 +123,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
 
 def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
     """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
-    shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
-    if not shapes:
-        return None
-    x0, y0, x1, y1 = shapely.total_bounds(shapes)
-    return scale_by_dimensions(_written(drawing, check_time), float(max(x1 - x0, y1 - y0)))
+    return scale_by_dimensions(_written(drawing, check_time), drawing.extent) if drawing.shapes else None
 
 
 def check_scale(
@@ -158,11 +212,11 @@ def _values_m(text: str) -> tuple[float, ...]:
     """Return the lengths (m) that a text can mean."""
     text = text.strip()
     if match := _IMPERIAL.fullmatch(text):
-        values = [0.3048 * int(match[1]) + 0.0254 * int(match[2] or 0)]
+        values = [METRES_PER_UNIT["ft"] * int(match[1]) + METRES_PER_UNIT["in"] * int(match[2] or 0)]
     elif match := _METRIC.fullmatch(text):
         number, unit = float(match[1].replace(",", ".")), match[2]
         if unit:
-            values = [number * _UNIT_M[unit]]
+            values = [number * METRES_PER_UNIT[unit]]
         elif not match[1].isdigit():
             values = [number]
         else:

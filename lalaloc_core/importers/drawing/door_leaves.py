@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.common.geometry import point_xy
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Stroke, Swing, fit_swing
+from lalaloc_core.importers.common.geometry import point_xy, side_lengths
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, fit_swing
 
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
 LEAF_M = (0.45, 1.6)
@@ -81,8 +81,7 @@ def without_leaves(areas: Sequence[Area], swings: Sequence[Swing]) -> list[Area]
 def _is_leaf(shape: shapely.Polygon, swing: Swing) -> bool:
     if shapely.distance(shape, shapely.Point(swing.hinge)) > 5 * _TOUCH_M:
         return False
-    points = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
-    thin, long = sorted(math.dist(points[k], points[k + 1]) for k in (0, 1)) if len(points) == 5 else (0.0, 0.0)
+    thin, long = side_lengths(shape)
     tip = min(shapely.distance(shape, shapely.Point(end)) for end in (swing.first, swing.last))
     has_size = thin <= _THICK_LEAF_M and abs(long - swing.radius) <= 0.1 * swing.radius
     return has_size and bool(tip <= 5 * _TOUCH_M)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, PlanLimits
-from lalaloc_core.importers.common.trace import Trace
+from lalaloc_core.importers.common.import_report import Trace
 
 _REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
 

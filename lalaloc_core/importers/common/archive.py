@@ -1,0 +1,66 @@
+"""Zip archives, read within limits and written without times."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.import_limits import ImportLimits
+
+# Archives carry no time, so that equal plans give equal bytes.
+_EPOCH = (2000, 1, 1, 0, 0, 0)
+
+
+def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
+    """Unpack the files with these suffixes (lower case) from a zip archive, in memory, without archives inside it.
+
+    Returns:
+        The files by name.
+
+    Raises:
+        InvalidFloorPlanError: the archive is damaged, encrypted or exceeds a limit.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return _read_members(archive, limits, suffixes)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError) as error:
+        raise InvalidFloorPlanError(f"the archive is damaged: {error}; pack it again") from error
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive of files."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), content, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
+
+
+def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tuple[str, ...]) -> dict[str, bytes]:
+    members = archive.infolist()
+    if len(members) > limits.max_archive_files:
+        raise InvalidFloorPlanError(
+            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files); "
+            "pack only the files of the plan"
+        )
+    found: dict[str, bytes] = {}
+    remaining = limits.max_unpacked_bytes
+    for member in members:
+        if member.is_dir() or not member.filename.casefold().endswith(suffixes):
+            continue
+        if member.flag_bits & 0x1:
+            raise InvalidFloorPlanError(f"'{member.filename[:100]}' is encrypted; send the archive without a password")
+        # The sizes in the archive's directory can be forged, so the read itself is bounded.
+        with archive.open(member) as stream:
+            content = stream.read(remaining + 1)
+        remaining -= len(content)
+        if remaining < 0:
+            raise InvalidFloorPlanError(
+                f"the archive unpacks to more than {limits.max_unpacked_bytes} bytes (max_unpacked_bytes); "
+                "pack only the files of the plan"
+            )
+        found[member.filename] = content
+    return found
