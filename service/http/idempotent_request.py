@@ -34,12 +34,15 @@ from service.errors import (
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
 from service.pools import JobLostError
+from service.security.access_control import routed_path
 from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Claimed, Conflict, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MAX_KEY_CHARACTERS = 255
+# Characters of a method and path that keys belong to, enough for any id.
+_MAX_ROUTE = 64
 _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 # Errors of the request itself, which are kept. Others are not kept, whatever their status.
 _PERMANENT_ERRORS = (
@@ -60,17 +63,16 @@ class IdempotentRequest:
     Args:
         claims: stored keys.
         request: the request.
-        tenant: tenant of the request; keys of different tenants and routes are independent.
-        route: method and path of the route.
+        tenant: tenant of the request; keys of different tenants and paths are independent.
 
     Raises:
         InvalidRequestError: an invalid key.
     """
 
-    def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str, route: str) -> None:
+    def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str) -> None:
         self._claims = claims
         self._request = request
-        self._place = (tenant, route)
+        self._place = (tenant, f"{request.method} {routed_path(request.scope)}"[:_MAX_ROUTE])
         self._key = _key_of(request)
 
     def run(self, parts: Parts, work: Callable[[str], Response]) -> Response:

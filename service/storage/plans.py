@@ -22,7 +22,7 @@ from service.storage.plan_rows import (
     new_record,
     revision_values,
 )
-from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
+from service.storage.records import Cursor, NewPlan, PlanRecord, PlanSummary
 from service.storage.statements import damaged, lock_plan_of, newest_first, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
@@ -68,18 +68,7 @@ class Plans:
         """Set the function that parses documents; it returns None for a damaged one."""
         self._parse = parse
 
-    def add(
-        self,
-        tenant: str,
-        plan_id: str,
-        plan: FloorPlan,
-        *,
-        original: Original,
-        limit: int,
-        document: PlanDocument | None = None,
-        grid: ComputedGrid | None = None,
-        later_bytes: int = 0,
-    ) -> PlanRecord:
+    def add(self, tenant: str, plan_id: str, new: NewPlan, *, limit: int) -> PlanRecord:
         """Store a plan, its uploaded file, and its grid if it is already computed.
 
         An existing id is a repeated upload whose first answer was lost; the stored plan is returned.
@@ -87,26 +76,21 @@ class Plans:
         Args:
             tenant: owner of the plan.
             plan_id: a new id, or the id of a repeated upload; callers never choose it.
-            plan: the plan.
-            original: the uploaded file.
+            new: the plan.
             limit: maximum number of the tenant's plans.
-            document: the plan's stored form, if it is made already.
-            grid: the plan's own grid.
-            later_bytes: expected size of the own grid if it is computed later; there must be room for it.
 
         Raises:
             TooManyFloorPlansError: the tenant has `limit` plans already.
             StorageQuotaError: the tenant would store too many bytes.
         """
-        now = datetime.now(UTC)
-        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
-        content = PlanContent.prepare(record, original, document, grid)
+        record = new_record(new, plan_id, tenant, datetime.now(UTC))
+        content = PlanContent.prepare(record.revision_id, new)
         with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
                 if count_plans(connection, tenant) >= limit:
                     raise TooManyFloorPlansError(limit)
-                self._quota.check(connection, tenant, content.stored.total + later_bytes)
+                self._quota.check(connection, tenant, content.stored.total + new.later_bytes)
                 if insert_plan(connection, self._database, record, content):
                     self._quota.settle(connection, tenant, content.stored)
                     # Exact now, because settling locks the tenant.
@@ -121,17 +105,7 @@ class Plans:
         return record
 
     def add_revision(
-        self,
-        tenant: str,
-        plan_id: str,
-        plan: FloorPlan,
-        *,
-        original: Original,
-        keep: int,
-        expected: str | None = None,
-        document: PlanDocument | None = None,
-        grid: ComputedGrid | None = None,
-        later_bytes: int = 0,
+        self, tenant: str, plan_id: str, new: NewPlan, *, keep: int, expected: str | None = None
     ) -> PlanRecord:
         """Store a new revision of a plan, and delete revisions beyond `keep`.
 
@@ -140,22 +114,17 @@ class Plans:
         Args:
             tenant: owner of the plan.
             plan_id: id of the plan.
-            plan: the new plan.
-            original: the uploaded file.
+            new: the new plan.
             keep: maximum number of revisions.
             expected: id of the revision that the plan must have; None for any.
-            document: the plan's stored form, if it is made already.
-            grid: the plan's own grid.
-            later_bytes: as for `add`.
 
         Raises:
             UnknownFloorPlanError: the tenant has no such plan.
             RevisionMismatchError: the plan is not at revision `expected`.
             StorageQuotaError: the tenant would store too many bytes.
         """
-        now = datetime.now(UTC)
-        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
-        content = PlanContent.prepare(record, original, document, grid)
+        record = new_record(new, plan_id, tenant, datetime.now(UTC))
+        content = PlanContent.prepare(record.revision_id, new)
         with self._database.writing(grows_by=content.stored.total) as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -168,7 +137,7 @@ class Plans:
             record = replace(record, revision=number, created_at=row.created_at)
             freed = _delete_revisions(connection, own, grids_before=number - 1, before=number - keep + 1)
             change = content.stored - freed
-            self._quota.check(connection, tenant, change.total + later_bytes)
+            self._quota.check(connection, tenant, change.total + new.later_bytes)
             insert_revision(connection, record, content)
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**revision_values(record)))
             self._quota.settle(connection, tenant, change, changed_plan=plan_id)
