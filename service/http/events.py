@@ -19,7 +19,7 @@ from service.capacity.admission_control import Admission
 from service.capacity.threads import BoundedReads
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider
-from service.schemas import PlanEvent
+from service.schemas.stored_plans import PlanEvent
 from service.storage import Store
 from service.telemetry import LOGGER_NAME
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -101,6 +102,10 @@ class ApiCall:
     async def read(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Read the store on a thread with a timeout; see `BoundedReads.run`."""
         return await self.runtime.reads.run(self.tenant, work, *args, **kwargs)
+
+    def reading(self) -> AbstractAsyncContextManager[None]:
+        """Return a block that holds a permit to read, for answers that are read part by part."""
+        return self.runtime.admission.reading.held(self.client)
 
     def plan(self, floorplan_id: str) -> PlanSummary:
         """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks.

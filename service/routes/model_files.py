@@ -55,7 +55,7 @@ async def _chunks(path: Path, call: ApiCall) -> AsyncIterator[bytes]:
     """Yield a file until the client has gone. Clients check the digest, so an altered file is noticed there."""
     with path.open("rb") as opened:
         while not await call.request.is_disconnected():
-            async with call.runtime.admission.reading.held(call.client):
+            async with call.reading():
                 chunk = await run_in_threadpool(opened.read, _CHUNK_BYTES)
             if not chunk:
                 return

@@ -36,7 +36,7 @@ from service.routes.descriptions import (
     REVISION_RESPONSES,
     file_response,
 )
-from service.schemas import LocalisabilityAnswer
+from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.stored_plans import LayoutAnswer
 from service.storage.records import PlanSummary
 from service.stored_plan import PREDICTIONS, RenditionKind
@@ -254,7 +254,7 @@ async def _chunks(plan: PlanSummary, size_bytes: int, call: ApiCall) -> AsyncIte
     """
     sent_bytes = number = 0
     while sent_bytes < size_bytes and not await call.request.is_disconnected():
-        async with call.runtime.admission.reading.held(call.client):
+        async with call.reading():
             chunk = await run_in_threadpool(call.store.originals.chunk, plan.revision_id, number)
         if chunk is None:
             raise UnknownFloorPlanError(plan.id)

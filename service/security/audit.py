@@ -22,16 +22,8 @@ from urllib.parse import quote
 
 from starlette.requests import Request
 
-from service.errors import (
-    ExposedWithoutKeysError,
-    InsufficientScopeError,
-    IssuerUnavailableError,
-    RateLimitedError,
-    StoreUnavailableError,
-    TooManyRefusedKeysError,
-    UnauthenticatedError,
-)
-from service.security.access_control import routed_path
+from service.errors import StoreUnavailableError
+from service.security.access_control import REFUSALS, routed_path
 from service.security.permissions import Caller, Permission, permissions_needed, template_of
 from service.storage.audit_log import AuditLog
 from service.storage.records import ANONYMOUS, DONE, AuditEntry
@@ -39,14 +31,7 @@ from service.telemetry import LOGGER_NAME
 from service.telemetry.log_fields import log_fields_of
 
 # Refusals that are audited, besides those of changes.
-AUDITED_REFUSALS = (
-    UnauthenticatedError,
-    InsufficientScopeError,
-    ExposedWithoutKeysError,
-    RateLimitedError,
-    TooManyRefusedKeysError,
-    IssuerUnavailableError,
-)
+AUDITED_REFUSALS = tuple(error for error in REFUSALS if error is not StoreUnavailableError)
 # Statuses of refusals by routes that are not audited otherwise: photographs where features are required, or too many.
 REFUSED = frozenset({403, 429})
 # nginx's status for a client that disconnected before the answer; a change may have been made.
@@ -213,13 +198,4 @@ class AuditTrail:
 
 def _same(entry: AuditEntry) -> AuditEntry:
     """Return the part of an entry in which counted entries are equal."""
-    return AuditEntry(
-        actor=entry.actor,
-        tenant=entry.tenant,
-        address=entry.address,
-        action=entry.action,
-        resource=entry.resource,
-        status=entry.status,
-        result=entry.result,
-        created_at=_NO_TIME,
-    )
+    return replace(entry, count=1, request_id=None, detail=None, created_at=_NO_TIME)

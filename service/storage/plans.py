@@ -23,7 +23,7 @@ from service.storage.plan_rows import (
     revision_values,
 )
 from service.storage.records import Cursor, NewPlan, PlanRecord, PlanSummary
-from service.storage.statements import damaged, lock_plan_of, newest_first, select_summaries
+from service.storage.statements import damaged, lock_plan_of, newest_first, select_revisions, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
@@ -218,17 +218,9 @@ class Plans:
 
     def stored(self, revision_id: str) -> StoredPlan | None:
         """Return a plan at a revision with its unparsed document, regardless of tenant. Callers check access first."""
-        columns = REVISIONS.c
-        query = select(
-            columns.plan_id.label("id"),
-            columns.id.label("revision_id"),
-            columns.number.label("revision"),
-            FLOORPLANS.c.created_at,
-            columns.created_at.label("updated_at"),
-            columns.report,
-        ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.id == columns.plan_id)
+        query = select_revisions(REVISIONS.c.report, current=False).where(REVISIONS.c.id == revision_id)
         with self._database.reading() as connection:
-            row = connection.execute(query.where(columns.id == revision_id)).one_or_none()
+            row = connection.execute(query).one_or_none()
             if row is None:
                 return None
             return StoredPlan(**row._mapping, document=_document(connection, revision_id))
@@ -274,29 +266,26 @@ class Plans:
         self._cache.forget(tenant, plan_id)
         return deleted
 
-    def set_failure(self, revision_id: str, reason: str) -> None:
-        """Store the error of the computation of a revision's own grid."""
-        self._set_failure(revision_id, reason)
+    def set_failure(self, revision_id: str, reason: str | None) -> None:
+        """Store the error of the computation of a revision's own grid; None deletes it."""
+        with self._database.writing() as connection:
+            plan = lock_plan_of(connection, revision_id)
+            if plan is not None:
+                connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
+                self._quota.settle(connection, plan.tenant, StoredBytes(), refuse=False, changed_plan=plan.id)
 
     def clear_failures(self) -> None:
         """Delete all stored errors, so that these grids are computed again."""
         with self._database.reading() as connection:
             failed = connection.scalars(select(REVISIONS.c.id).where(REVISIONS.c.failure.is_not(None))).all()
         for revision_id in failed:
-            self._set_failure(revision_id, None)
+            self.set_failure(revision_id, None)
 
     def current_revisions(self, revision_ids: Collection[str]) -> set[str]:
         """Return the revisions among `revision_ids` that are the current ones of their plans."""
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
             return set(connection.scalars(query))
-
-    def _set_failure(self, revision_id: str, reason: str | None) -> None:
-        with self._database.writing() as connection:
-            plan = lock_plan_of(connection, revision_id)
-            if plan is not None:
-                connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
-                self._quota.settle(connection, plan.tenant, StoredBytes(), refuse=False, changed_plan=plan.id)
 
     def _delete(self, connection: Connection, tenant: str, plan_id: str, expected: str | None) -> bool:
         mine = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
@@ -359,14 +348,4 @@ def _select_current(tenant: str, plan_id: str) -> Any:
 
 def _select_heads(*, current: bool) -> Any:
     """Return a query for the columns of `PlanRecord` except `plan`, at the current or at every revision."""
-    link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
-    return select(
-        FLOORPLANS.c.id,
-        FLOORPLANS.c.tenant,
-        REVISIONS.c.id.label("revision_id"),
-        REVISIONS.c.number.label("revision"),
-        FLOORPLANS.c.created_at,
-        REVISIONS.c.created_at.label("updated_at"),
-        REVISIONS.c.failure,
-        REVISIONS.c.report,
-    ).join_from(FLOORPLANS, REVISIONS, link)
+    return select_revisions(FLOORPLANS.c.tenant, REVISIONS.c.failure, REVISIONS.c.report, current=current)
