@@ -20,17 +20,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPhotographError, InvalidPoseError
+from service import errors
 from service.capacity.threads import BoundedReads
-from service.errors import (
-    IdempotencyInProgressError,
-    IdempotencyKeyReusedError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    StorageQuotaError,
-    StoreUnavailableError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
-)
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
 from service.pools import JobLostError
@@ -50,10 +41,10 @@ _PERMANENT_ERRORS = (
     InvalidHintError,
     InvalidPhotographError,
     InvalidPoseError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
+    errors.InvalidRequestError,
+    errors.PlanTooLargeError,
+    errors.UnknownFloorPlanError,
+    errors.UnknownVenueError,
 )
 
 
@@ -113,7 +104,7 @@ class IdempotentRequest:
             token = await reads.run(tenant, self._begin_for, waiting, parts)
         except BaseException:
             if (left := waiting.leave()) is not None:
-                with suppress(StoreUnavailableError):
+                with suppress(errors.StoreUnavailableError):
                     await reads.run(tenant, self._abandon, left)
             raise
         if isinstance(token, Response):
@@ -122,12 +113,12 @@ class IdempotentRequest:
             answer = await work()
         except BaseException as error:
             refusal = None
-            with suppress(StoreUnavailableError):
+            with suppress(errors.StoreUnavailableError):
                 refusal = await reads.run(tenant, self._fail, token, error)
             if refusal is None:
                 raise
             return refusal
-        with suppress(StoreUnavailableError):
+        with suppress(errors.StoreUnavailableError):
             await reads.run(tenant, self._keep, token, answer)
         return answer
 
@@ -141,9 +132,9 @@ class IdempotentRequest:
             case StoredAnswer():
                 return Response(claim.body, claim.status, {**claim.headers, REPLAYED: "true"})
             case Conflict():
-                raise IdempotencyKeyReusedError(self._key)
+                raise errors.IdempotencyKeyReusedError(self._key)
             case InProgress():
-                raise IdempotencyInProgressError(self._key)
+                raise errors.IdempotencyInProgressError(self._key)
 
     def _begin_for(self, waiting: _Waiting, parts: Parts) -> Response | str:
         begun = self._begin(parts)
@@ -158,10 +149,10 @@ class IdempotentRequest:
         try:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
             self._claims.finish(*self._place, self._key, token, kept)
-        except StorageQuotaError:
+        except errors.StorageQuotaError:
             # The next attempt executes the request again, under the same token.
             self._abandon(token)
-        except StoreUnavailableError:
+        except errors.StoreUnavailableError:
             # The work is done; after the lease, the next attempt finds it under the token.
             logging.getLogger(LOGGER_NAME).warning("the answer to an idempotent request was not kept")
         return answer
@@ -181,7 +172,7 @@ class IdempotentRequest:
             return
         try:
             self._claims.abandon(*self._place, self._key, token)
-        except StoreUnavailableError:
+        except errors.StoreUnavailableError:
             logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in progress for its lease")
 
 
@@ -226,5 +217,5 @@ def _key_of(request: Request) -> str | None:
         return None
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
         fault = f"is '{', '.join(values)[:100]}'; give one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
-        raise InvalidRequestError([(HEADER, fault)])
+        raise errors.InvalidRequestError([(HEADER, fault)])
     return values[0]

@@ -18,7 +18,7 @@ _PROBLEMS = problem_responses(UnknownAnswerError, *READ_ERRORS)
 
 @router.get("/{answer_id}", summary="Get a kept answer", response_model=LocaliseAnswer, responses=_PROBLEMS)
 def get_answer(answer_id: str, call: Call) -> Response:
-    """Return the answer to an earlier query, byte for byte, while it is kept. Panoramas are never kept."""
+    """Return the answer to an earlier query, byte for byte, while it is kept. Photographs are never kept."""
     kept_s = call.settings.storage.keep_answers_s
     content = call.store.answers.get(call.tenant, answer_id, kept_s=kept_s) if is_id(answer_id) else None
     if content is None:

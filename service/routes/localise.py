@@ -40,7 +40,7 @@ _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-
 _PHOTO_SCHEMA = {
     "type": "string",
     "format": "binary",
-    "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° panorama, twice as wide as "
+    "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° sphere, twice as wide as "
     "high, or a part of it with photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an "
     "ordinary photograph, a fisheye photograph or a phone's panorama. Its EXIF metadata state the field of view.",
 }

@@ -12,21 +12,9 @@ from typing import Any
 from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from service import errors
 from service.capacity.admission_control import BATCH
-from service.errors import (
-    OverloadedError,
-    PlanFailedError,
-    PlanNotReadyError,
-    RateLimitedError,
-    ServiceError,
-    StoppingError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
-    UploadTooLargeError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
-)
-from service.http.lines import NDJSON, LinesResponse
+from service.http.piecewise import NDJSON, LinesResponse
 from service.http.problems import problem_document, problem_responses
 from service.http.uploads import Repeats
 from service.query import Content, PhotographQuery, QueryContext
@@ -59,11 +47,11 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
 # Errors that every further photograph of the batch would meet.
 _COMMON_ERRORS = (
     InvalidHintError,
-    PlanFailedError,
-    PlanNotReadyError,
-    StoppingError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
+    errors.PlanFailedError,
+    errors.PlanNotReadyError,
+    errors.StoppingError,
+    errors.VenueNotReadyError,
+    errors.VenueUnsearchableError,
 )
 # Pause (s) before a photograph asks again for a slot, while the tenant's other queries have them.
 _BUSY_PAUSE_S = 0.25
@@ -80,9 +68,9 @@ _MAX_NAME = 255
     responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
     | problem_responses(
         InvalidHintError,
-        RateLimitedError,
-        UnknownVenueError,
-        UnknownFloorPlanError,
+        errors.RateLimitedError,
+        errors.UnknownVenueError,
+        errors.UnknownFloorPlanError,
         *QUERY_ERRORS,
         *IDEMPOTENCY_ERRORS,
     ),
@@ -151,7 +139,7 @@ class _Batch:
             if isinstance(error, _COMMON_ERRORS):
                 self._common_error = error
             problem = problem_document(self._call.request, error)
-            retry_after_s = error.retry_after_s if isinstance(error, ServiceError) else None
+            retry_after_s = error.retry_after_s if isinstance(error, errors.ServiceError) else None
         finally:
             file.close()
         line = BatchLine(
@@ -170,17 +158,17 @@ class _Batch:
         settings = self._call.settings
         limit = settings.photographs.max_photograph_bytes
         if len(file) > limit:
-            raise UploadTooLargeError("max_photograph_bytes", limit, len(file))
+            raise errors.UploadTooLargeError("max_photograph_bytes", limit, len(file))
         context = QueryContext.starting(self._call.client, settings.requests.request_deadline_s)
         while True:
             if self._call.runtime.admission.stopping:
-                raise StoppingError()
+                raise errors.StoppingError()
             if self._common_error is not None:
                 raise self._common_error
             try:
                 query = PhotographQuery(self._form, photograph, context)
                 return await keep_answer(await localise_in(self._place, query, self._call), self._call)
-            except OverloadedError:
+            except errors.OverloadedError:
                 if context.left_s < _BUSY_PAUSE_S:
                     raise
             await asyncio.sleep(_BUSY_PAUSE_S)

@@ -215,7 +215,7 @@ async def get_layout(floorplan_id: str, call: Call, revision: Revision = None) -
     """Return the walls of each room, and the part of a wall that each opening takes up.
 
     A client can compute from them the layout that a camera sees: the distance to the nearest wall of its room in every
-    direction, and hence where floor, ceiling and openings appear in a panorama.
+    direction, and hence where floor, ceiling and openings appear in a photograph.
     """
     plan, _ = await run_in_threadpool(call.plan_at_revision, floorplan_id, revision)
     return await _rendition(call, plan, "layout", JSON)

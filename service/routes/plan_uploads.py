@@ -13,7 +13,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, building_name
 from service.errors import InvalidRequestError
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
-from service.plan_files.plan_file import PlanFile, convert, convert_levels, seems_native
+from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import json_body
 from service.schemas.native_plan import FloorPlanDocument
@@ -121,11 +121,11 @@ def prepare_plan(uploaded: PlanUpload, call: ApiCall) -> tuple[NewPlan, PlanFile
 
     Raises:
         PlanTooLargeError: the plan needs too large a grid.
-        LaLaLocError: see `convert`.
+        LaLaLocError: see `PlanReader.read`.
     """
     content, runtime = uploaded.file.read(), call.runtime
     name = building_name(uploaded.file.name)
-    file = convert(content, uploaded.options, name, runtime.converter, call.settings, call.client, runtime.permits)
+    file = _reader(call).read(content, uploaded.options, name, call.client)
     runtime.grids.check_size(file.plan)
     original = Original(content, file.media_type, file.report)
     return _new_plan(file, original, runtime.grids.prepare(file.plan, call.client), 0.0, call), file
@@ -137,12 +137,10 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str) -> list[NewPl
     Raises:
         InvalidRequestError: the file has more levels than a venue can have plans.
         PlanTooLargeError: a level needs too large a grid.
-        LaLaLocError: see `convert_levels`.
+        LaLaLocError: see `PlanReader.read_levels`.
     """
     content, runtime = uploaded.file.read(), call.runtime
-    files = convert_levels(
-        content, uploaded.options, name, runtime.converter, call.settings, call.client, runtime.permits
-    )
+    files = _reader(call).read_levels(content, uploaded.options, name, call.client)
     limit = call.settings.plans.max_venue_plans
     if len(files) > limit:
         fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
@@ -152,6 +150,10 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str) -> list[NewPl
     grids = runtime.grids.prepare_all([file.plan for file in files], call.client)
     originals = [_original(file, content if len(files) == 1 else None) for file in files]
     return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
+
+
+def _reader(call: ApiCall) -> PlanReader:
+    return PlanReader(call.runtime.converter, call.settings, call.runtime.permits)
 
 
 def _new_plan(file: PlanFile, original: Original, grid: ComputedGrid | None, level: float, call: ApiCall) -> NewPlan:

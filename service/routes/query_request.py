@@ -14,14 +14,7 @@ from pydantic import BaseModel
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from lalaloc_core.localise.search.pipeline import StageClock
-from service.errors import (
-    FeaturesRequiredError,
-    InvalidRequestError,
-    StorageQuotaError,
-    StoreUnavailableError,
-    UnanchoredPlanError,
-    UploadTooLargeError,
-)
+from service import errors
 from service.http.uploads import (
     GEOJSON,
     JSON,
@@ -116,12 +109,12 @@ async def read_query(
                 aliases={PANORAMA: PHOTO},
                 substitutes={FEATURES: PHOTO},
             )
-        except UploadTooLargeError as error:
+        except errors.UploadTooLargeError as error:
             if settings.photographs.require_features:
-                raise FeaturesRequiredError from error
+                raise errors.FeaturesRequiredError from error
             raise
     if settings.photographs.require_features and parts.named(PHOTO):
-        raise FeaturesRequiredError
+        raise errors.FeaturesRequiredError
     context = QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)
     if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
@@ -140,7 +133,7 @@ def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[
     if not features:
         return [*parts.named(PHOTO)]
     if stated := sorted(form.model_fields_set & PhotographFields.model_fields.keys()):
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [(name, f"is stated when {FEATURES} are computed; leave it out of the query") for name in stated]
         )
     for index, file in enumerate(features):
@@ -156,7 +149,7 @@ def check_anchor(place: PlanRecord | VenueRecord, media: str) -> None:
         UnanchoredPlanError: the answer is GeoJSON, and the plan has no anchor.
     """
     if media == GEOJSON and isinstance(place, PlanRecord) and place.plan.anchor is None:
-        raise UnanchoredPlanError(place.id)
+        raise errors.UnanchoredPlanError(place.id)
 
 
 async def localise_in(place: PlanRecord | VenueRecord, query: PhotographQuery, call: ApiCall) -> LocaliseAnswer:
@@ -176,7 +169,7 @@ def answer_as(answer: Answer, media: str, to_geojson: Callable[[Answer], dict[st
         return Response(answer.model_dump_json(), headers=VARY, media_type=JSON)
     feature = to_geojson(answer)
     if feature is None:
-        raise UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
+        raise errors.UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
     return Response(json.dumps(feature), headers=VARY, media_type=GEOJSON)
 
 
@@ -192,7 +185,7 @@ async def keep_answer(answer: LocaliseAnswer, call: ApiCall) -> LocaliseAnswer:
     keep = partial(call.store.answers.add, limit=storage.max_kept_answers)
     try:
         answer_id = await call.read(keep, call.tenant, answer.floorplan_id, with_id)
-    except (StoreUnavailableError, StorageQuotaError):
+    except (errors.StoreUnavailableError, errors.StorageQuotaError):
         # The answer is valid although it could not be kept.
         return answer
     return answer.model_copy(update={"answer_id": answer_id})

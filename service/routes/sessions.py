@@ -10,21 +10,7 @@ from fastapi import APIRouter, Response, status
 
 from lalaloc_core.errors import InvalidHintError, InvalidMotionError, InvalidPoseError
 from lalaloc_core.render.sampling import grid_size
-from service.errors import (
-    InvalidRequestError,
-    PhotographOutOfOrderError,
-    SessionBusyError,
-    SessionOutdatedError,
-    StorageQuotaError,
-    StoreFullError,
-    StoreUnavailableError,
-    TooManySessionsError,
-    UnknownFloorPlanError,
-    UnknownSessionError,
-    UnknownVenueError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
-)
+from service import errors
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, media_type
@@ -53,7 +39,7 @@ _PHOTOGRAPH: dict[str, Any] = {
     "format": "binary",
     "description": "Photograph, as for `POST /localise`.",
 }
-_READ_RESPONSES = problem_responses(UnknownSessionError, *READ_ERRORS)
+_READ_RESPONSES = problem_responses(errors.UnknownSessionError, *READ_ERRORS)
 
 
 @router.post(
@@ -65,13 +51,13 @@ _READ_RESPONSES = problem_responses(UnknownSessionError, *READ_ERRORS)
     responses=problem_responses(
         InvalidHintError,
         InvalidPoseError,
-        InvalidRequestError,
+        errors.InvalidRequestError,
         *BODY_ERRORS,
         *STORE_ERRORS,
-        UnknownFloorPlanError,
-        UnknownVenueError,
-        VenueUnsearchableError,
-        TooManySessionsError,
+        errors.UnknownFloorPlanError,
+        errors.UnknownVenueError,
+        errors.VenueUnsearchableError,
+        errors.TooManySessionsError,
         *IDEMPOTENCY_ERRORS,
     ),
 )
@@ -114,7 +100,7 @@ def get_session(session_id: str, call: Call) -> Response:
 def delete_session(session_id: str, call: Call) -> None:
     """Delete a session before it expires."""
     if not call.store.sessions.delete(call.tenant, _id(session_id)):
-        raise UnknownSessionError(session_id)
+        raise errors.UnknownSessionError(session_id)
 
 
 @router.post(
@@ -125,14 +111,14 @@ def delete_session(session_id: str, call: Call) -> None:
     responses=problem_responses(
         InvalidHintError,
         InvalidMotionError,
-        UnknownSessionError,
-        SessionBusyError,
-        SessionOutdatedError,
-        PhotographOutOfOrderError,
-        StorageQuotaError,
-        StoreFullError,
-        VenueUnsearchableError,
-        VenueNotReadyError,
+        errors.UnknownSessionError,
+        errors.SessionBusyError,
+        errors.SessionOutdatedError,
+        errors.PhotographOutOfOrderError,
+        errors.StorageQuotaError,
+        errors.StoreFullError,
+        errors.VenueUnsearchableError,
+        errors.VenueNotReadyError,
         *QUERY_ERRORS,
     ),
 )
@@ -158,7 +144,7 @@ async def add_photograph(session_id: str, call: Call) -> Response:
             changed = f"floor plan '{place.id}' was replaced"
             if session.plan_id is None:
                 changed = f"venue '{place.id}' was changed"
-            raise SessionOutdatedError(session.id, changed)
+            raise errors.SessionOutdatedError(session.id, changed)
         call.log(plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
         query = TrackQuery(session.id, document, session.state, form, content, context)
         outcome = await call.runtime.tracker.track(place, query)
@@ -167,7 +153,7 @@ async def add_photograph(session_id: str, call: Call) -> Response:
         after = await call.read(finish, session, outcome.state, stored)
     except BaseException:
         # Also if the client leaves; the claim would expire by itself.
-        with suppress(StoreUnavailableError):
+        with suppress(errors.StoreUnavailableError):
             await call.read(sessions.release, session)
         raise
     return Response(_answer(after), media_type=JSON)
@@ -181,7 +167,7 @@ def _check_size(record: PlanRecord, call: ApiCall) -> None:
     """
     poses = grid_size(record.plan, call.settings.grids.grid_step_m)
     if poses > MAX_POSES:
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [("floorplan_id", f"the plan has about {poses} grid poses; the limit of sessions is {MAX_POSES}")]
         )
 
@@ -198,13 +184,13 @@ def _limited(document: SessionDocument, call: ApiCall) -> SessionDocument:
     """
     limit = call.settings.photographs.max_top_k
     if document.top_k > limit and "top_k" in document.model_fields_set:
-        raise InvalidRequestError([("top_k", f"is {document.top_k}; the limit is {limit} (max_top_k)")])
+        raise errors.InvalidRequestError([("top_k", f"is {document.top_k}; the limit is {limit} (max_top_k)")])
     return document.model_copy(update={"top_k": min(document.top_k, limit)})
 
 
 def _id(session_id: str) -> str:
     if not is_id(session_id):
-        raise UnknownSessionError(session_id)
+        raise errors.UnknownSessionError(session_id)
     return session_id
 
 

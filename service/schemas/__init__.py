@@ -3,6 +3,7 @@
 Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` milliseconds.
 
 fields           base class of answers, and number types with their rounding
+form_validators  checks of form fields
 native_plan      floor plans in the native format
 plan_import      options for reading a plan file, and the report on it
 stored_plans     stored floor plans, their events and walls
@@ -10,7 +11,7 @@ query_fields     form fields that queries share
 localise_query   form of a query
 localise_answer  its answer
 localisability   photographs of a plan that will be found
-sequence         queries with several panoramas
+sequence         queries with several photographs
 sessions         sessions of tracked cameras
 oscp             queries of AR clients
 venues           groups of floor plans
@@ -18,7 +19,8 @@ service_state    limits, health, readiness
 admin            API keys, limits of tenants, audit log
 problem_details  errors
 
-Begin with `localise_answer.py`.
+Begin with `localise_answer.py`. The package exports the forms and answers of queries; other schemas have few users,
+which import them from their modules.
 """
 
 from service.schemas.localise_answer import (

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from service.schemas.fields import Finite, needs, reject_underscores
+from service.schemas.fields import Finite
+from service.schemas.form_validators import needs, reject_underscores
 from service.schemas.photographs import PhotographFields
 from service.schemas.query_fields import CameraFields, HintFields, PlaceFields
 

@@ -11,7 +11,8 @@ from pydantic_core import PydanticCustomError
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.localise.query import DEFAULT_STD_M, RADIUS_RANGE_M, UNKNOWN_RANGE_M
-from service.schemas.fields import Finite, parse_json, reject_underscores
+from service.schemas.fields import Finite
+from service.schemas.form_validators import parse_json, reject_underscores
 
 
 class CameraFields(BaseModel):
@@ -135,7 +136,7 @@ class HintFields(BaseModel):
     )
     strict: bool = Field(
         False,
-        description="Search only places that agree with the hints and the given heading. Otherwise a panorama that "
+        description="Search only places that agree with the hints and the given heading. Otherwise a photograph that "
         "clearly contradicts them overrules them, with a warning in the answer.",
     )
 

@@ -12,18 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
-from service.schemas.fields import (
-    Degrees,
-    Finite,
-    HeadingDeg,
-    Metres,
-    ResponseModel,
-    Score,
-    Share,
-    needs,
-    parse_json,
-    reject_underscores,
-)
+from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
+from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import PhotographFields, ViewAnswer
 from service.schemas.query_fields import CameraFields, PlaceFields

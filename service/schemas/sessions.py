@@ -11,17 +11,8 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.motion import MAX_STEP_M, MAX_TURN
-from service.schemas.fields import (
-    Finite,
-    HeadingDeg,
-    Metres,
-    ResponseModel,
-    Share,
-    Variance,
-    needs,
-    parse_json,
-    reject_underscores,
-)
+from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
+from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import PhotographFields, ReadView

@@ -1,4 +1,4 @@
-"""Answers that are kept for a while, so that a link opens them again; the panoramas are never stored."""
+"""Answers that are kept for a while, so that a link opens them again; the photographs are never stored."""
 
 from __future__ import annotations
 
