@@ -38,10 +38,6 @@ _SERVICE = ""
 StillAuthorised = Callable[[], Awaitable[bool]]
 
 
-async def _always() -> bool:
-    return True
-
-
 class EventStream(StreamingResponse):
     """Stream that ends in bounded time, even if its client stops reading."""
 
@@ -94,11 +90,11 @@ class PlanEvents:
         self._subscribers: set[_Subscriber] = set()
         self._watch: asyncio.Task[None] | None = None
 
-    def event_stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
+    def event_stream(self, plan_id: str, still_authorised: StillAuthorised) -> EventStream:
         """Return the stream of an existing plan; `still_authorised` is called at every heartbeat."""
         return EventStream(self.stream(plan_id, still_authorised), self._max_s)
 
-    async def stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> AsyncGenerator[bytes]:
+    async def stream(self, plan_id: str, still_authorised: StillAuthorised) -> AsyncGenerator[bytes]:
         """Yield encoded events until the plan reaches a final state, the timeout passes, or the service stops."""
         subscriber = _Subscriber(plan_id)
         self._subscribers.add(subscriber)

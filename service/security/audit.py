@@ -39,6 +39,7 @@ CLIENT_CLOSED = 499
 READING = frozenset({"GET", "HEAD"})
 _METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _DETAIL = "lalaloc.audit_detail"
+# Interval (s) at which counted entries are stored.
 _FLUSH_S = 60.0
 # Different entries per actor and minute, and of all actors; further ones are counted without resource and address.
 _MAX_PER_ACTOR, _MAX_COUNTED = 20, 1000
@@ -104,12 +105,10 @@ class AuditTrail:
 
     Args:
         log: the stored log.
-        flush_s: interval (s) at which counted entries are stored.
     """
 
-    def __init__(self, log: AuditLog, *, flush_s: float = _FLUSH_S) -> None:
+    def __init__(self, log: AuditLog) -> None:
         self._log = log
-        self._flush_s = flush_s
         self._lock = threading.Lock()
         self._counted: dict[AuditEntry, AuditEntry] = {}
         self._per_actor = Counter[str]()
@@ -192,7 +191,7 @@ class AuditTrail:
         logging.getLogger(LOGGER_NAME).error("audit entries are not stored", extra={"fields": fields})
 
     def _run(self) -> None:
-        while not self._stop.wait(self._flush_s):
+        while not self._stop.wait(_FLUSH_S):
             self.flush()
 
 
