@@ -77,7 +77,7 @@ async def create_key(call: Call) -> Response:
             rate_per_minute=document.rate_per_minute,
             lifetime=None if document.expires_in_s is None else timedelta(seconds=document.expires_in_s),
         )
-        return _created(call, key, secret)
+        return _new_key_answer(call, key, secret)
 
     return await call.upload(create)
 
@@ -111,7 +111,7 @@ async def rotate_key(key_id: str, call: Call) -> Response:
         key = call.store.keys.rotate(key_id, hash_of(secret), overlap=overlap) if is_id(key_id) else None
         if key is None:
             raise UnknownKeyError(key_id, "valid ")
-        return _created(call, key, secret)
+        return _new_key_answer(call, key, secret)
 
     return await call.upload(rotate)
 
@@ -188,7 +188,7 @@ def list_audit_entries(
     if actor is not None and not actor.isprintable():
         raise InvalidRequestError([("actor", "must have printable characters only")])
     call.runtime.audit_trail.flush()
-    times = {"since": _checked("since", since), "until": _checked("until", until)}
+    times = {"since": _check_year("since", since), "until": _check_year("until", until)}
     found, more = page.read(partial(call.store.audit_log.page, tenant=tenant, actor=actor, **times))
     return AuditList(entries=[_audit_answer(entry) for entry in found], next_cursor=more)
 
@@ -198,7 +198,7 @@ async def _document(call: ApiCall, model: type[Document]) -> Document:
     return await call.upload(parse_document, model, content.read(), _VALUES)
 
 
-def _created(call: ApiCall, key: ApiKey, secret: str) -> Response:
+def _new_key_answer(call: ApiCall, key: ApiKey, secret: str) -> Response:
     facts = {"scopes": sorted(key.scopes), "expires_at": key.expires_at, "replaces": key.replaces}
     add_audit_detail(call.request, key.tenant, id=key.id, name=key.name, **facts)
     answer = NewKeyAnswer(**_values(key), key=key_text(key.id, secret))
@@ -216,7 +216,7 @@ def _audit_answer(entry: StoredAuditEntry) -> AuditEntryAnswer:
     return AuditEntryAnswer(**values)
 
 
-def _checked(field: str, moment: datetime | None) -> datetime | None:
+def _check_year(field: str, moment: datetime | None) -> datetime | None:
     """Return a time, unless databases cannot compare it.
 
     Raises:

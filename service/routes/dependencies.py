@@ -187,7 +187,7 @@ class ApiCall:
         """Return the path of a route, by the name of its function."""
         return str(self.request.app.url_path_for(route, **ids))
 
-    def written(self, content: bytes, etag: str, path: str, *, created: bool) -> Response:
+    def change_answer(self, content: bytes, etag: str, path: str, *, created: bool) -> Response:
         """Return the representation of a plan or venue that was created or changed; `etag` is also that of a GET."""
         headers = {"Content-Location": path, "ETag": etag} | ({"Location": path} if created else {})
         return Response(content, status.HTTP_201_CREATED if created else status.HTTP_200_OK, headers, JSON)

@@ -64,7 +64,7 @@ async def create_floorplan(call: Call) -> Response:
             # Stored by an earlier attempt, and possibly replaced since.
             grids.on_plan_stored(record, None)
             state = grids.states([call.plan(record.id)])[0]
-        return _written(call, record, file, state, created=True)
+        return _change_answer(call, record, file, state, created=True)
 
     # One call from claim to answer, so that a disconnect does not interrupt it.
     return await uploaded.store(call, idempotent.run, uploaded.parts, store)
@@ -127,7 +127,7 @@ async def replace_floorplan(floorplan_id: str, call: Call) -> Response:
         # Before the new grid starts. The old grid stays in memory for queries in progress.
         grids.cancel(current.revision_id)
         grids.on_plan_stored(record, new.grid)
-        return _written(call, record, file, GridState.after_upload(new.grid), created=False)
+        return _change_answer(call, record, file, GridState.after_upload(new.grid), created=False)
 
     return await uploaded.store(call, store)
 
@@ -150,7 +150,7 @@ def delete_floorplan(floorplan_id: str, call: Call) -> None:
     call.runtime.grids.forget({current.revision_id})
 
 
-def _written(call: ApiCall, record: PlanRecord, file: PlanFile, state: GridState, *, created: bool) -> Response:
+def _change_answer(call: ApiCall, record: PlanRecord, file: PlanFile, state: GridState, *, created: bool) -> Response:
     call.log(plan=record.id, revision=record.revision_id)
     step_m = call.settings.grids.grid_step_m
     if file.description is None or record.plan is not file.plan:
@@ -160,7 +160,7 @@ def _written(call: ApiCall, record: PlanRecord, file: PlanFile, state: GridState
     call.runtime.renditions.put(record.revision_id, "description", description)
     content = b"".join(_description_parts(description, state, step_m))
     path = call.path_of("get_floorplan", floorplan_id=record.id)
-    return call.written(content, _description_etag(record.revision_id, state, step_m), path, created=created)
+    return call.change_answer(content, _description_etag(record.revision_id, state, step_m), path, created=created)
 
 
 def _description_etag(revision_id: str, state: GridState, step_m: float, *, superseded: bool = False) -> str:

@@ -69,7 +69,7 @@ async def create_session(call: Call) -> Response:
     """
     idempotent, storage = call.idempotent(), call.settings.storage
     content = await call.read_json()
-    document = _limited(await call.upload(parse_document, SessionDocument, content.read(), _VALUES), call)
+    document = _limit_candidates(await call.upload(parse_document, SessionDocument, content.read(), _VALUES), call)
     place = await call.place(document.floorplan_id, document.venue_id)
     if isinstance(place, PlanRecord):
         _check_size(place, call)
@@ -176,7 +176,7 @@ def _stored_pose(session: SessionRecord) -> StoredPose | None:
     return None if session.pose is None else StoredPose.model_validate_json(session.pose)
 
 
-def _limited(document: SessionDocument, call: ApiCall) -> SessionDocument:
+def _limit_candidates(document: SessionDocument, call: ApiCall) -> SessionDocument:
     """Return the request with at most as many candidates as the settings allow.
 
     Raises:

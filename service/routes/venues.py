@@ -90,7 +90,7 @@ async def create_venue(call: Call) -> Response:
                 call.tenant, token, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
             )
             _announce(plans, stored, call)
-            return _written(call, record, created=True)
+            return _change_answer(call, record, created=True)
 
         return await uploaded.store(call, idempotent.run, uploaded.parts, store_levels)
     content = await call.read_json()
@@ -100,7 +100,7 @@ async def create_venue(call: Call) -> Response:
         members, anchor = _members(document.plans, call), _anchor(document.anchor)
         add = call.store.venues.add
         record = add(call.tenant, token, document.name, anchor, members, limit=limits.max_venues)
-        return _written(call, record, created=True)
+        return _change_answer(call, record, created=True)
 
     return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
 
@@ -171,7 +171,7 @@ async def replace_venue(venue_id: str, call: Call) -> Response:
             max_plans=call.settings.plans.max_venue_plans,
             expected=expected,
         )
-        return _written(call, record, created=False)
+        return _change_answer(call, record, created=False)
 
     return await call.upload(store)
 
@@ -216,7 +216,7 @@ async def change_venue(venue_id: str, call: Call) -> Response:
             max_plans=call.settings.plans.max_venue_plans,
             expected=expected,
         )
-        return _written(call, record, created=False)
+        return _change_answer(call, record, created=False)
 
     return await call.upload(store)
 
@@ -253,7 +253,7 @@ async def _add_levels(venue_id: str, call: ApiCall) -> Response:
             expected=expected,
         )
         _announce(plans, stored, call)
-        return _written(call, record, created=False)
+        return _change_answer(call, record, created=False)
 
     return await uploaded.store(call, idempotent.run, uploaded.parts, store)
 
@@ -303,10 +303,10 @@ def _removed(document: VenueChangeDocument) -> set[str]:
     return removed
 
 
-def _written(call: ApiCall, record: VenueRecord, *, created: bool) -> Response:
+def _change_answer(call: ApiCall, record: VenueRecord, *, created: bool) -> Response:
     call.log(venue=record.id, revision=record.revision_id)
     content, etag = _representation(record, call)
-    return call.written(content, etag, call.path_of("get_venue", venue_id=record.id), created=created)
+    return call.change_answer(content, etag, call.path_of("get_venue", venue_id=record.id), created=created)
 
 
 def _summary(record: VenueRecord) -> VenueSummary:
