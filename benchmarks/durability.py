@@ -20,7 +20,7 @@ from benchmarks.harness import argument_parser
 from examples.truth import PLAN_PATH
 from lalaloc_core.floorplan import FloorPlan
 from service.storage import Store
-from service.storage.records import GridKey, Original
+from service.storage.records import GridKey, NewPlan, Original
 
 _MODES = ("NORMAL", "FULL")
 _KINDS = ("plan", "lease")
@@ -37,7 +37,7 @@ def open_store(folder: Path, mode: str) -> Store:
 def write(store: Store, content: bytes, plan: FloorPlan) -> tuple[float, float]:
     """Store a plan and claim a lease; return the times (ms)."""
     begin_s = time.perf_counter()
-    stored = store.plans.add("t", uuid.uuid4().hex, plan, original=Original(content), limit=10**9)
+    stored = store.plans.add("t", uuid.uuid4().hex, NewPlan(plan, Original(content)), limit=10**9)
     between_s = time.perf_counter()
     key = GridKey(revision_id=stored.revision_id, model_sha256="m", step_m=0.5, camera_height_mm=1500)
     store.leases.claim(key, "owner", 60.0)

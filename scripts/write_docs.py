@@ -86,7 +86,7 @@ def folder_map() -> str:
 
 def metrics_table() -> str:
     """Return the service's metrics as a Markdown table, from the calls that create them."""
-    kinds = {"counter": "counter", "gauge": "gauge", "_gauge": "gauge", "Histogram": "histogram"}
+    kinds = {"counter": "counter", "gauge": "gauge", "_gauge": "gauge", "_histogram": "histogram"}
     kinds |= {"tenant_counter": "counter", "tenant_gauge": "gauge"}
     metrics = {}
     for path in sorted((ROOT / "service").rglob("*.py")):

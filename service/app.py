@@ -35,9 +35,10 @@ from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
 
 _DESCRIPTION = (
-    "Localises 360° panoramas in floor plans. Lengths are metres in the plan frame (x to the right, y up on the "
-    "drawing), headings are degrees clockwise from the plan's +y. Errors are `application/problem+json` (RFC 9457). "
-    "Every GET route also answers HEAD. Unknown form fields and query parameters are refused."
+    "Localises photographs in floor plans: 360° spheres and, by models with an encoder of views, ordinary, fisheye and "
+    "phone photographs. Lengths are metres in the plan frame (x to the right, y up on the drawing), headings are "
+    "degrees clockwise from the plan's +y. Errors are `application/problem+json` (RFC 9457). Every GET route also "
+    "answers HEAD. Unknown form fields and query parameters are refused."
 )
 
 

@@ -473,7 +473,7 @@ class DecoderNotReadyError(ServiceError):
     retry_after_s = 2
 
     def __init__(self) -> None:
-        super().__init__("no process for decoding panoramas is running yet")
+        super().__init__("no process for decoding photographs is running yet")
 
 
 class ConverterNotReadyError(ServiceError):

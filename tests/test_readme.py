@@ -22,8 +22,9 @@ from lalaloc_core.cli import main as lalaloc
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import read_annotation
 from scripts.write_docs import documents
-from service.schemas import GeoPose, ImportReport, LocaliseAnswer
+from service.schemas import GeoPose, LocaliseAnswer
 from service.schemas.oscp import OscpAnswer
+from service.schemas.plan_import import ImportReport
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/**/*.md"))

@@ -132,8 +132,8 @@ def _followed(
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
     from lalaloc_core.localise.tracking import TrackState
-    from lalaloc_core.localise.tracking.tracking_filter import track_steps
     from lalaloc_core.localise.tracking.tracked_plans import Ground
+    from lalaloc_core.localise.tracking.tracking_filter import track_steps
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
 
     model = LocalModel(Bundle.open(arguments.bundle))

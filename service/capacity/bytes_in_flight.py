@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
+from service.capacity.fair_share import Shares
 from service.errors import BytesInFlightError, UploadTooLargeError
 
 TENANT_SETTING, TOTAL_SETTING = "LALALOC_UPLOAD_TENANT_BYTES", "LALALOC_UPLOAD_TOTAL_BYTES"
@@ -14,7 +14,7 @@ _MAX_RATIO = 3
 _STEP_BYTES = 2**20
 
 
-class BytesInFlight:
+class BytesInFlight(Shares):
     """Bytes of request bodies in progress, from their heads to the end of their answers; for one event loop.
 
     Args:
@@ -23,48 +23,29 @@ class BytesInFlight:
     """
 
     def __init__(self, total_bytes: int, limit_of: Callable[[str], int]) -> None:
-        self._total_bytes = total_bytes
+        super().__init__(total_bytes)
         self._limit_of = limit_of
-        self._held: Counter[str] = Counter()
-        self.in_use = 0
 
     def limit_of(self, client: str) -> int:
         """Return the limit (bytes) of a client."""
-        return min(self._limit_of(client), self._total_bytes)
+        return min(self._limit_of(client), self.limit)
 
-    def held_by(self, client: str) -> int:
-        """Return the bytes that a client holds."""
-        return self._held[client]
-
-    def held(self) -> Mapping[str, int]:
-        """Return the bytes that each client holds."""
-        return dict(self._held)
-
-    def take(self, client: str, count: int) -> None:
+    def take(self, client: str, count: int = 1) -> None:
         """Take some bytes for a client.
 
         Raises:
             UploadTooLargeError: they exceed the client's limit even if it holds nothing else.
             BytesInFlightError: they exceed what the client can hold now.
         """
-        held, limit = self._held[client], self.limit_of(client)
+        held, limit = self.held_by(client), self.limit_of(client)
         if count > limit:
             raise UploadTooLargeError(TENANT_SETTING, limit, count)
         if held + count > limit:
             raise BytesInFlightError(count, held, limit, TENANT_SETTING)
-        left = self._total_bytes - self.in_use - count
+        left = self.limit - self.in_use - count
         if left < 0 or (held and held + count > _MAX_RATIO * left):
-            raise BytesInFlightError(count, self.in_use, self._total_bytes, TOTAL_SETTING)
-        self._held[client] += count
-        self.in_use += count
-
-    def give_back(self, client: str, count: int) -> None:
-        """Give bytes of a client back."""
-        self.in_use -= count
-        self._held[client] -= count
-        if not self._held[client]:
-            # Without this the counter would grow with every new client.
-            del self._held[client]
+            raise BytesInFlightError(count, self.in_use, self.limit, TOTAL_SETTING)
+        super().take(client, count)
 
 
 class BodyBudget:

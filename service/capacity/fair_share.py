@@ -52,6 +52,10 @@ class Shares:
         """Return the number of units that a client holds."""
         return self._held[client]
 
+    def held(self) -> dict[str, int]:
+        """Return the number of units that each client holds."""
+        return dict(self._held)
+
     def clients(self) -> Set[str]:
         """Return the clients that hold units."""
         return self._held.keys()
@@ -61,15 +65,15 @@ class Shares:
         held, left = self._held[client], self.limit - self.in_use - 1
         return left >= 0 and (held == 0 or held < _MAX_RATIO * left)
 
-    def take(self, client: str) -> None:
-        """Count one more unit for a client, without a check."""
-        self.in_use += 1
-        self._held[client] += 1
+    def take(self, client: str, count: int = 1) -> None:
+        """Count more units for a client, without a check."""
+        self.in_use += count
+        self._held[client] += count
 
-    def give_back(self, client: str) -> None:
-        """Count one unit less for a client."""
-        self.in_use -= 1
-        self._held[client] -= 1
+    def give_back(self, client: str, count: int = 1) -> None:
+        """Count fewer units for a client."""
+        self.in_use -= count
+        self._held[client] -= count
         if not self._held[client]:
             # Without this the counter would grow with every new client.
             del self._held[client]

@@ -16,10 +16,8 @@ from datetime import datetime, timedelta
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from service.capacity.cores import limit_arenas, usable_cores
-from service.cli.audit_commands import add_audit_commands
-from service.cli.backup_commands import add_backup_commands
 from service.cli.command_parts import audit, configured_store, duration, tenant_name, text_table
-from service.cli.tenant_commands import add_tenant_commands
+from service.cli.data_commands import add_audit_commands, add_backup_commands, add_tenant_commands
 from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret

@@ -15,6 +15,7 @@ from lalaloc_core.bundle import Manifest
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
+from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
     DecodeJob,
@@ -25,13 +26,6 @@ from service.decoding.decode_worker import (
     Result,
     ShowJob,
     run_decoder,
-)
-from service.errors import (
-    DeadlineExceededError,
-    DecoderNotReadyError,
-    DrawingFailedError,
-    OverloadedError,
-    StoppingError,
 )
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
@@ -158,10 +152,10 @@ class Decoder:
     def _error(self, lost: JobLostError, job: Job) -> Exception:
         """Return the service's error for a lost job."""
         if isinstance(job, RasteriseJob) and lost.reason in ("poisoned", "fault"):
-            return DrawingFailedError(lost.reason)
+            return errors.DrawingFailedError(lost.reason)
         if isinstance(job, RasteriseJob) and lost.reason == "stalled":
             # Drawings have a bounded size, so the machine is slow.
-            return DeadlineExceededError(self._settings.decode.stall_s)
+            return errors.DeadlineExceededError(self._settings.decode.stall_s)
         match lost.reason:
             case "poisoned":
                 return InvalidPhotographError("the photograph crashed the decoder twice: save it anew or smaller")
@@ -173,10 +167,10 @@ class Decoder:
             case "fault":
                 return InvalidPhotographError("the photograph is damaged: save it anew")
             case "queue-full":
-                return OverloadedError(_QUEUE)
+                return errors.OverloadedError(_QUEUE)
             case "not-ready":
-                return DecoderNotReadyError()
+                return errors.DecoderNotReadyError()
             case "closing":
-                return StoppingError()
+                return errors.StoppingError()
             case "deadline" | "died":
-                return DeadlineExceededError(self._settings.requests.request_deadline_s)
+                return errors.DeadlineExceededError(self._settings.requests.request_deadline_s)

@@ -20,7 +20,7 @@ from service.grids.builder import GridBuilder
 from service.grids.embedding import RENDERED, check_size, embed, embed_small
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
-from service.schemas import PlanStatus
+from service.schemas.stored_plans import PlanStatus
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes

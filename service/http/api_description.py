@@ -10,22 +10,16 @@ from fastapi.routing import APIRoute
 
 from service.capacity import admission_control as admission
 from service.http.problems import add_problems
-from service.schemas import (
-    EarthPoint,
-    FloorPlanDocument,
-    KeyDocument,
-    PlanEvent,
-    PlanPoint,
-    Problem,
-    RotationDocument,
-    SessionDocument,
-    StatedMotion,
-    TenantLimitsDocument,
-    VenueChangeDocument,
-    VenueDocument,
-)
+from service.schemas import EarthPoint, SessionDocument
+from service.schemas.admin import KeyDocument, RotationDocument, TenantLimitsDocument
+from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.oscp import OscpRequest
 from service.schemas.photographs import StatedIntrinsics
+from service.schemas.problem_details import Problem
+from service.schemas.query_fields import PlanPoint
+from service.schemas.sequence import StatedMotion
+from service.schemas.stored_plans import PlanEvent
+from service.schemas.venues import VenueChangeDocument, VenueDocument
 from service.security import access_control
 from service.security.permissions import NEEDED
 

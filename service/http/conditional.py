@@ -18,7 +18,7 @@ from starlette.responses import Response
 
 from lalaloc_core import __version__
 from service.errors import InvalidRequestError, RevisionMismatchError
-from service.http.parts import Part, Parts, PartsResponse
+from service.http.piecewise import Part, Parts, PartsResponse
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}

@@ -19,7 +19,7 @@ from service.capacity.admission_control import Admission
 from service.capacity.threads import BoundedReads
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider
-from service.schemas import PlanEvent
+from service.schemas.stored_plans import PlanEvent
 from service.storage import Store
 from service.telemetry import LOGGER_NAME
 
@@ -36,10 +36,6 @@ _FINAL = frozenset({"ready", "failed", "deleted"})
 _SERVICE = ""
 
 StillAuthorised = Callable[[], Awaitable[bool]]
-
-
-async def _always() -> bool:
-    return True
 
 
 class EventStream(StreamingResponse):
@@ -94,11 +90,11 @@ class PlanEvents:
         self._subscribers: set[_Subscriber] = set()
         self._watch: asyncio.Task[None] | None = None
 
-    def event_stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
+    def event_stream(self, plan_id: str, still_authorised: StillAuthorised) -> EventStream:
         """Return the stream of an existing plan; `still_authorised` is called at every heartbeat."""
         return EventStream(self.stream(plan_id, still_authorised), self._max_s)
 
-    async def stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> AsyncGenerator[bytes]:
+    async def stream(self, plan_id: str, still_authorised: StillAuthorised) -> AsyncGenerator[bytes]:
         """Yield encoded events until the plan reaches a final state, the timeout passes, or the service stops."""
         subscriber = _Subscriber(plan_id)
         self._subscribers.add(subscriber)

@@ -20,26 +20,20 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPhotographError, InvalidPoseError
+from service import errors
 from service.capacity.threads import BoundedReads
-from service.errors import (
-    IdempotencyInProgressError,
-    IdempotencyKeyReusedError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    StorageQuotaError,
-    StoreUnavailableError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
-)
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
 from service.pools import JobLostError
+from service.security.access_control import routed_path
 from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Claimed, Conflict, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MAX_KEY_CHARACTERS = 255
+# Characters of a method and path that keys belong to, enough for any id.
+_MAX_ROUTE = 64
 _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 # Errors of the request itself, which are kept. Others are not kept, whatever their status.
 _PERMANENT_ERRORS = (
@@ -47,10 +41,10 @@ _PERMANENT_ERRORS = (
     InvalidHintError,
     InvalidPhotographError,
     InvalidPoseError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
+    errors.InvalidRequestError,
+    errors.PlanTooLargeError,
+    errors.UnknownFloorPlanError,
+    errors.UnknownVenueError,
 )
 
 
@@ -60,17 +54,16 @@ class IdempotentRequest:
     Args:
         claims: stored keys.
         request: the request.
-        tenant: tenant of the request; keys of different tenants and routes are independent.
-        route: method and path of the route.
+        tenant: tenant of the request; keys of different tenants and paths are independent.
 
     Raises:
         InvalidRequestError: an invalid key.
     """
 
-    def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str, route: str) -> None:
+    def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str) -> None:
         self._claims = claims
         self._request = request
-        self._place = (tenant, route)
+        self._place = (tenant, f"{request.method} {routed_path(request.scope)}"[:_MAX_ROUTE])
         self._key = _key_of(request)
 
     def run(self, parts: Parts, work: Callable[[str], Response]) -> Response:
@@ -111,7 +104,7 @@ class IdempotentRequest:
             token = await reads.run(tenant, self._begin_for, waiting, parts)
         except BaseException:
             if (left := waiting.leave()) is not None:
-                with suppress(StoreUnavailableError):
+                with suppress(errors.StoreUnavailableError):
                     await reads.run(tenant, self._abandon, left)
             raise
         if isinstance(token, Response):
@@ -120,12 +113,12 @@ class IdempotentRequest:
             answer = await work()
         except BaseException as error:
             refusal = None
-            with suppress(StoreUnavailableError):
+            with suppress(errors.StoreUnavailableError):
                 refusal = await reads.run(tenant, self._fail, token, error)
             if refusal is None:
                 raise
             return refusal
-        with suppress(StoreUnavailableError):
+        with suppress(errors.StoreUnavailableError):
             await reads.run(tenant, self._keep, token, answer)
         return answer
 
@@ -139,9 +132,9 @@ class IdempotentRequest:
             case StoredAnswer():
                 return Response(claim.body, claim.status, {**claim.headers, REPLAYED: "true"})
             case Conflict():
-                raise IdempotencyKeyReusedError(self._key)
+                raise errors.IdempotencyKeyReusedError(self._key)
             case InProgress():
-                raise IdempotencyInProgressError(self._key)
+                raise errors.IdempotencyInProgressError(self._key)
 
     def _begin_for(self, waiting: _Waiting, parts: Parts) -> Response | str:
         begun = self._begin(parts)
@@ -156,10 +149,10 @@ class IdempotentRequest:
         try:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
             self._claims.finish(*self._place, self._key, token, kept)
-        except StorageQuotaError:
+        except errors.StorageQuotaError:
             # The next attempt executes the request again, under the same token.
             self._abandon(token)
-        except StoreUnavailableError:
+        except errors.StoreUnavailableError:
             # The work is done; after the lease, the next attempt finds it under the token.
             logging.getLogger(LOGGER_NAME).warning("the answer to an idempotent request was not kept")
         return answer
@@ -179,7 +172,7 @@ class IdempotentRequest:
             return
         try:
             self._claims.abandon(*self._place, self._key, token)
-        except StoreUnavailableError:
+        except errors.StoreUnavailableError:
             logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in progress for its lease")
 
 
@@ -224,5 +217,5 @@ def _key_of(request: Request) -> str | None:
         return None
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
         fault = f"is '{', '.join(values)[:100]}'; give one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
-        raise InvalidRequestError([(HEADER, fault)])
+        raise errors.InvalidRequestError([(HEADER, fault)])
     return values[0]

@@ -20,7 +20,7 @@ from service.errors import (
 )
 from service.http.fields import describe_fault
 from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind, problem_kind
-from service.schemas import Fault, Problem
+from service.schemas.problem_details import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed
 from service.telemetry import add_log_fields, request_id_of
@@ -65,13 +65,14 @@ def add_problems(operation: dict[str, Any], *errors: type[Exception]) -> None:
 def problem_document(request: Request, error: Exception) -> Problem:
     """Return the problem document of an error, and note its kind for the request's log line."""
     kind = problem_kind(error)
+    faults = error.faults if isinstance(error, InvalidRequestError) else None
     return _document(
         request,
         kind,
         str(error) if kind.public else _HIDDEN,
         room=error.room if isinstance(error, InvalidFloorPlanError) else None,
         levels=list(error.levels) if isinstance(error, SeveralLevelsError) else None,
-        faults=error.faults if isinstance(error, InvalidRequestError) else None,
+        errors=faults and [Fault(field=field, message=message) for field, message in faults],
     )
 
 
@@ -110,15 +111,7 @@ def _on_unexpected_error(request: Request, _error: Exception) -> JSONResponse:
     return _answer(_document(request, INTERNAL, _HIDDEN))
 
 
-def _document(
-    request: Request,
-    kind: ProblemKind,
-    detail: str,
-    *,
-    room: str | None = None,
-    levels: list[str] | None = None,
-    faults: list[tuple[str, str]] | None = None,
-) -> Problem:
+def _document(request: Request, kind: ProblemKind, detail: str, **further: Any) -> Problem:
     if kind is not INTERNAL:
         add_log_fields(request, rejection=kind.slug)
     return Problem(
@@ -127,9 +120,7 @@ def _document(
         status=kind.status,
         detail=detail,
         request_id=request_id_of(request.scope),
-        room=room,
-        levels=levels,
-        errors=None if faults is None else [Fault(field=field, message=message) for field, message in faults],
+        **further,
     )
 
 

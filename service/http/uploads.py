@@ -20,15 +20,7 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect
 
-from service.errors import (
-    InvalidRequestError,
-    MalformedRequestError,
-    SpoolFullError,
-    UnsupportedEncodingError,
-    UnsupportedMediaError,
-    UploadTimeoutError,
-    UploadTooLargeError,
-)
+from service import errors
 from service.http.fields import describe_fault
 from service.http.request_end import on_request_end
 from service.settings import Settings
@@ -124,11 +116,11 @@ def media_type(request: Request, accepted: tuple[str, ...]) -> str:
     """
     for encoding in request.headers.getlist("content-encoding"):
         if encoding.strip().lower() not in ("", "identity"):
-            raise UnsupportedEncodingError(encoding)
+            raise errors.UnsupportedEncodingError(encoding)
     stated = request.headers.get("content-type", "")
     media = stated.partition(";")[0].strip().lower()
     if media not in accepted:
-        raise UnsupportedMediaError(stated, accepted)
+        raise errors.UnsupportedMediaError(stated, accepted)
     return media
 
 
@@ -180,7 +172,7 @@ async def read_parts(
     stated = request.headers.get("content-type", "")
     charset = parse_options_header(stated)[1].get(b"charset", _UTF_8)
     if charset.lower() != _UTF_8:
-        raise UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
+        raise errors.UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
     parser = MultiPartParser(
         request.headers,
         _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES),
@@ -197,10 +189,10 @@ async def read_parts(
     except MultiPartException as error:
         if repeated and error.message.startswith(_TOO_MANY_FILES):
             faults = [(name, repeats.fault(f"more than {repeats.most}")) for name, repeats in repeated.items()]
-            raise InvalidRequestError(faults) from error
-        raise MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
+            raise errors.InvalidRequestError(faults) from error
+        raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
     except FormParserError as error:
-        raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
+        raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     uploaded = {id(value): _kept(request, value) for _, value in form.multi_items() if isinstance(value, UploadFile)}
     items = [
         (aliases.get(name, name), value if isinstance(value, str) else uploaded[id(value)])
@@ -218,7 +210,7 @@ def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapp
     try:
         return model.model_validate({name: value for name, value in fields.items() if value.strip()}, context=context)
     except ValidationError as error:
-        raise InvalidRequestError([describe_fault(fault) for fault in error.errors()]) from error
+        raise errors.InvalidRequestError([describe_fault(fault) for fault in error.errors()]) from error
 
 
 def faults_of(
@@ -227,7 +219,7 @@ def faults_of(
     """Return the faults for which `validate_fields` would raise."""
     try:
         validate_fields(model, fields, context)
-    except InvalidRequestError as error:
+    except errors.InvalidRequestError as error:
         return error.faults
     return []
 
@@ -264,7 +256,7 @@ def _sort(
                 found.fields[name] = value
         elif isinstance(value, UploadedFile):
             if len(value) > limits.max_bytes:
-                raise UploadTooLargeError(limits.name, limits.max_bytes, len(value))
+                raise errors.UploadTooLargeError(limits.name, limits.max_bytes, len(value))
             found.files[name] = value
         else:
             faults.append((label, "must be a file (a part with a file name)"))
@@ -280,7 +272,7 @@ def _sort(
             faults.append((name, repeats.fault(str(counts[name]))))
     faults.extend(check(found.fields))
     if faults:
-        raise InvalidRequestError(faults)
+        raise errors.InvalidRequestError(faults)
     return found
 
 
@@ -308,7 +300,7 @@ def _spooling(limits: UploadLimits) -> Iterator[None]:
     except TimeoutError:
         raise
     except OSError as error:
-        raise SpoolFullError(limits.memory_bytes) from error
+        raise errors.SpoolFullError(limits.memory_bytes) from error
 
 
 async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:
@@ -317,7 +309,7 @@ async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: in
     stated = request.headers.get("content-length", "")
     # Refuse before reading if the stated length is too large.
     if stated.isdecimal() and int(stated) > max_bytes:
-        raise UploadTooLargeError(limits.name, limits.max_bytes, int(stated))
+        raise errors.UploadTooLargeError(limits.name, limits.max_bytes, int(stated))
     received, begin = 0, monotonic()
     chunks = request.stream()
     while True:
@@ -327,7 +319,7 @@ async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: in
             return
         received += len(chunk)
         if received > max_bytes:
-            raise UploadTooLargeError(limits.name, limits.max_bytes)
+            raise errors.UploadTooLargeError(limits.name, limits.max_bytes)
         yield chunk
 
 
@@ -337,12 +329,12 @@ async def _next_chunk(chunks: AsyncGenerator[bytes, None], patience_s: float, li
         async with asyncio.timeout(max(patience_s, 0.0)):
             return await anext(chunks, None)
     except TimeoutError as error:
-        raise UploadTimeoutError(
+        raise errors.UploadTimeoutError(
             f"the upload stopped for {limits.idle_s:g} s (upload_idle_s), or lagged that far behind "
             f"{limits.bytes_per_s:g} bytes/s (upload_bytes_per_s)"
         ) from error
     except ClientDisconnect as error:
-        raise MalformedRequestError("the connection was closed before the whole body arrived") from error
+        raise errors.MalformedRequestError("the connection was closed before the whole body arrived") from error
 
 
 @asynccontextmanager
@@ -351,4 +343,6 @@ async def _in_time(limits: UploadLimits) -> AsyncGenerator[None, None]:
         async with asyncio.timeout(limits.deadline_s):
             yield
     except TimeoutError as error:
-        raise UploadTimeoutError(f"the upload took longer than {limits.deadline_s:g} s (upload_deadline_s)") from error
+        raise errors.UploadTimeoutError(
+            f"the upload took longer than {limits.deadline_s:g} s (upload_deadline_s)"
+        ) from error

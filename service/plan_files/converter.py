@@ -29,7 +29,7 @@ from service.plan_files.convert_worker import (
 )
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
-from service.stored_plan import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob
+from service.stored_plan import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
 
 _Pool = WorkerPool[ConversionJob, ConversionResult]
@@ -100,15 +100,9 @@ class Converter:
             ConverterNotReadyError: no worker is running.
             StoppingError: the service is shutting down.
         """
-        limit_s = self._settings.plans.import_deadline_s
+        job = ImportJob(content, options, self._settings.grids.grid_step_m, every_level, building)
         try:
-            job = ImportJob(content, options, self._settings.grids.grid_step_m, every_level, building)
-            future = self._running_pool().submit(job, limit_s, client)
-            done, _ = wait([future], limit_s)
-            if not done:
-                future.cancel()
-                raise JobLostError("deadline")
-            result = future.result()
+            result = self._run(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
             self._raise_lost(error)
         if isinstance(result, ConversionRefusal):
@@ -121,12 +115,7 @@ class Converter:
         if len(document.document) <= LARGE:
             return document.plan()
         try:
-            future = self._running_pool().submit(ParseJob(document), _PARSE_S)
-            done, _ = wait([future], _PARSE_S)
-            if not done:
-                future.cancel()
-                raise JobLostError("deadline")
-            result = future.result()
+            result = self._run(ParseJob(document), _PARSE_S)
         except JobLostError:
             return document.plan()
         return result.plan() if isinstance(result, PackedPlan) else None
@@ -144,38 +133,28 @@ class Converter:
         except JobLostError as error:
             self._raise_lost(error)
 
-    async def prediction(self, begun: Future[ConversionResult]) -> Rendition:
-        """Wait for a prediction, or a map of it, of `begin_rendition`.
-
-        Raises:
-            DamagedDataError: the stored plan is damaged.
-            DeadlineExceededError: the prediction did not finish.
-            ConverterNotReadyError, StoppingError: see `read`.
-        """
-        try:
-            result = await asyncio.wrap_future(begun)
-        except JobLostError as error:
-            if error.reason not in ("not-ready", "closing"):
-                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
-            self._raise_lost(error)
-        return _made(result)
-
-    async def rendition(self, begun: Future[ConversionResult]) -> Rendition:
+    async def rendition(self, begun: Future[ConversionResult], kind: RenditionKind) -> Rendition:
         """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
 
         Raises:
             InvalidFloorPlanError: the plan lacks something that the format requires.
             DamagedDataError: the stored plan is damaged.
-            MissingExtraError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `read`.
+            DeadlineExceededError: the file was not made in time.
+            MissingExtraError, ConverterNotReadyError, StoppingError: see `read`.
         """
+        predicts = kind in PREDICTIONS
         try:
-            async with asyncio.timeout(self._settings.plans.import_deadline_s):
+            async with asyncio.timeout(None if predicts else self._settings.plans.import_deadline_s):
                 result = await asyncio.wrap_future(begun)
-        except TimeoutError:
-            self._raise_lost(JobLostError("deadline"))
-        except JobLostError as error:
-            self._raise_lost(error)
-        return _made(result)
+        except (TimeoutError, JobLostError) as error:
+            lost = error if isinstance(error, JobLostError) else JobLostError("deadline")
+            if predicts and lost.reason not in ("not-ready", "closing"):
+                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
+            self._raise_lost(lost)
+        if isinstance(result, ConversionRefusal):
+            raise result.error()
+        assert isinstance(result, Rendition)
+        return result
 
     def close(self) -> None:
         """Stop all workers and wait for them."""
@@ -184,6 +163,19 @@ class Converter:
         for pool in (self._pool, self._predicting):
             if pool is not None:
                 pool.close()
+
+    def _run(self, job: ConversionJob, limit_s: float, client: str = "") -> ConversionResult:
+        """Run a job of the imports, and wait for it.
+
+        Raises:
+            JobLostError: there is no result in time.
+        """
+        future = self._running_pool().submit(job, limit_s, client)
+        done, _ = wait([future], limit_s)
+        if not done:
+            future.cancel()
+            raise JobLostError("deadline")
+        return future.result()
 
     def _running_pool(self, *, predicts: bool = False) -> _Pool:
         """Return the pool of imports or predictions; the first call starts it."""
@@ -245,11 +237,3 @@ class Converter:
                 raise DeadlineExceededError(
                     settings.plans.import_deadline_s, "the plan file was not read or written"
                 ) from error
-
-
-def _made(result: ConversionResult) -> Rendition:
-    """Return the file; raise the error of a refusal."""
-    if isinstance(result, ConversionRefusal):
-        raise result.error()
-    assert isinstance(result, Rendition)
-    return result

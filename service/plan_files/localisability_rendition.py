@@ -9,7 +9,8 @@ from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.localisability.localisability_report import report_of
 from lalaloc_core.localise.localisability.predicted_localisability import localisability
-from service.schemas import LocalisabilityAnswer, ModelAnswer
+from service.schemas import ModelAnswer
+from service.schemas.localisability import LocalisabilityAnswer
 from service.stored_plan import RenditionJob
 
 

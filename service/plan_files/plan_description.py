@@ -10,8 +10,16 @@ from typing import Literal
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.sampling import grid_size
-from service.schemas import BoundsAnswer, GridAnswer, ImportReport, RoomAnswer
-from service.schemas.stored_plans import PlanContentAnswer, PlanHeadAnswer, PlanStateAnswer, PlanStatus
+from service.schemas.plan_import import ImportReport
+from service.schemas.stored_plans import (
+    BoundsAnswer,
+    GridAnswer,
+    PlanContentAnswer,
+    PlanHeadAnswer,
+    PlanStateAnswer,
+    PlanStatus,
+    RoomAnswer,
+)
 from service.stored_plan import PlanHead, Rendition
 
 

@@ -60,95 +60,72 @@ def _seems_native(content: bytes) -> bool:
     return is_small and is_json(content) and describe_file(content) is None
 
 
-def convert(
-    content: bytes,
-    options: ImportOptions,
-    name: str | None,
-    converter: Converter,
-    settings: Settings,
-    client: str,
-    permits: FairSemaphore,
-) -> PlanFile:
-    """Convert an uploaded file to its only plan. Blocks.
+@dataclass(frozen=True)
+class PlanReader:
+    """Reader of uploaded plan files; its calls block.
 
-    Args:
-        content: the file.
-        options: options of the import.
-        name: name for a plan that has none.
+    Attributes:
         converter: workers for files that are not in the native format.
         settings: the settings.
-        client: client of the upload.
         permits: permits to compute in this process.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid or exceeds a limit.
-        SeveralLevelsError: the file has several storeys and no `level` is set.
-        MissingExtraError: a library of its format is not installed.
-        OverloadedError: the queue of the workers is full.
-        DeadlineExceededError: the import did not finish in time.
-        ConverterNotReadyError: no worker is running.
-        StoppingError: the service is shutting down.
     """
-    if (native := _convert_native(content, options, name, settings, client, permits)) is not None:
-        return native
-    (imported,) = converter.read(content, options, client, building=name)
-    return _plan_file(imported, client, permits)
 
+    converter: Converter
+    settings: Settings
+    permits: FairSemaphore
 
-def convert_levels(
-    content: bytes,
-    options: ImportOptions,
-    building: str,
-    converter: Converter,
-    settings: Settings,
-    client: str,
-    permits: FairSemaphore,
-) -> list[PlanFile]:
-    """Convert an uploaded file to the plans of its levels, lowest first. Blocks.
+    def read(self, content: bytes, options: ImportOptions, name: str | None, client: str) -> PlanFile:
+        """Return the only plan of a client's file; `name` is for a plan that has none.
 
-    Args:
-        content: the file.
-        options: options of the import.
-        building: name for plans that have none, and for those of several levels, unless the options have one.
-        converter: as for `convert`; so are the other arguments.
-        settings: the settings.
-        client: client of the upload.
-        permits: permits to compute in this process.
+        Raises:
+            InvalidFloorPlanError: the file is invalid or exceeds a limit.
+            SeveralLevelsError: the file has several storeys and no `level` is set.
+            MissingExtraError: a library of its format is not installed.
+            OverloadedError: the queue of the workers is full.
+            DeadlineExceededError: the import did not finish in time.
+            ConverterNotReadyError: no worker is running.
+            StoppingError: the service is shutting down.
+        """
+        if (native := self._read_native(content, options, name, client)) is not None:
+            return native
+        (imported,) = self.converter.read(content, options, client, building=name)
+        return self._plan_file(imported, client)
 
-    Raises:
-        InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
-        MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see `convert`.
-    """
-    if (native := _convert_native(content, options, building, settings, client, permits)) is not None:
-        return [native]
-    levels = converter.read(content, options, client, every_level=True, building=building)
-    return [_plan_file(imported, client, permits) for imported in levels]
+    def read_levels(self, content: bytes, options: ImportOptions, building: str, client: str) -> list[PlanFile]:
+        """Return the plans of the levels of a client's file, lowest first.
 
+        `building` is the name for plans that have none, and for those of several levels, unless the options have one.
 
-def _convert_native(
-    content: bytes,
-    options: ImportOptions,
-    name: str | None,
-    settings: Settings,
-    client: str,
-    permits: FairSemaphore,
-) -> PlanFile | None:
-    """Convert a small native plan; None leaves other files, of formats that are supported, to the workers."""
-    if not content.strip():
-        raise InvalidFloorPlanError("the body is empty; send a plan file")
-    limits = settings.plans.import_limits
-    if _seems_native(content):
-        with permits.hold(client):
-            imported = import_if_native(content, options, limits, building=name)
-            if imported is not None:
-                return PlanFile(imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native"))
-    elif not is_json(content):
-        # Reject unsupported formats before they take a worker.
-        detect_format(content, limits)
-    return None
+        Raises:
+            InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
+            MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see
+                `read`.
+        """
+        if (native := self._read_native(content, options, building, client)) is not None:
+            return [native]
+        levels = self.converter.read(content, options, client, every_level=True, building=building)
+        return [self._plan_file(imported, client) for imported in levels]
 
+    def _read_native(self, content: bytes, options: ImportOptions, name: str | None, client: str) -> PlanFile | None:
+        """Read a small native plan; None leaves other files, of formats that are supported, to the workers."""
+        if not content.strip():
+            raise InvalidFloorPlanError("the body is empty; send a plan file")
+        limits = self.settings.plans.import_limits
+        if _seems_native(content):
+            with self.permits.hold(client):
+                imported = import_if_native(content, options, limits, building=name)
+                if imported is not None:
+                    return PlanFile(
+                        imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native")
+                    )
+        elif not is_json(content):
+            # Reject unsupported formats before they take a worker.
+            detect_format(content, limits)
+        return None
 
-def _plan_file(imported: Imported, client: str, permits: FairSemaphore) -> PlanFile:
-    with permits.hold(client):
-        plan = imported.plan.plan()
-    return PlanFile(plan, imported.report, imported.media_type, imported.level, imported.document, imported.description)
+    def _plan_file(self, imported: Imported, client: str) -> PlanFile:
+        with self.permits.hold(client):
+            plan = imported.plan.plan()
+        return PlanFile(
+            plan, imported.report, imported.media_type, imported.level, imported.document, imported.description
+        )

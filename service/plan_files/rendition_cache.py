@@ -159,8 +159,7 @@ class RenditionCache:
         if isinstance(begun, Rendition):
             return begun
         job.in_worker = begun
-        wait = self._converter.prediction if key[1] in PREDICTIONS else self._converter.rendition
-        return await wait(begun)
+        return await self._converter.rendition(begun, key[1])
 
     def _check_model(self) -> None:
         try:

@@ -12,7 +12,7 @@ from lalaloc_core.importers import ExportFormat, export_plan
 from service.errors import DamagedDataError
 from service.plan_files.plan_description import describe
 from service.plan_files.plan_mesh import plan_glb
-from service.schemas import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
+from service.schemas.stored_plans import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.stored_plan import Rendition, RenditionJob
 
 

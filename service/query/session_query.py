@@ -19,10 +19,10 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import KnownHeading
 from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
-from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
-from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from lalaloc_core.localise.tracking.passages import PlanOnLevel
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.query.executor import Executor

@@ -1,24 +1,21 @@
 """HTTP routes, one router per module.
 
-Begin with `localise.py`, the query. `dependencies.py` has the dependencies and look-ups that routes share,
-`plan_answers.py` turns stored plans into answers.
+Begin with `localise.py`, the query. `dependencies.py` has the request as routes take it, with the running service, the
+caller and look-ups; `descriptions.py` has the errors, headers and bodies that the API description repeats.
 """
 
 from service.routes import (
     admin,
     floorplans,
-    geopose,
-    health,
     kept_answers,
-    limits,
     localise,
     localise_batch,
     localise_sequence,
     model_files,
+    oscp,
     pages,
-    plan_events,
     plan_files,
-    plan_layout,
+    service_state,
     session_stream,
     sessions,
     venues,
@@ -30,19 +27,16 @@ ROUTERS = tuple(
     for module in (
         floorplans,
         plan_files,
-        plan_layout,
-        plan_events,
         venues,
         localise,
         localise_batch,
         localise_sequence,
         sessions,
         session_stream,
-        geopose,
+        oscp,
         model_files,
         kept_answers,
-        health,
-        limits,
+        service_state,
         admin,
         pages,
     )

@@ -1,110 +1,239 @@
-"""Dependencies of routes: the running service, the tenant, and the plan or venue in the path."""
+"""Dependencies of routes: the request with the running service and its caller, and the page of a list."""
 
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from typing import Annotated, Any, ParamSpec, TypeVar
 
-from fastapi import Depends, Request
+from fastapi import Depends, Query, Request, Response, status
 
-from service.errors import UnknownFloorPlanError, UnknownRevisionError, UnknownVenueError
-from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
+from service.errors import InvalidRequestError, UnknownFloorPlanError, UnknownRevisionError, UnknownVenueError
+from service.http import IdempotentRequest
+from service.http.conditional import expected_revision
+from service.http.cursors import cursor_text, parse_cursor
+from service.http.idempotent_request import HEADER
+from service.http.uploads import JSON, UploadLimits, media_type, read_body
 from service.runtime import Runtime, get_runtime
 from service.security import caller_of
-from service.storage.plans import Plans
-from service.storage.records import PlanRecord, PlanSummary, VenueRecord
+from service.settings import Settings
+from service.storage import Store
+from service.storage.records import Cursor, PlanRecord, PlanSummary, VenueRecord
+from service.stored_plan import Rendition, RenditionKind
+from service.telemetry import add_log_fields
+from service.uploaded_file import UploadedFile
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _ID = re.compile(r"[0-9a-f]{32}")
-
-
-async def _tenant_of(request: Request) -> str:
-    return caller_of(request.scope).tenant
-
-
-async def _client_of(request: Request) -> str:
-    return caller_of(request.scope).client
-
+_MAX_LISTED = 500
 
 Running = Annotated[Runtime, Depends(get_runtime)]
-Tenant = Annotated[str, Depends(_tenant_of)]
-# Tenant or client address that the request's share of slots counts for; see `service.capacity.fair_share`.
-Client = Annotated[str, Depends(_client_of)]
+Name = Annotated[
+    str | None,
+    Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$", description="Part of the name; case is ignored."),
+]
+Revision = Annotated[str | None, Query(description="Id of an older revision.")]
+Limit = Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")]
+After = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
 
 
-def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
-    """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted.
+@dataclass(frozen=True)
+class ApiCall:
+    """Request with the running service and its caller.
 
-    Raises:
-        UnknownFloorPlanError: no such plan.
-        StoreUnavailableError: the database is away.
+    Attributes:
+        request: the request.
+        runtime: the running service.
+        tenant: tenant whose data the caller can see.
+        client: tenant or client address that the request's share of slots counts for; see
+            `service.capacity.fair_share`.
     """
-    summary = plans.summary(tenant, floorplan_id) if is_id(floorplan_id) else None
-    if summary is None:
-        raise UnknownFloorPlanError(floorplan_id)
-    return summary
+
+    request: Request
+    runtime: Runtime
+    tenant: str
+    client: str
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the service."""
+        return self.runtime.settings
+
+    @property
+    def store(self) -> Store:
+        """Stored data."""
+        return self.runtime.store
+
+    def log(self, **fields: Any) -> None:
+        """Set fields of the request's log line; see `add_log_fields`."""
+        add_log_fields(self.request, **fields)
+
+    def idempotent(self, media: str = JSON) -> IdempotentRequest:
+        """Return the request with its idempotency key, if it has one.
+
+        Args:
+            media: media type of the answer.
+
+        Raises:
+            InvalidRequestError: an invalid key, or one for an answer that is not JSON.
+        """
+        if media != JSON and HEADER in self.request.headers:
+            raise InvalidRequestError([(HEADER, "works for answers in application/json only")])
+        return IdempotentRequest(self.store.idempotency_keys, self.request, self.tenant)
+
+    async def read_json(self) -> UploadedFile:
+        """Read a body in JSON.
+
+        Raises:
+            UnsupportedMediaError: another media type.
+            UploadTooLargeError, UploadTimeoutError, BytesInFlightError: see `read_body`.
+        """
+        media_type(self.request, (JSON,))
+        return await read_body(self.request, UploadLimits.of(self.settings, "max_venue_bytes"))
+
+    async def upload(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run work on what was uploaded, on a thread; see `Threads.run`."""
+        return await self.runtime.uploads.run(self.client, work, *args, **kwargs)
+
+    async def read(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Read the store on a thread with a timeout; see `BoundedReads.run`."""
+        return await self.runtime.reads.run(self.tenant, work, *args, **kwargs)
+
+    def reading(self) -> AbstractAsyncContextManager[None]:
+        """Return a block that holds a permit to read, for answers that are read part by part."""
+        return self.runtime.admission.reading.held(self.client)
+
+    def plan(self, floorplan_id: str) -> PlanSummary:
+        """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks.
+
+        Raises:
+            UnknownFloorPlanError: no such plan.
+            StoreUnavailableError: the database is away.
+        """
+        summary = self.store.plans.summary(self.tenant, floorplan_id) if is_id(floorplan_id) else None
+        if summary is None:
+            raise UnknownFloorPlanError(floorplan_id)
+        self.log(plan=summary.id, revision=summary.revision_id)
+        return summary
+
+    def plan_at_revision(self, floorplan_id: str, revision_id: str | None) -> tuple[PlanSummary, bool]:
+        """Return a stored plan at one of its revisions, and True for an old one; None names the current one. Blocks.
+
+        Raises:
+            UnknownFloorPlanError: no such plan.
+            UnknownRevisionError: no such revision is kept.
+            StoreUnavailableError: the database is away.
+        """
+        current = self.plan(floorplan_id)
+        if revision_id is None or revision_id == current.revision_id:
+            return current, False
+        found = self.store.plans.summary(self.tenant, current.id, revision_id) if is_id(revision_id) else None
+        if found is None:
+            raise UnknownRevisionError(current.id, revision_id)
+        self.log(revision=found.revision_id)
+        return found, True
+
+    async def rendition(self, plan: PlanSummary | PlanRecord, kind: RenditionKind) -> Rendition:
+        """Return a file made from a stored plan; see `RenditionCache.get`."""
+        return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
+
+    def venue(self, venue_id: str) -> VenueRecord:
+        """Return a stored venue. Blocks.
+
+        Raises:
+            UnknownVenueError: no such venue.
+            StoreUnavailableError: the database is away.
+        """
+        record = self.store.venues.get(self.tenant, venue_id) if is_id(venue_id) else None
+        if record is None:
+            raise UnknownVenueError(venue_id)
+        return record
+
+    def expected_revision(self, stored: PlanSummary | VenueRecord) -> str | None:
+        """Return the revision that a change needs, by the request's preconditions; see `expected_revision`.
+
+        Raises:
+            RevisionMismatchError: the plan or venue has another one.
+        """
+        what = "venue" if isinstance(stored, VenueRecord) else "floor plan"
+        return expected_revision(self.request, stored.id, stored.revision_id, what=what)
+
+    async def place(self, floorplan_id: str | None, venue_id: str | None) -> PlanRecord | VenueRecord:
+        """Return the plan or venue of a query; a plan from memory while the database is away.
+
+        Raises:
+            UnknownFloorPlanError, UnknownVenueError: no such plan or venue.
+            StoreUnavailableError: the database is away and the plan is not in memory, or the database is busy.
+        """
+        if venue_id is not None:
+            if not is_id(venue_id):
+                raise UnknownVenueError(venue_id)
+            venue = await self.read(self.venue, venue_id)
+            self.log(venue=venue.id)
+            return venue
+        assert floorplan_id is not None
+        lookup, reads = self.runtime.plan_lookup, self.runtime.reads
+        record = await lookup.find(self.tenant, floorplan_id, reads) if is_id(floorplan_id) else None
+        if record is None:
+            raise UnknownFloorPlanError(floorplan_id)
+        self.log(plan=record.id, revision=record.revision_id)
+        return record
+
+    def path_of(self, route: str, **ids: str) -> str:
+        """Return the path of a route, by the name of its function."""
+        return str(self.request.app.url_path_for(route, **ids))
+
+    def change_answer(self, content: bytes, etag: str, path: str, *, created: bool) -> Response:
+        """Return the representation of a plan or venue that was created or changed; `etag` is also that of a GET."""
+        headers = {"Content-Location": path, "ETag": etag} | ({"Location": path} if created else {})
+        return Response(content, status.HTTP_201_CREATED if created else status.HTTP_200_OK, headers, JSON)
 
 
-def plan_at_revision(tenant: str, current: PlanSummary, revision_id: str | None, plans: Plans) -> PlanSummary:
-    """Return a stored plan at one of its revisions; None names the current one.
-
-    Raises:
-        UnknownRevisionError: no such revision is kept.
-        StoreUnavailableError: the database is away.
-    """
-    if revision_id is None or revision_id == current.revision_id:
-        return current
-    found = plans.summary(tenant, current.id, revision_id) if is_id(revision_id) else None
-    if found is None:
-        raise UnknownRevisionError(current.id, revision_id)
-    return found
+async def _call_of(request: Request, runtime: Running) -> ApiCall:
+    caller = caller_of(request.scope)
+    return ApiCall(request, runtime, caller.tenant, caller.client)
 
 
-async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:
-    """Return a plan for a query: from the database, or from memory while the database is away.
-
-    Raises:
-        UnknownFloorPlanError: no such plan.
-        StoreUnavailableError: the database is away and the plan is not in memory, or the database is busy.
-    """
-    record = await runtime.plan_lookup.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
-    if record is None:
-        raise UnknownFloorPlanError(floorplan_id)
-    return record
+Call = Annotated[ApiCall, Depends(_call_of)]
 
 
-async def venue_for_query(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
-    """Return a venue for a query.
+class _Page:
+    """Page of a list that a request asks for."""
 
-    Raises:
-        UnknownVenueError: no such venue.
-        StoreUnavailableError: the database is away or busy.
-    """
-    record = await runtime.reads.run(tenant, runtime.store.venues.get, tenant, venue_id) if is_id(venue_id) else None
-    if record is None:
-        raise UnknownVenueError(venue_id)
-    return record
+    def __init__(self, limit: Limit = 100, cursor: After = None) -> None:
+        self._limit = limit
+        self._cursor = cursor
+
+    def read(
+        self,
+        find: Callable[..., list[T]],
+        position_of: Callable[[Any], Any] = lambda row: Cursor(row.created_at, row.id),
+        parse: Callable[[str], Any] = parse_cursor,
+    ) -> tuple[list[T], str | None]:
+        """Return the items of the page, and the cursor of the next one; None on the last page.
+
+        Args:
+            find: returns at most `limit` items after the position `after`.
+            position_of: returns the position of an item.
+            parse: returns the position of a cursor.
+
+        Raises:
+            InvalidRequestError: an invalid cursor.
+        """
+        after = None if self._cursor is None else parse(self._cursor)
+        # One extra item shows that there is another page.
+        found = find(limit=self._limit + 1, after=after)
+        page = found[: self._limit]
+        return page, cursor_text(position_of(page[-1])) if len(found) > self._limit else None
+
+
+Page = Annotated[_Page, Depends()]
 
 
 def is_id(text: str) -> bool:
     """Return True for 32 hexadecimal digits; other texts are never looked up in the database."""
     return _ID.fullmatch(text) is not None
-
-
-def header(name: str, description: str) -> dict[str, Any]:
-    """Describe an optional request header for the API description."""
-    return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
-
-
-IDEMPOTENCY_KEY = header(
-    HEADER,
-    f"1 to {MAX_KEY_CHARACTERS} visible ASCII characters. A second request with the same key and content within 24 "
-    "hours is not executed again; it gets the first answer with `Idempotency-Replayed: true`.",
-)
-IF_NONE_MATCH = header("If-None-Match", "Entity tags that the client has, or `*`; if one matches, the answer is 304.")
-NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has this representation already."}}
-UNLESS_CHANGED = [
-    header("If-Match", "Entity tags of the expected revision, or `*`; 412 if none matches."),
-    header("If-None-Match", "Entity tags of revisions; 412 if one matches."),
-]
-# Pattern of filters by name.
-NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"

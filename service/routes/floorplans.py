@@ -2,52 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import astuple
+from functools import partial
 
-from fastapi import APIRouter, Query, Request, Response, status
+from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
 
-from lalaloc_core.importers import building_name
-from service.errors import (
-    IdempotencyInProgressError,
-    IdempotencyKeyReusedError,
-    InvalidRequestError,
-    RevisionMismatchError,
-    StoreUnavailableError,
-    TooManyFloorPlansError,
-    UnknownFloorPlanError,
-    UnknownRevisionError,
-)
+from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.grids import GridState
-from service.http import IdempotentRequest
-from service.http.conditional import expected_revision, not_modified, tagged_answer
-from service.http.cursors import cursor_text, parse_cursor
+from service.http.conditional import not_modified, revision_etag, tagged_answer
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.plan_files.plan_description import describe, with_head
-from service.plan_files.plan_file import PlanFile, convert
-from service.routes.dependencies import (
+from service.plan_files.plan_description import describe, state_of_description, with_head
+from service.plan_files.plan_file import PlanFile
+from service.routes.dependencies import ApiCall, Call, Name, Page, Revision
+from service.routes.descriptions import (
+    CONDITIONAL,
+    IDEMPOTENCY_ERRORS,
     IDEMPOTENCY_KEY,
-    IF_NONE_MATCH,
-    NO_CONTROLS,
-    NOT_MODIFIED,
+    READ_ERRORS,
+    REVISION_RESPONSES,
     UNLESS_CHANGED,
-    Client,
-    Running,
-    Tenant,
-    plan_at_revision,
-    plan_summary,
+    UPLOAD_ERRORS,
 )
-from service.routes.plan_answers import description_etag, description_parts, list_entries
-from service.routes.plan_uploads import REFUSED_UPLOADS, UPLOAD_BODY, PlanUpload, read_upload
-from service.runtime import Runtime
-from service.schemas import FloorPlanAnswer, FloorPlanList
-from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
-from service.telemetry import add_log_fields
+from service.routes.plan_uploads import UPLOAD_BODY, prepare_plan, read_upload
+from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
+from service.storage.records import PlanRecord, PlanSummary
+from service.stored_plan import Rendition
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
-
-_MAX_LISTED = 500
 
 
 @router.post(
@@ -56,11 +39,9 @@ _MAX_LISTED = 500
     summary="Upload a floor plan",
     response_model=FloorPlanAnswer,
     openapi_extra={"requestBody": UPLOAD_BODY, "parameters": [IDEMPOTENCY_KEY]},
-    responses=problem_responses(
-        *REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
-    ),
+    responses=problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS),
 )
-async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def create_floorplan(call: Call) -> Response:
     """Store a floor plan from a plan file.
 
     The format is detected from the content: JSON in the native format, GeoJSON, an IMDF archive, OpenStreetMap, a
@@ -68,91 +49,58 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
     picture is a draft, so check it before use. A small plan is `ready` at once; the pose grid of a larger plan is
     computed in the background (see `status`, `progress` and `/events`).
     """
-    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /floorplans")
-    uploaded = await read_upload(request, runtime)
+    idempotent = call.idempotent()
+    uploaded = await read_upload(call)
+    plans, grids = call.store.plans, call.runtime.grids
 
     def store(token: str) -> Response:
-        file, original, grid = _prepared(uploaded, runtime, client)
-        limit = runtime.settings.plans.max_floorplans
-        later_bytes = runtime.grids.expected_bytes(file.plan) if grid is None else 0
-        record = runtime.store.plans.add(
-            tenant,
-            token,
-            file.plan,
-            original=original,
-            limit=limit,
-            document=file.document,
-            grid=grid,
-            later_bytes=later_bytes,
-        )
-        if record.plan is file.plan:
-            runtime.grids.on_plan_stored(record, grid)
+        new, file = prepare_plan(uploaded, call)
+        record = plans.add(call.tenant, token, new, limit=call.settings.plans.max_floorplans)
+        if record.plan is new.plan:
+            grids.on_plan_stored(record, new.grid)
             # Not read back, so that a stored plan is confirmed even if the database fails now.
-            state = GridState.after_upload(grid)
+            state = GridState.after_upload(new.grid)
         else:
             # Stored by an earlier attempt, and possibly replaced since.
-            runtime.grids.on_plan_stored(record, None)
-            state = runtime.grids.states([plan_summary(tenant, record.id, runtime.store.plans)])[0]
-        return _written(request, record, file, state, runtime, status.HTTP_201_CREATED)
+            grids.on_plan_stored(record, None)
+            state = grids.states([call.plan(record.id)])[0]
+        return _change_answer(call, record, file, state, created=True)
 
     # One call from claim to answer, so that a disconnect does not interrupt it.
-    return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
+    return await uploaded.store(call, idempotent.run, uploaded.parts, store)
 
 
-@router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
-def list_floorplans(
-    runtime: Running,
-    tenant: Tenant,
-    name: Annotated[
-        str | None,
-        Query(max_length=200, pattern=NO_CONTROLS, description="Part of the name; case is ignored."),
-    ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-) -> FloorPlanList:
+@router.get("", summary="List floor plans", responses=problem_responses(*READ_ERRORS))
+def list_floorplans(call: Call, page: Page, name: Name = None) -> FloorPlanList:
     """List stored floor plans, newest first.
 
     Paging returns every plan that exists throughout exactly once, even if others are uploaded or deleted meanwhile.
     """
-    after = None if cursor is None else parse_cursor(cursor)
-    # One extra item shows that there is another page.
-    found = runtime.store.plans.list_plans(tenant, limit=limit + 1, after=after, name=name)
-    page = found[:limit]
-    more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
-    return FloorPlanList(floorplans=list_entries(page, runtime.grids), next_cursor=more)
+    found, more = page.read(partial(call.store.plans.list_plans, call.tenant, name=name))
+    return FloorPlanList(floorplans=_list_entries(found, call.runtime.grids.states(found)), next_cursor=more)
 
 
 @router.get(
     "/{floorplan_id}",
     summary="Get a floor plan",
     response_model=FloorPlanAnswer,
-    openapi_extra={"parameters": [IF_NONE_MATCH]},
-    responses=NOT_MODIFIED
-    | problem_responses(UnknownFloorPlanError, UnknownRevisionError, InvalidRequestError, StoreUnavailableError),
+    openapi_extra=CONDITIONAL,
+    responses=REVISION_RESPONSES,
 )
-async def get_floorplan(
-    floorplan_id: str,
-    request: Request,
-    runtime: Running,
-    tenant: Tenant,
-    client: Client,
-    revision: Annotated[str | None, Query(description="Id of an older revision.")] = None,
-) -> Response:
+async def get_floorplan(floorplan_id: str, call: Call, revision: Revision = None) -> Response:
     """Return a stored floor plan with the status and progress of its pose grid."""
 
     def look() -> tuple[PlanSummary, GridState, bool]:
-        current = plan_summary(tenant, floorplan_id, runtime.store.plans)
-        plan = plan_at_revision(tenant, current, revision, runtime.store.plans)
-        return plan, runtime.grids.states([plan])[0], plan.revision_id != current.revision_id
+        plan, superseded = call.plan_at_revision(floorplan_id, revision)
+        return plan, call.runtime.grids.states([plan])[0], superseded
 
     plan, state, superseded = await run_in_threadpool(look)
-    add_log_fields(request, plan=plan.id, revision=plan.revision_id)
-    step_m = runtime.settings.grids.grid_step_m
-    etag = description_etag(plan.revision_id, state, step_m, superseded=superseded)
-    if (answer := not_modified(request, etag)) is not None:
+    step_m = call.settings.grids.grid_step_m
+    etag = _description_etag(plan.revision_id, state, step_m, superseded=superseded)
+    if (answer := not_modified(call.request, etag)) is not None:
         return answer
-    description = await runtime.renditions.get(plan.id, plan.revision_id, "description", client)
-    return tagged_answer(description_parts(description, state, step_m, superseded=superseded), JSON, etag)
+    description = await call.rendition(plan, "description")
+    return tagged_answer(_description_parts(description, state, step_m, superseded=superseded), JSON, etag)
 
 
 @router.put(
@@ -160,40 +108,28 @@ async def get_floorplan(
     summary="Replace a floor plan",
     response_model=FloorPlanAnswer,
     openapi_extra={"requestBody": UPLOAD_BODY, "parameters": UNLESS_CHANGED},
-    responses=problem_responses(*REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
+    responses=problem_responses(*UPLOAD_ERRORS, UnknownFloorPlanError, RevisionMismatchError),
 )
-async def replace_floorplan(
-    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
-) -> Response:
+async def replace_floorplan(floorplan_id: str, call: Call) -> Response:
     """Store a new revision of a floor plan, from a file of any format that `POST /floorplans` accepts.
 
     Queries in progress use the revision that they began with, and return it as `floorplan_revision`.
     """
-    current = await runtime.uploads.run(client, plan_summary, tenant, floorplan_id, runtime.store.plans)
-    expected = expected_revision(request, current.id, current.revision_id)
-    uploaded = await read_upload(request, runtime)
+    current = await call.upload(call.plan, floorplan_id)
+    expected = call.expected_revision(current)
+    uploaded = await read_upload(call)
+    plans, grids = call.store.plans, call.runtime.grids
 
     def store() -> Response:
-        file, original, grid = _prepared(uploaded, runtime, client)
-        keep = runtime.settings.plans.max_revisions
-        later_bytes = runtime.grids.expected_bytes(file.plan) if grid is None else 0
-        record = runtime.store.plans.add_revision(
-            tenant,
-            current.id,
-            file.plan,
-            original=original,
-            keep=keep,
-            expected=expected,
-            document=file.document,
-            grid=grid,
-            later_bytes=later_bytes,
-        )
+        new, file = prepare_plan(uploaded, call)
+        keep = call.settings.plans.max_revisions
+        record = plans.add_revision(call.tenant, current.id, new, keep=keep, expected=expected)
         # Before the new grid starts. The old grid stays in memory for queries in progress.
-        runtime.grids.cancel(current.revision_id)
-        runtime.grids.on_plan_stored(record, grid)
-        return _written(request, record, file, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
+        grids.cancel(current.revision_id)
+        grids.on_plan_stored(record, new.grid)
+        return _change_answer(call, record, file, GridState.after_upload(new.grid), created=False)
 
-    return await uploaded.threads(runtime).run(client, store)
+    return await uploaded.store(call, store)
 
 
 @router.delete(
@@ -201,47 +137,64 @@ async def replace_floorplan(
     status_code=status.HTTP_204_NO_CONTENT,
     summary="Delete a floor plan",
     openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(
-        UnknownFloorPlanError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError
-    ),
+    responses=problem_responses(UnknownFloorPlanError, RevisionMismatchError, *READ_ERRORS),
 )
-def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
+def delete_floorplan(floorplan_id: str, call: Call) -> None:
     """Delete a floor plan with all its revisions, uploaded files and pose grids.
 
     The computation of its pose grid is cancelled. Venues with this plan get a new revision without it.
     """
-    current = plan_summary(tenant, floorplan_id, runtime.store.plans)
-    add_log_fields(request, plan=current.id, revision=current.revision_id)
-    expected = expected_revision(request, current.id, current.revision_id)
-    if not runtime.store.plans.delete(tenant, current.id, expected=expected):
+    current = call.plan(floorplan_id)
+    if not call.store.plans.delete(call.tenant, current.id, expected=call.expected_revision(current)):
         raise UnknownFloorPlanError(floorplan_id)
-    runtime.grids.forget({current.revision_id})
+    call.runtime.grids.forget({current.revision_id})
 
 
-def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[PlanFile, Original, ComputedGrid | None]:
-    """Return the plan in an uploaded file, the file as stored, and the pose grid if it is computed at once."""
-    content = uploaded.file.read()
-    name = building_name(uploaded.file.name)
-    file = convert(content, uploaded.options, name, runtime.converter, runtime.settings, client, runtime.permits)
-    runtime.grids.check_size(file.plan)
-    original = Original(content, file.media_type, file.report)
-    return file, original, runtime.grids.prepare(file.plan, client)
-
-
-def _written(
-    request: Request, record: PlanRecord, file: PlanFile, state: GridState, runtime: Runtime, code: int
-) -> Response:
-    add_log_fields(request, plan=record.id, revision=record.revision_id)
-    step_m = runtime.settings.grids.grid_step_m
+def _change_answer(call: ApiCall, record: PlanRecord, file: PlanFile, state: GridState, *, created: bool) -> Response:
+    call.log(plan=record.id, revision=record.revision_id)
+    step_m = call.settings.grids.grid_step_m
     if file.description is None or record.plan is not file.plan:
         description = describe(record.plan, record, step_m)
     else:
         description = with_head(file.description, record)
-    runtime.renditions.put(record.revision_id, "description", description)
-    content = b"".join(description_parts(description, state, step_m))
-    path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
-    # The tag of this answer, which is also that of a GET from this location.
-    headers = {"Content-Location": path, "ETag": description_etag(record.revision_id, state, step_m)}
-    if code == status.HTTP_201_CREATED:
-        headers["Location"] = path
-    return Response(content, code, headers, JSON)
+    call.runtime.renditions.put(record.revision_id, "description", description)
+    content = b"".join(_description_parts(description, state, step_m))
+    path = call.path_of("get_floorplan", floorplan_id=record.id)
+    return call.change_answer(content, _description_etag(record.revision_id, state, step_m), path, created=created)
+
+
+def _description_etag(revision_id: str, state: GridState, step_m: float, *, superseded: bool = False) -> str:
+    """Return the entity tag of a plan's description; `superseded` marks an old revision."""
+    return revision_etag(revision_id, "description", superseded, astuple(state), step_m)
+
+
+def _description_parts(
+    description: Rendition, state: GridState, step_m: float, *, superseded: bool = False
+) -> tuple[bytes, bytes]:
+    """Return a plan as JSON in two parts; `superseded` marks an old revision."""
+    head = state_of_description(
+        "superseded" if superseded else state.status,
+        state.progress,
+        state.reason,
+        poses=description.poses if state.poses is None else state.poses,
+        step_m=step_m,
+    )
+    return head, description.content
+
+
+def _list_entries(summaries: list[PlanSummary], states: list[GridState]) -> list[FloorPlanSummary]:
+    """Return plans as items of a list."""
+    return [
+        FloorPlanSummary(
+            id=summary.id,
+            revision=summary.revision_id,
+            name=summary.name,
+            status=state.status,
+            progress=state.progress,
+            rooms=summary.room_count,
+            area_m2=summary.area_m2,
+            created_at=summary.created_at,
+            updated_at=summary.updated_at,
+        )
+        for summary, state in zip(summaries, states, strict=True)
+    ]

@@ -6,44 +6,26 @@ import asyncio
 import json
 import logging
 from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from service import errors
 from service.capacity.admission_control import BATCH
-from service.errors import (
-    OverloadedError,
-    PlanFailedError,
-    PlanNotReadyError,
-    RateLimitedError,
-    ServiceError,
-    StoppingError,
-    UnknownVenueError,
-    UploadTooLargeError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
-)
-from service.http.lines import NDJSON, LinesResponse
+from service.http.piecewise import NDJSON, LinesResponse
 from service.http.problems import problem_document, problem_responses
-from service.http.uploads import MULTIPART, Repeats, media_type
+from service.http.uploads import Repeats
 from service.query import Content, PhotographQuery, QueryContext
-from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
-from service.routes.localise import kept_answer
-from service.routes.query_request import (
-    FEATURES,
-    PHOTO,
-    QUERY_ERRORS,
-    body_schema,
-    check_idempotent_media,
-    photographs_of,
-    read_query,
-)
-from service.runtime import Runtime
-from service.schemas import BatchLine, LocaliseAnswer, LocaliseForm
+from service.routes.dependencies import ApiCall, Call
+from service.routes.descriptions import IDEMPOTENCY_ERRORS, QUERY_ERRORS
+from service.routes.query_request import FEATURES, PHOTO, body_schema, keep_answer, photographs_of, read_query
+from service.schemas import LocaliseAnswer, LocaliseForm
+from service.schemas.localise_answer import BatchLine
 from service.security import caller_of
-from service.telemetry import LOGGER_NAME, add_log_fields
+from service.storage.records import PlanRecord, VenueRecord
+from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
@@ -57,17 +39,15 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
 # Errors that every further photograph of the batch would meet.
 _COMMON_ERRORS = (
     InvalidHintError,
-    PlanFailedError,
-    PlanNotReadyError,
-    StoppingError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
+    errors.PlanFailedError,
+    errors.PlanNotReadyError,
+    errors.StoppingError,
+    errors.VenueNotReadyError,
+    errors.VenueUnsearchableError,
 )
 # Pause (s) before a photograph asks again for a slot, while the tenant's other queries have them.
 _BUSY_PAUSE_S = 0.25
 _MAX_NAME = 255
-
-Localise = Callable[[PhotographQuery], Awaitable[LocaliseAnswer]]
 
 
 @router.post(
@@ -78,9 +58,16 @@ Localise = Callable[[PhotographQuery], Awaitable[LocaliseAnswer]]
     response_model=BatchLine,
     openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA),
     responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
-    | problem_responses(InvalidHintError, RateLimitedError, UnknownVenueError, *QUERY_ERRORS),
+    | problem_responses(
+        InvalidHintError,
+        errors.RateLimitedError,
+        errors.UnknownVenueError,
+        errors.UnknownFloorPlanError,
+        *QUERY_ERRORS,
+        *IDEMPOTENCY_ERRORS,
+    ),
 )
-async def localise_batch(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def localise_batch(call: Call) -> Response:
     """Localise many photographs, each by itself, in a stored floor plan or in the plans of a venue.
 
     The fields hold for all photographs. The answer is a stream of lines of JSON, one per photograph in the order of the
@@ -89,55 +76,30 @@ async def localise_batch(request: Request, runtime: Running, tenant: Tenant, cli
     as a request for the rate limit. The batch ends if its client leaves, or does not take a line within
     `request_deadline_s`.
     """
-    settings = runtime.settings
-    check_idempotent_media(request, NDJSON)
-    media_type(request, (MULTIPART,))
+    call.idempotent(NDJSON)
+    settings = call.settings
     most = settings.photographs.max_batch_photographs
-    form, parts, _ = await read_query(
-        request,
-        settings,
-        client,
-        LocaliseForm,
-        "max_sequence_bytes",
-        repeated={PHOTO: Repeats(1, most, "max_batch_photographs")},
-    )
+    repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
+    form, parts, _ = await read_query(call, LocaliseForm, "max_sequence_bytes", repeated=repeated)
     files = parts.named(PHOTO) or parts.named(FEATURES)
-    photographs = list(zip(files, photographs_of(parts, form, runtime.bundle), strict=True))
-    await runtime.access_control.count_photographs(caller_of(request.scope), len(photographs))
-    localise = await _localiser_of(request, form, tenant, runtime)
-    batch = _Batch(request, runtime, client, tenant, form, localise)
+    photographs = list(zip(files, photographs_of(parts, form, call), strict=True))
+    await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(photographs))
+    batch = _Batch(call, form, await call.place(form.floorplan_id, form.venue_id))
     return LinesResponse(batch.lines(photographs), settings.requests.request_deadline_s)
-
-
-async def _localiser_of(request: Request, form: LocaliseForm, tenant: str, runtime: Runtime) -> Localise:
-    """Return the function that answers queries in the form's plan or venue."""
-    if form.venue_id is not None:
-        venue = await venue_for_query(tenant, form.venue_id, runtime)
-        add_log_fields(request, venue=venue.id)
-        return lambda query: runtime.localiser.localise(venue, query)
-    assert form.floorplan_id is not None
-    record = await plan_for_query(tenant, form.floorplan_id, runtime)
-    add_log_fields(request, plan=record.id, revision=record.revision_id)
-    return lambda query: runtime.localiser.localise(record, query)
 
 
 class _Batch:
     """Photographs of one request; as many at a time as there are cores that compute."""
 
-    def __init__(
-        self, request: Request, runtime: Runtime, client: str, tenant: str, form: LocaliseForm, localise: Localise
-    ) -> None:
-        self._request = request
-        self._runtime = runtime
-        self._client = client
-        self._tenant = tenant
+    def __init__(self, call: ApiCall, form: LocaliseForm, place: PlanRecord | VenueRecord) -> None:
+        self._call = call
         self._form = form
-        self._localise = localise
+        self._place = place
         self._common_error: Exception | None = None
 
     async def lines(self, photographs: Sequence[tuple[UploadedFile, Content]]) -> AsyncGenerator[str]:
         """Yield the line of every photograph, in order. While a line is not taken, no further photograph begins."""
-        cores = self._runtime.settings.cores
+        cores = self._call.settings.cores
         at_a_time = max(cores.workers + cores.compute_threads, 1)
         begun = deque[asyncio.Task[str]]()
         try:
@@ -157,7 +119,7 @@ class _Batch:
     async def _charged_line(self, index: int, file: UploadedFile, photograph: Content) -> str:
         # A task is not part of the request's own steps.
         line = self._line(index, file, photograph)
-        return await self._runtime.admission.cpu_accounts.charged_steps(self._client, line)
+        return await self._call.runtime.admission.cpu_accounts.charged_steps(self._call.client, line)
 
     async def _line(self, index: int, file: UploadedFile, photograph: Content) -> str:
         answer = problem = retry_after_s = None
@@ -168,8 +130,8 @@ class _Batch:
                 logging.getLogger(LOGGER_NAME).exception("unexpected error")
             if isinstance(error, _COMMON_ERRORS):
                 self._common_error = error
-            problem = problem_document(self._request, error)
-            retry_after_s = error.retry_after_s if isinstance(error, ServiceError) else None
+            problem = problem_document(self._call.request, error)
+            retry_after_s = error.retry_after_s if isinstance(error, errors.ServiceError) else None
         finally:
             file.close()
         line = BatchLine(
@@ -185,20 +147,21 @@ class _Batch:
 
     async def _answer(self, file: UploadedFile, photograph: Content) -> LocaliseAnswer:
         """Localise one photograph; wait for a slot while the tenant's other queries have them all."""
-        settings = self._runtime.settings
+        settings = self._call.settings
         limit = settings.photographs.max_photograph_bytes
         if len(file) > limit:
-            raise UploadTooLargeError("max_photograph_bytes", limit, len(file))
-        context = QueryContext.starting(self._client, settings.requests.request_deadline_s)
+            raise errors.UploadTooLargeError("max_photograph_bytes", limit, len(file))
+        context = QueryContext.starting(self._call.client, settings.requests.request_deadline_s)
         while True:
-            if self._runtime.admission.stopping:
-                raise StoppingError()
+            if self._call.runtime.admission.stopping:
+                raise errors.StoppingError()
             if self._common_error is not None:
                 raise self._common_error
             try:
-                answer = await self._localise(PhotographQuery(self._form, photograph, context))
-                return await kept_answer(answer, self._tenant, self._runtime)
-            except OverloadedError:
+                query = PhotographQuery(self._form, photograph, context)
+                answer = await self._call.runtime.localiser.localise(self._place, query)
+                return await keep_answer(answer, self._call)
+            except errors.OverloadedError:
                 if context.left_s < _BUSY_PAUSE_S:
                     raise
             await asyncio.sleep(_BUSY_PAUSE_S)

@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidMotionError
-from service.errors import (
-    InvalidRequestError,
-    UnanchoredPlanError,
-    UnknownVenueError,
-    UploadTooLargeError,
-    VenueNotReadyError,
-    VenueUnsearchableError,
-)
-from service.http import IdempotentRequest
+from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http.accept import preferred
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, Repeats, media_type
+from service.http.uploads import GEOJSON, JSON, Parts, Repeats
 from service.query import Content, SequenceQuery
 from service.query.geopose import geojson_features
-from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
-from service.routes.query_request import (
-    PHOTO,
-    QUERY_ERRORS,
-    body_schema,
-    check_idempotent_media,
-    photographs_of,
-    read_query,
-)
-from service.runtime import Runtime
+from service.routes.dependencies import ApiCall, Call
+from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
+from service.routes.query_request import PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import SequenceAnswer, SequenceForm
-from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
@@ -54,16 +37,9 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
     responses={
         200: {"content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}}}
     }
-    | problem_responses(
-        InvalidMotionError,
-        UnanchoredPlanError,
-        UnknownVenueError,
-        VenueUnsearchableError,
-        VenueNotReadyError,
-        *QUERY_ERRORS,
-    ),
+    | problem_responses(InvalidMotionError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
 )
-async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def localise_sequence(call: Call) -> Response:
     """Localise several photographs of one visit together in a stored floor plan, or in the plans of a venue.
 
     Measured motions between them resolve places that look alike. Photographs that were taken while turning on one spot
@@ -73,42 +49,25 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     a plan that is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls back to the best
     path on the pose grid, with `"stage": "retrieval"`.
     """
-    settings = runtime.settings
-    media = preferred(request, (JSON, GEOJSON))
-    check_idempotent_media(request, media)
-    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
-    media_type(request, (MULTIPART,))
-    most = settings.photographs.max_sequence_photographs
+    media = preferred(call.request, (JSON, GEOJSON))
+    idempotent = call.idempotent(media)
+    most = call.settings.photographs.max_sequence_photographs
     repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs")}
-    form, parts, context = await read_query(
-        request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
-    )
-    photographs = _photographs(parts, form, runtime)
+    form, parts, context = await read_query(call, SequenceForm, "max_sequence_bytes", repeated=repeated)
+    photographs = _photographs(parts, form, call)
     query = SequenceQuery(form, photographs, context.for_photographs(len(photographs)))
 
     async def respond() -> Response:
-        if form.venue_id is not None:
-            venue = await venue_for_query(tenant, form.venue_id, runtime)
-            add_log_fields(request, venue=venue.id)
-            found = await runtime.localiser.localise_sequence(venue, query)
-        else:
-            assert form.floorplan_id is not None
-            record = await plan_for_query(tenant, form.floorplan_id, runtime)
-            add_log_fields(request, plan=record.id, revision=record.revision_id)
-            if media == GEOJSON and record.plan.anchor is None:
-                raise UnanchoredPlanError(record.id)
-            found = await runtime.localiser.localise_sequence(record, query)
-        add_log_fields(request, stage=found.stage)
-        features = geojson_features(found) if media == GEOJSON else None
-        if media == GEOJSON and features is None:
-            raise UnanchoredPlanError(found.floorplan_id, found.venue_id)
-        content = found.model_dump_json() if media == JSON else json.dumps(features)
-        return Response(content, headers={"Vary": "Accept"}, media_type=media)
+        place = await call.place(form.floorplan_id, form.venue_id)
+        check_anchor(place, media)
+        found = await call.runtime.localiser.localise_sequence(place, query)
+        call.log(stage=found.stage)
+        return answer_as(found, media, geojson_features)
 
-    return await idempotent.run_async(parts, respond, runtime.reads)
+    return await idempotent.run_async(parts, respond, call.runtime.reads)
 
 
-def _photographs(parts: Parts, form: SequenceForm, runtime: Runtime) -> list[Content]:
+def _photographs(parts: Parts, form: SequenceForm, call: ApiCall) -> list[Content]:
     """Return the photographs in order.
 
     Raises:
@@ -116,10 +75,10 @@ def _photographs(parts: Parts, form: SequenceForm, runtime: Runtime) -> list[Con
         InvalidFeaturesError, ForeignFeaturesError: see `photographs_of`.
         InvalidRequestError: fields that do not fit the number of photographs.
     """
-    limit = runtime.settings.photographs.max_photograph_bytes
+    limit = call.settings.photographs.max_photograph_bytes
     if (largest := max(map(len, parts.named(PHOTO)), default=0)) > limit:
         raise UploadTooLargeError("max_photograph_bytes", limit, largest)
-    contents = photographs_of(parts, form, runtime.bundle)
+    contents = photographs_of(parts, form, call)
     if faults := form.faults(len(contents)):
         raise InvalidRequestError(faults)
     return contents

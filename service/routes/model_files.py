@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from hashlib import sha256
 from pathlib import Path
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.bundle import MANIFEST_NAME
@@ -15,8 +15,8 @@ from service.errors import InvalidRequestError, UnknownModelFileError
 from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running
-from service.runtime import Runtime
+from service.routes.dependencies import ApiCall, Call
+from service.routes.descriptions import CONDITIONAL, file_response
 
 router = APIRouter(prefix="/model", tags=["localisation"])
 _BINARY = "application/octet-stream"
@@ -27,39 +27,35 @@ _CHUNK_BYTES = 2**20
     "/{file}",
     summary="Get a file of the image encoder",
     response_class=Response,
-    openapi_extra={"parameters": [IF_NONE_MATCH]},
-    responses={
-        200: {"content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
-        **NOT_MODIFIED,
-        **problem_responses(UnknownModelFileError, InvalidRequestError),
-    },
+    openapi_extra=CONDITIONAL,
+    responses=file_response("*/*") | problem_responses(UnknownModelFileError, InvalidRequestError),
 )
-async def get_model_file(file: str, request: Request, runtime: Running, client: Client) -> Response:
+async def get_model_file(file: str, call: Call) -> Response:
     """Return a file with which a device computes features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`.
 
     The manifest has sizes and digests of the files, and no more of the model than its image encoder needs.
     """
-    bundle = runtime.bundle
+    bundle = call.runtime.bundle
     manifest = bundle.manifest
     if file == MANIFEST_NAME:
         content = device_manifest(manifest).to_json().encode()
         etag = digest_etag(sha256(content).hexdigest())
-        return not_modified(request, etag) or tagged_answer([content], JSON, etag)
+        return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
     entry = manifest.files.get(file)
     if file not in DEVICE_FILES or entry is None:
         raise UnknownModelFileError(file, manifest.name)
     etag = digest_etag(entry.sha256)
-    if (answer := not_modified(request, etag)) is not None:
+    if (answer := not_modified(call.request, etag)) is not None:
         return answer
-    chunks = _chunks(bundle.folder / file, request, runtime, client)
+    chunks = _chunks(bundle.folder / file, call)
     return tagged_stream(chunks, entry.bytes, _BINARY, etag)
 
 
-async def _chunks(path: Path, request: Request, runtime: Runtime, client: str) -> AsyncIterator[bytes]:
+async def _chunks(path: Path, call: ApiCall) -> AsyncIterator[bytes]:
     """Yield a file until the client has gone. Clients check the digest, so an altered file is noticed there."""
     with path.open("rb") as opened:
-        while not await request.is_disconnected():
-            async with runtime.admission.reading.held(client):
+        while not await call.request.is_disconnected():
+            async with call.reading():
                 chunk = await run_in_threadpool(opened.read, _CHUNK_BYTES)
             if not chunk:
                 return

@@ -1,11 +1,14 @@
-"""Downloads of a stored plan: original file, export, drawing, mesh, localisability."""
+"""Reads of a stored plan: original file, export, drawing, mesh, localisability, walls, events."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Mapping
+from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
@@ -16,20 +19,27 @@ from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
 from service.errors import (
     ConverterNotReadyError,
     InvalidRequestError,
-    StoreUnavailableError,
     UnanchoredPlanError,
     UnknownFloorPlanError,
     UnmeasuredModelError,
 )
 from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
+from service.http.events import EventStream
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary
-from service.runtime import Runtime
-from service.schemas import LocalisabilityAnswer
+from service.routes.dependencies import ApiCall, Call, Revision
+from service.routes.descriptions import (
+    CONDITIONAL,
+    NOT_MODIFIED,
+    PLAN_RESPONSES,
+    READ_ERRORS,
+    REVISION_RESPONSES,
+    file_response,
+)
+from service.schemas.localisability import LocalisabilityAnswer
+from service.schemas.stored_plans import LayoutAnswer
 from service.storage.records import PlanSummary
 from service.stored_plan import PREDICTIONS, RenditionKind
-from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
@@ -39,42 +49,30 @@ _SVG, _GLB = "image/svg+xml", "model/gltf-binary"
 _INERT = "default-src 'none'; img-src data:"
 # Tolerance for a covariance whose three numbers were rounded.
 _ROUNDED = 1e-3
-_PROBLEMS = problem_responses(UnknownFloorPlanError, InvalidRequestError, StoreUnavailableError)
-_CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
 # Predictions are made by conversion workers.
-_PREDICTED = problem_responses(
-    UnknownFloorPlanError, InvalidRequestError, UnmeasuredModelError, StoreUnavailableError, ConverterNotReadyError
-)
+_PREDICTED = problem_responses(UnknownFloorPlanError, UnmeasuredModelError, *READ_ERRORS, ConverterNotReadyError)
 
 
 @router.get(
     "/{floorplan_id}/original",
     summary="Get the uploaded file",
     response_class=Response,
-    openapi_extra=_CONDITIONAL,
-    responses={
-        200: {
-            # Bytes, even of a JSON plan: generated clients must not parse what was uploaded.
-            "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}
-        },
-        **NOT_MODIFIED,
-        **_PROBLEMS,
-    },
+    openapi_extra=CONDITIONAL,
+    # Bytes, even of a JSON plan: generated clients must not parse what was uploaded.
+    responses=file_response("*/*") | PLAN_RESPONSES,
 )
-async def get_original(
-    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
-) -> Response:
+async def get_original(floorplan_id: str, call: Call) -> Response:
     """Return the uploaded file of the current revision, unchanged, with the media type of its content."""
-    plan, originals = await _look(request, tenant, floorplan_id, runtime), runtime.store.originals
+    plan, originals = await run_in_threadpool(call.plan, floorplan_id), call.store.originals
     digest = await run_in_threadpool(originals.digest, plan.revision_id)
-    if digest is not None and (answer := not_modified(request, digest_etag(digest))) is not None:
+    if digest is not None and (answer := not_modified(call.request, digest_etag(digest))) is not None:
         return answer
     original = await run_in_threadpool(originals.checked, plan.revision_id)
     if digest is None or original is None:
         raise UnknownFloorPlanError(floorplan_id)
     # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
-    chunks = _chunks(plan, original.size_bytes, request, runtime, client)
+    chunks = _chunks(plan, original.size_bytes, call)
     return tagged_stream(chunks, original.size_bytes, original.media_type, digest_etag(digest), kept)
 
 
@@ -82,56 +80,38 @@ async def get_original(
     "/{floorplan_id}/export",
     summary="Export a floor plan",
     response_class=Response,
-    openapi_extra=_CONDITIONAL,
-    responses={
-        200: {
-            "content": {
-                FORMATS[name].media_type: {"schema": {"type": "string", "format": "binary"}} for name in EXPORT_FORMATS
-            }
-        },
-        **NOT_MODIFIED,
-        **problem_responses(
-            UnknownFloorPlanError,
-            UnanchoredPlanError,
-            MissingExtraError,
-            InvalidRequestError,
-            StoreUnavailableError,
-            ConverterNotReadyError,
-        ),
-    },
+    openapi_extra=CONDITIONAL,
+    responses=file_response(*(FORMATS[name].media_type for name in EXPORT_FORMATS))
+    | problem_responses(
+        UnknownFloorPlanError, UnanchoredPlanError, MissingExtraError, *READ_ERRORS, ConverterNotReadyError
+    ),
 )
 async def get_export(
     floorplan_id: str,
-    request: Request,
-    runtime: Running,
-    tenant: Tenant,
-    client: Client,
+    call: Call,
     format: Annotated[
         ExportFormat,
         Query(description="Format of the file. IMDF needs a plan with an `anchor`; GeoJSON uses it if present."),
     ] = "native",
 ) -> Response:
     """Return the plan in another file format."""
-    plan = await _look(request, tenant, floorplan_id, runtime)
+    plan = await run_in_threadpool(call.plan, floorplan_id)
     if format == "imdf" and not plan.anchored:
         raise UnanchoredPlanError(plan.id)
     kept = {"Content-Disposition": f'attachment; filename="plan.{FORMATS[format].suffix}"'}
-    return await _rendition(request, plan, format, FORMATS[format].media_type, runtime, client, kept)
+    return await _rendition(call, plan, format, FORMATS[format].media_type, kept)
 
 
 @router.get(
     "/{floorplan_id}/preview.svg",
     summary="Get a drawing",
     response_class=Response,
-    openapi_extra=_CONDITIONAL,
-    responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PROBLEMS},
+    openapi_extra=CONDITIONAL,
+    responses=file_response(_SVG, schema_format=None) | PLAN_RESPONSES,
 )
 async def get_preview(
     floorplan_id: str,
-    request: Request,
-    runtime: Running,
-    tenant: Tenant,
-    client: Client,
+    call: Call,
     x_m: Annotated[float | None, Query(allow_inf_nan=False, description="x of a camera to mark.")] = None,
     y_m: Annotated[float | None, Query(allow_inf_nan=False, description="y of a camera to mark.")] = None,
     heading_deg: Annotated[
@@ -158,12 +138,12 @@ async def get_preview(
     marker = None
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
-    plan = await _look(request, tenant, floorplan_id, runtime)
+    plan = await run_in_threadpool(call.plan, floorplan_id)
     policy = {"Content-Security-Policy": _INERT}
     etag = revision_etag(plan.revision_id, "preview", marker)
-    if (answer := not_modified(request, etag, policy)) is not None:
+    if (answer := not_modified(call.request, etag, policy)) is not None:
         return answer
-    rooms = await runtime.renditions.get(plan.id, plan.revision_id, "preview", client)
+    rooms = await call.rendition(plan, "preview")
     if marker is not None:
         _check_near(marker, rooms.bounds_m)
     head, tail = svg_around(plan.name, rooms.bounds_m, marker)
@@ -176,102 +156,121 @@ async def get_preview(
     "/{floorplan_id}/mesh.glb",
     summary="Get a mesh",
     response_class=Response,
-    openapi_extra=_CONDITIONAL,
-    responses={
-        200: {"content": {_GLB: {"schema": {"type": "string", "format": "binary"}}}},
-        **NOT_MODIFIED,
-        **_PROBLEMS,
-    },
+    openapi_extra=CONDITIONAL,
+    responses=file_response(_GLB) | PLAN_RESPONSES,
 )
-async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def get_mesh(floorplan_id: str, call: Call) -> Response:
     """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
-    plan = await _look(request, tenant, floorplan_id, runtime)
-    return await _rendition(request, plan, "mesh", _GLB, runtime, client)
+    plan = await run_in_threadpool(call.plan, floorplan_id)
+    return await _rendition(call, plan, "mesh", _GLB)
 
 
 @router.get(
     "/{floorplan_id}/localisability",
     summary="Predict which photographs will be found",
     response_model=LocalisabilityAnswer,
-    openapi_extra=_CONDITIONAL,
-    responses={**NOT_MODIFIED, **_PREDICTED},
+    openapi_extra=CONDITIONAL,
+    responses=NOT_MODIFIED | _PREDICTED,
 )
-async def get_localisability(
-    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
-) -> Response:
+async def get_localisability(floorplan_id: str, call: Call) -> Response:
     """Predict which photographs will be found, from the plan and the model's measured errors alone.
 
     For places spread over the plan: the probability that the answer to a photograph taken there is right, for a
     sphere, a phone photograph and three of them, with known and unknown heading. Also which rooms are confused, and
     what helps most. The first request for a revision takes seconds; the result is kept.
     """
-    plan = await _look(request, tenant, floorplan_id, runtime)
-    return await _rendition(request, plan, "localisability", JSON, runtime, client)
+    plan = await run_in_threadpool(call.plan, floorplan_id)
+    return await _rendition(call, plan, "localisability", JSON)
 
 
 @router.get(
     "/{floorplan_id}/localisability.svg",
     summary="Get a map of the photographs that will be found",
     response_class=Response,
-    openapi_extra=_CONDITIONAL,
-    responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PREDICTED},
+    openapi_extra=CONDITIONAL,
+    responses=file_response(_SVG, schema_format=None) | _PREDICTED,
 )
 async def get_localisability_map(
     floorplan_id: str,
-    request: Request,
-    runtime: Running,
-    tenant: Tenant,
-    client: Client,
+    call: Call,
     photograph: Annotated[
         Photograph, Query(description="A sphere, a phone photograph of 80°, or three of these from one spot.")
     ] = "phone",
     heading: Annotated[HeadingState, Query(description="Whether the heading is known.")] = "unknown",
 ) -> Response:
     """Return a drawing of the plan with the probability by place that a photograph is found; darker is higher."""
-    plan = await _look(request, tenant, floorplan_id, runtime)
+    plan = await run_in_threadpool(call.plan, floorplan_id)
     condition = condition_of(photograph, heading)
-    return await _rendition(request, plan, condition, _SVG, runtime, client, {"Content-Security-Policy": _INERT})
+    return await _rendition(call, plan, condition, _SVG, {"Content-Security-Policy": _INERT})
 
 
-async def _chunks(
-    plan: PlanSummary, size_bytes: int, request: Request, runtime: Runtime, client: str
-) -> AsyncIterator[bytes]:
+@router.get(
+    "/{floorplan_id}/layout",
+    summary="Get the walls of a floor plan",
+    response_model=LayoutAnswer,
+    openapi_extra=CONDITIONAL,
+    responses=REVISION_RESPONSES,
+)
+async def get_layout(floorplan_id: str, call: Call, revision: Revision = None) -> Response:
+    """Return the walls of each room, and the part of a wall that each opening takes up.
+
+    A client can compute from them the layout that a camera sees: the distance to the nearest wall of its room in every
+    direction, and hence where floor, ceiling and openings appear in a photograph.
+    """
+    plan, _ = await run_in_threadpool(call.plan_at_revision, floorplan_id, revision)
+    return await _rendition(call, plan, "layout", JSON)
+
+
+@router.get(
+    "/{floorplan_id}/events",
+    summary="Follow a floor plan",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Server-sent events; their data is a PlanEvent.",
+            "content": {EventStream.media_type: {"schema": {"type": "string"}}},
+        },
+        **PLAN_RESPONSES,
+    },
+)
+async def follow_floorplan(floorplan_id: str, call: Call) -> Response:
+    """Stream server-sent events about the plan's pose grid.
+
+    `progress` comes at once and after each change, up to four times a second; `ready`, `failed` or `deleted` is the
+    last event. A comment is sent at least every 15 s. The stream also ends after 15 minutes, soon after the API key is
+    revoked, and when the service stops; reconnect then.
+    """
+    current = await asyncio.to_thread(call.plan, floorplan_id)
+    return call.runtime.events.event_stream(
+        current.id, partial(call.runtime.access_control.still_authorised, call.request)
+    )
+
+
+async def _chunks(plan: PlanSummary, size_bytes: int, call: ApiCall) -> AsyncIterator[bytes]:
     """Yield the uploaded file, until the client has gone.
 
     Raises:
         UnknownFloorPlanError: the revision was deleted meanwhile, so that the connection ends before the answer.
     """
     sent_bytes = number = 0
-    while sent_bytes < size_bytes and not await request.is_disconnected():
-        async with runtime.admission.reading.held(client):
-            chunk = await run_in_threadpool(runtime.store.originals.chunk, plan.revision_id, number)
+    while sent_bytes < size_bytes and not await call.request.is_disconnected():
+        async with call.reading():
+            chunk = await run_in_threadpool(call.store.originals.chunk, plan.revision_id, number)
         if chunk is None:
             raise UnknownFloorPlanError(plan.id)
         yield chunk
         sent_bytes, number = sent_bytes + len(chunk), number + 1
 
 
-async def _look(request: Request, tenant: str, floorplan_id: str, runtime: Runtime) -> PlanSummary:
-    plan = await run_in_threadpool(plan_summary, tenant, floorplan_id, runtime.store.plans)
-    add_log_fields(request, plan=plan.id, revision=plan.revision_id)
-    return plan
-
-
 async def _rendition(
-    request: Request,
-    plan: PlanSummary,
-    kind: RenditionKind,
-    media_type: str,
-    runtime: Runtime,
-    client: str,
-    headers: Mapping[str, str] | None = None,
+    call: ApiCall, plan: PlanSummary, kind: RenditionKind, media_type: str, headers: Mapping[str, str] | None = None
 ) -> Response:
     """Answer with a file made from a plan, or with 304 before it is made."""
     # Predictions depend on the model.
-    etag = revision_etag(plan.revision_id, kind, *([runtime.localiser.model.sha256] if kind in PREDICTIONS else []))
-    if (answer := not_modified(request, etag, headers)) is not None:
+    etag = revision_etag(plan.revision_id, kind, *([call.runtime.bundle.sha256] if kind in PREDICTIONS else []))
+    if (answer := not_modified(call.request, etag, headers)) is not None:
         return answer
-    made = await runtime.renditions.get(plan.id, plan.revision_id, kind, client)
+    made = await call.rendition(plan, kind)
     return tagged_answer([made.content], media_type, etag, headers)
 
 

@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ParamSpec
 
-from fastapi import Request
+from fastapi import Response
 from pydantic import BaseModel
 
-from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
-from lalaloc_core.importers import ImportOptions
-from service.capacity.threads import Threads
-from service.errors import (
-    BytesInFlightError,
-    ConverterNotReadyError,
-    InvalidRequestError,
-    MalformedRequestError,
-    PlanTooLargeError,
-    SpoolFullError,
-    StorageQuotaError,
-    StoreFullError,
-    StoreUnavailableError,
-    UnsupportedMediaError,
-    UploadTimeoutError,
-    UploadTooLargeError,
-)
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers import ImportOptions, building_name
+from service.errors import InvalidRequestError
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
-from service.plan_files.plan_file import seems_native
-from service.runtime import Runtime
-from service.schemas import ImportForm, LevelsForm
+from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
+from service.routes.dependencies import ApiCall
+from service.routes.descriptions import json_body
+from service.schemas.native_plan import FloorPlanDocument
+from service.schemas.plan_import import ImportForm, LevelsForm
+from service.storage.records import ComputedGrid, NewPlan, Original
+from service.stored_plan import PlanDocument
 from service.uploaded_file import UploadedFile
 
+P = ParamSpec("P")
 _FILE = "file"
+# Levels of a venue, as in requests.
+_MAX_LEVEL = 1000.0
 # Media types that clients send; the actual format is detected from the content.
 _FILES = (
     JSON,
@@ -49,23 +42,6 @@ _FILES = (
     "application/octet-stream",
 )
 _BYTES = {"schema": {"type": "string", "format": "binary"}}
-REFUSED_UPLOADS = (
-    InvalidFloorPlanError,
-    SeveralLevelsError,
-    MissingExtraError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    MalformedRequestError,
-    UnsupportedMediaError,
-    UploadTooLargeError,
-    UploadTimeoutError,
-    BytesInFlightError,
-    SpoolFullError,
-    ConverterNotReadyError,
-    StoreUnavailableError,
-    StoreFullError,
-    StorageQuotaError,
-)
 
 
 def _form_schema(form: type[BaseModel]) -> dict[str, Any]:
@@ -82,14 +58,9 @@ def _form_schema(form: type[BaseModel]) -> dict[str, Any]:
 
 
 # Request body of both operations that take a plan.
-UPLOAD_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {
-        JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}},
-        MULTIPART: {"schema": _form_schema(ImportForm)},
-        **dict.fromkeys(_FILES[1:], _BYTES),
-    },
-}
+UPLOAD_BODY = json_body(
+    FloorPlanDocument, **{MULTIPART: {"schema": _form_schema(ImportForm)}}, **dict.fromkeys(_FILES[1:], _BYTES)
+)
 # Form of an operation that takes a file with all its levels.
 LEVELS_FORM: dict[str, Any] = {"schema": _form_schema(LevelsForm)}
 
@@ -107,29 +78,25 @@ class PlanUpload:
         """The parts that identify the request for idempotency."""
         return Parts(dict(self.fields), {_FILE: self.file})
 
-    def threads(self, runtime: Runtime) -> Threads:
-        """Return the threads to read and store it on; files that wait for a worker have threads of their own."""
-        return runtime.uploads if seems_native(self.file) else runtime.file_uploads
+    async def store(self, call: ApiCall, work: Callable[P, Response], *args: P.args, **kwargs: P.kwargs) -> Response:
+        """Read and store it on a thread; files that wait for a worker have threads of their own."""
+        threads = call.runtime.uploads if seems_native(self.file) else call.runtime.file_uploads
+        return await threads.run(call.client, work, *args, **kwargs)
 
 
-async def read_upload(request: Request, runtime: Runtime, form: type[BaseModel] = ImportForm) -> PlanUpload:
-    """Read the file in a request, with its options.
-
-    Args:
-        request: the request.
-        runtime: the service.
-        form: known options.
+async def read_upload(call: ApiCall, form: type[BaseModel] = ImportForm) -> PlanUpload:
+    """Read the file in a request, with its options, the fields of a form.
 
     Raises:
         UnsupportedMediaError: the media type is not that of a plan file.
         UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_body` and `read_parts`.
         InvalidRequestError: a part or option is missing, unknown or invalid.
     """
-    limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
-    if media_type(request, (MULTIPART, *_FILES)) != MULTIPART:
-        return PlanUpload(await read_body(request, limits), ImportOptions(), {})
+    limits = UploadLimits.of(call.settings, "max_plan_bytes")
+    if media_type(call.request, (MULTIPART, *_FILES)) != MULTIPART:
+        return PlanUpload(await read_body(call.request, limits), ImportOptions(), {})
     known = set(form.model_fields)
-    parts = await read_parts(request, limits, files={_FILE}, fields=known, check=_faults)
+    parts = await read_parts(call.request, limits, files={_FILE}, fields=known, check=_faults)
     return PlanUpload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
 
 
@@ -147,3 +114,63 @@ def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
         except InvalidFloorPlanError as error:
             faults.append(("scale", error.reason))
     return faults
+
+
+def prepare_plan(uploaded: PlanUpload, call: ApiCall) -> tuple[NewPlan, PlanFile]:
+    """Return the plan in an uploaded file, with its pose grid if that is computed at once, and as it was read. Blocks.
+
+    Raises:
+        PlanTooLargeError: the plan needs too large a grid.
+        LaLaLocError: see `PlanReader.read`.
+    """
+    content, runtime = uploaded.file.read(), call.runtime
+    name = building_name(uploaded.file.name)
+    file = _reader(call).read(content, uploaded.options, name, call.client)
+    runtime.grids.check_size(file.plan)
+    original = Original(content, file.media_type, file.report)
+    return _new_plan(file, original, runtime.grids.prepare(file.plan, call.client), 0.0, call), file
+
+
+def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str) -> list[NewPlan]:
+    """Return a plan of every level of a file with rooms, with the pose grids that are computed at once. Blocks.
+
+    Raises:
+        InvalidRequestError: the file has more levels than a venue can have plans.
+        PlanTooLargeError: a level needs too large a grid.
+        LaLaLocError: see `PlanReader.read_levels`.
+    """
+    content, runtime = uploaded.file.read(), call.runtime
+    files = _reader(call).read_levels(content, uploaded.options, name, call.client)
+    limit = call.settings.plans.max_venue_plans
+    if len(files) > limit:
+        fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
+        raise InvalidRequestError([("file", fault)])
+    for file in files:
+        runtime.grids.check_size(file.plan, None if file.level is None else file.level.name)
+    grids = runtime.grids.prepare_all([file.plan for file in files], call.client)
+    originals = [_original(file, content if len(files) == 1 else None) for file in files]
+    return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
+
+
+def _reader(call: ApiCall) -> PlanReader:
+    return PlanReader(call.runtime.converter, call.settings, call.runtime.permits)
+
+
+def _new_plan(file: PlanFile, original: Original, grid: ComputedGrid | None, level: float, call: ApiCall) -> NewPlan:
+    later_bytes = call.runtime.grids.expected_bytes(file.plan) if grid is None else 0
+    return NewPlan(file.plan, original, file.document, grid, later_bytes, level)
+
+
+def _original(file: PlanFile, content: bytes | None) -> Original:
+    """Return the file that is kept for a plan: a level in the native format where the uploaded file has several."""
+    if content is not None:
+        return Original(content, file.media_type, file.report)
+    document = file.document or PlanDocument.from_plan(file.plan)
+    return Original(document.document.encode(), JSON, file.report)
+
+
+def _level_numbers(files: Sequence[PlanFile]) -> list[float]:
+    """Return the levels' numbers; their order if the file gives a level none."""
+    numbers = [0.0 if file.level is None else file.level.number for file in files]
+    known = [number for number in numbers if number is not None and abs(number) <= _MAX_LEVEL]
+    return known if len(known) == len(files) else [float(index) for index in range(len(files))]

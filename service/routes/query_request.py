@@ -1,41 +1,22 @@
-"""Common parts of queries: the multipart form with its photographs, and the errors."""
+"""Common parts of queries: the multipart form with its photographs, the search in a plan or venue, and the answer."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import json
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
-from fastapi import Request
+from fastapi import Response
 from pydantic import BaseModel
 
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPhotographError, InvalidPoseError
+from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from lalaloc_core.localise.search.pipeline import StageClock
-from service.errors import (
-    BytesInFlightError,
-    DeadlineExceededError,
-    DecoderNotReadyError,
-    FeaturesRequiredError,
-    IdempotencyInProgressError,
-    IdempotencyKeyReusedError,
-    InvalidRequestError,
-    MalformedRequestError,
-    OverloadedError,
-    PlanFailedError,
-    PlanNotReadyError,
-    SpoolFullError,
-    StoppingError,
-    StoreUnavailableError,
-    UnknownFloorPlanError,
-    UnsupportedMediaError,
-    UploadTimeoutError,
-    UploadTooLargeError,
-)
-from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
+from service import errors
 from service.http.uploads import (
+    GEOJSON,
     JSON,
     MULTIPART,
     Parts,
@@ -43,45 +24,23 @@ from service.http.uploads import (
     Settable,
     UploadLimits,
     faults_of,
+    media_type,
     read_parts,
     validate_fields,
 )
 from service.query import Content, QueryContext
-from service.routes.dependencies import IDEMPOTENCY_KEY
-from service.schemas import LocaliseForm, PhotographForm, SequenceForm
+from service.routes.dependencies import ApiCall
+from service.routes.descriptions import IDEMPOTENCY_KEY
+from service.schemas import LocaliseAnswer, LocaliseForm, PhotographForm, SequenceAnswer, SequenceForm
 from service.schemas.photographs import PhotographFields
-from service.settings import Settings
-from service.telemetry import add_log_fields
+from service.storage.records import PlanRecord, VenueRecord
 
 PHOTO, FEATURES = "photo", "features"
 # Name of the part in versions up to 0.5.
 PANORAMA = "panorama"
+VARY = {"Vary": "Accept"}
 Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
-# Errors of a query.
-QUERY_ERRORS: tuple[type[Exception], ...] = (
-    InvalidPhotographError,
-    InvalidFeaturesError,
-    ForeignFeaturesError,
-    FeaturesRequiredError,
-    InvalidPoseError,
-    InvalidRequestError,
-    MalformedRequestError,
-    UnknownFloorPlanError,
-    PlanFailedError,
-    PlanNotReadyError,
-    UnsupportedMediaError,
-    UploadTooLargeError,
-    UploadTimeoutError,
-    BytesInFlightError,
-    SpoolFullError,
-    OverloadedError,
-    StoreUnavailableError,
-    StoppingError,
-    DecoderNotReadyError,
-    DeadlineExceededError,
-    IdempotencyKeyReusedError,
-    IdempotencyInProgressError,
-)
+Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 
 
 def body_schema(form: type[BaseModel], photo: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,20 +62,8 @@ def body_schema(form: type[BaseModel], photo: Mapping[str, Any]) -> dict[str, An
     return {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]}
 
 
-def check_idempotent_media(request: Request, media: str) -> None:
-    """Refuse an idempotency key for an answer that is not JSON.
-
-    Raises:
-        InvalidRequestError: the request has such a key.
-    """
-    if media != JSON and IDEMPOTENCY_HEADER in request.headers:
-        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "works for answers in application/json only")])
-
-
 async def read_query(
-    request: Request,
-    settings: Settings,
-    client: str,
+    call: ApiCall,
     form_type: type[Form],
     limit: Settable,
     *,
@@ -126,9 +73,7 @@ async def read_query(
     """Read the form of a query and start the clock of its deadline.
 
     Args:
-        request: the request.
-        settings: settings of the service.
-        client: tenant or client address that the query counts for.
+        call: the request.
         form_type: model of the form.
         limit: name of the setting that limits the body.
         files: see `read_parts`.
@@ -138,12 +83,14 @@ async def read_query(
         the form, all parts, and the context of the query.
 
     Raises:
-        UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_parts`.
+        UploadTooLargeError, UploadTimeoutError, MalformedRequestError, UnsupportedMediaError: see `read_parts`.
         InvalidRequestError: a part or field is missing, unknown or invalid.
         FeaturesRequiredError: a photograph was sent to a service that takes features only.
     """
+    media_type(call.request, (MULTIPART,))
+    settings = call.settings
     clock = StageClock()
-    add_log_fields(request, clock=clock)
+    call.log(clock=clock)
     bounds = {"max_top_k": settings.photographs.max_top_k}
     limits = UploadLimits.of(settings, limit)
     if settings.photographs.require_features:
@@ -153,7 +100,7 @@ async def read_query(
     with clock.stage("upload"):
         try:
             parts = await read_parts(
-                request,
+                call.request,
                 limits,
                 files=set(files),
                 fields=set(form_type.model_fields),
@@ -162,20 +109,20 @@ async def read_query(
                 aliases={PANORAMA: PHOTO},
                 substitutes={FEATURES: PHOTO},
             )
-        except UploadTooLargeError as error:
+        except errors.UploadTooLargeError as error:
             if settings.photographs.require_features:
-                raise FeaturesRequiredError from error
+                raise errors.FeaturesRequiredError from error
             raise
     if settings.photographs.require_features and parts.named(PHOTO):
-        raise FeaturesRequiredError
-    context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
+        raise errors.FeaturesRequiredError
+    context = QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)
     if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
         form = form.model_copy(update={"top_k": min(form.top_k, settings.photographs.max_top_k)})
     return form, parts, context
 
 
-def photographs_of(parts: Parts, form: PhotographFields, bundle: Bundle) -> list[Content]:
+def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[Content]:
     """Return the photographs of a query in order: their files, or what was read of their features.
 
     Raises:
@@ -186,10 +133,52 @@ def photographs_of(parts: Parts, form: PhotographFields, bundle: Bundle) -> list
     if not features:
         return [*parts.named(PHOTO)]
     if stated := sorted(form.model_fields_set & PhotographFields.model_fields.keys()):
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [(name, f"is stated when {FEATURES} are computed; leave it out of the query") for name in stated]
         )
     for index, file in enumerate(features):
         if len(file) > MAX_BYTES:
             raise InvalidFeaturesError(f"{FEATURES}[{index}] has {len(file)} bytes; the limit is {MAX_BYTES}")
-    return [read_features(file.read(), bundle) for file in features]
+    return [read_features(file.read(), call.runtime.bundle) for file in features]
+
+
+def check_anchor(place: PlanRecord | VenueRecord, media: str) -> None:
+    """Check that the answer in a plan can be in latitude and longitude; that in a venue depends on the plan it finds.
+
+    Raises:
+        UnanchoredPlanError: the answer is GeoJSON, and the plan has no anchor.
+    """
+    if media == GEOJSON and isinstance(place, PlanRecord) and place.plan.anchor is None:
+        raise errors.UnanchoredPlanError(place.id)
+
+
+def answer_as(answer: Answer, media: str, to_geojson: Callable[[Answer], dict[str, Any] | None]) -> Response:
+    """Return an answer as JSON or GeoJSON.
+
+    Raises:
+        UnanchoredPlanError: GeoJSON is requested, and neither the plan nor the venue has an anchor.
+    """
+    if media != GEOJSON:
+        return Response(answer.model_dump_json(), headers=VARY, media_type=JSON)
+    feature = to_geojson(answer)
+    if feature is None:
+        raise errors.UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
+    return Response(json.dumps(feature), headers=VARY, media_type=GEOJSON)
+
+
+async def keep_answer(answer: LocaliseAnswer, call: ApiCall) -> LocaliseAnswer:
+    """Store an answer if `keep_answers_s` is set; return it with its id."""
+    storage = call.settings.storage
+    if storage.keep_answers_s == 0.0:
+        return answer
+
+    def with_id(answer_id: str) -> str:
+        return answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
+
+    keep = partial(call.store.answers.add, limit=storage.max_kept_answers)
+    try:
+        answer_id = await call.read(keep, call.tenant, answer.floorplan_id, with_id)
+    except (errors.StoreUnavailableError, errors.StorageQuotaError):
+        # The answer is valid although it could not be kept.
+        return answer
+    return answer.model_copy(update={"answer_id": answer_id})

@@ -3,94 +3,62 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, Any
+from dataclasses import asdict
+from functools import partial
+from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response, status
-from pydantic import BaseModel
+from fastapi import APIRouter, Query, Response, status
 
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.importers import building_name
 from service.errors import (
-    BytesInFlightError,
-    IdempotencyInProgressError,
-    IdempotencyKeyReusedError,
     InvalidRequestError,
-    MalformedRequestError,
     RevisionMismatchError,
-    SpoolFullError,
-    StorageQuotaError,
-    StoreFullError,
-    StoreUnavailableError,
     TooManyFloorPlansError,
     TooManyVenuesError,
     UnknownVenueError,
-    UnsupportedMediaError,
-    UploadTimeoutError,
-    UploadTooLargeError,
 )
-from service.http import IdempotentRequest
-from service.http.conditional import expected_revision, not_modified, tagged_answer
-from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
+from service.http.conditional import not_modified, revision_etag, tagged_answer
+from service.http.cursors import parse_venue_cursor
 from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body
-from service.routes.dependencies import (
+from service.http.uploads import JSON, MULTIPART, Parts, media_type
+from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
+from service.routes.descriptions import (
+    BODY_ERRORS,
+    CONDITIONAL,
+    IDEMPOTENCY_ERRORS,
     IDEMPOTENCY_KEY,
-    IF_NONE_MATCH,
-    NO_CONTROLS,
     NOT_MODIFIED,
+    READ_ERRORS,
+    STORE_ERRORS,
     UNLESS_CHANGED,
-    Client,
-    Running,
-    Tenant,
-    is_id,
+    UPLOAD_ERRORS,
+    json_body,
 )
-from service.routes.plan_uploads import LEVELS_FORM, REFUSED_UPLOADS, read_upload
-from service.routes.venue_answers import plan_entries, venue_representation, venue_summary
-from service.routes.venue_levels import add_levels_to_venue, store_venue_of_levels
-from service.runtime import Runtime
-from service.schemas import (
-    LevelsForm,
+from service.routes.plan_uploads import LEVELS_FORM, prepare_levels, read_upload
+from service.schemas.plan_import import LevelsForm
+from service.schemas.venues import (
+    VenueAnchorAnswer,
     VenueAnchorDocument,
     VenueAnswer,
     VenueChangeDocument,
     VenueDocument,
     VenueList,
+    VenuePlanAnswer,
     VenuePlanDocument,
     VenuePlanList,
+    VenueSummary,
 )
-from service.storage.records import Cursor, VenueMember, VenuePlace, VenueRecord
-from service.telemetry import add_log_fields
-from service.uploaded_file import UploadedFile
+from service.storage.records import NewPlan, PlanRecord, VenueMember, VenuePlace, VenueRecord
 
 router = APIRouter(prefix="/venues", tags=["venues"])
 
-_MAX_LISTED = 500
-# Characters of a route that idempotency keys belong to, enough for any id of a venue.
-_MAX_ROUTE = 64
+# Name of a venue of levels, if neither its file nor the request has one.
+_DEFAULT_NAME = "venue"
 # Lists, objects and further items of a venue document, besides those of its plans.
 _FURTHER_VALUES = 1000
-_REFUSED_BODIES = (
-    InvalidRequestError,
-    MalformedRequestError,
-    UnsupportedMediaError,
-    UploadTooLargeError,
-    UploadTimeoutError,
-    BytesInFlightError,
-    SpoolFullError,
-    StoreUnavailableError,
-    StoreFullError,
-    StorageQuotaError,
-)
-
-
-def _body(model: type[BaseModel]) -> dict[str, Any]:
-    return {"required": True, "content": {JSON: {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}}}
-
-
-_NEW_VENUE = _body(VenueDocument)
-_VENUE_CHANGE = _body(VenueChangeDocument)
-for _described in (_NEW_VENUE, _VENUE_CHANGE):
-    _described["content"][MULTIPART] = LEVELS_FORM
+_VENUE_RESPONSES = problem_responses(UnknownVenueError, *READ_ERRORS)
 
 
 @router.post(
@@ -98,179 +66,159 @@ for _described in (_NEW_VENUE, _VENUE_CHANGE):
     status_code=status.HTTP_201_CREATED,
     summary="Create a venue",
     response_model=VenueAnswer,
-    openapi_extra={"requestBody": _NEW_VENUE, "parameters": [IDEMPOTENCY_KEY]},
-    responses=problem_responses(
-        *REFUSED_UPLOADS,
-        TooManyFloorPlansError,
-        TooManyVenuesError,
-        IdempotencyKeyReusedError,
-        IdempotencyInProgressError,
-    ),
+    openapi_extra={
+        "requestBody": json_body(VenueDocument, **{MULTIPART: LEVELS_FORM}),
+        "parameters": [IDEMPOTENCY_KEY],
+    },
+    responses=problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, TooManyVenuesError, *IDEMPOTENCY_ERRORS),
 )
-async def create_venue(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def create_venue(call: Call) -> Response:
     """Group floor plans, each on a level, so that one query searches all of them.
 
     A JSON body lists stored plans. A form has a plan file of any format: every level with rooms becomes a plan, and all
     of them a venue, or nothing is stored. A plan can belong to several venues. Deleting a plan removes it from its
     venues.
     """
-    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /venues")
-    if media_type(request, (JSON, MULTIPART)) == MULTIPART:
-        uploaded = await read_upload(request, runtime, LevelsForm)
+    idempotent, limits = call.idempotent(), call.settings.plans
+    if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
+        uploaded = await read_upload(call, LevelsForm)
 
         def store_levels(token: str) -> Response:
-            record = store_venue_of_levels(uploaded, runtime, tenant, client, token)
-            return _written(request, record, runtime, status.HTTP_201_CREATED)
+            name = uploaded.options.name or building_name(uploaded.file.name) or _DEFAULT_NAME
+            plans = prepare_levels(uploaded, call, name)
+            record, stored = call.store.venue_imports.add(
+                call.tenant, token, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
+            )
+            _announce(plans, stored, call)
+            return _change_answer(call, record, created=True)
 
-        return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store_levels)
-    content = await _read(request, runtime)
+        return await uploaded.store(call, idempotent.run, uploaded.parts, store_levels)
+    content = await call.read_json()
 
     def store(token: str) -> Response:
-        document = _document(VenueDocument, content.read(), runtime)
-        members = _members(document.plans, runtime)
-        limit = runtime.settings.plans.max_venues
-        record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
-        return _written(request, record, runtime, status.HTTP_201_CREATED)
+        document = _document(VenueDocument, content.read(), call)
+        members, anchor = _members(document.plans, call), _anchor(document.anchor)
+        add = call.store.venues.add
+        record = add(call.tenant, token, document.name, anchor, members, limit=limits.max_venues)
+        return _change_answer(call, record, created=True)
 
-    return await runtime.uploads.run(client, idempotent.run, Parts({}, {"body": content}), store)
+    return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
 
 
-@router.get("", summary="List venues", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
-def list_venues(
-    runtime: Running,
-    tenant: Tenant,
-    name: Annotated[
-        str | None,
-        Query(max_length=200, pattern=NO_CONTROLS, description="Part of the name; case is ignored."),
-    ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-) -> VenueList:
+@router.get("", summary="List venues", responses=problem_responses(*READ_ERRORS))
+def list_venues(call: Call, page: Page, name: Name = None) -> VenueList:
     """List stored venues, newest first."""
-    after = None if cursor is None else parse_cursor(cursor)
-    found = runtime.store.venues.list_venues(tenant, limit=limit + 1, after=after, name=name)
-    page = found[:limit]
-    more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
-    return VenueList(venues=[venue_summary(record) for record in page], next_cursor=more)
+    found, more = page.read(partial(call.store.venues.list_venues, call.tenant, name=name))
+    return VenueList(venues=[_summary(record) for record in found], next_cursor=more)
 
 
 @router.get(
     "/{venue_id}",
     summary="Get a venue",
     response_model=VenueAnswer,
-    openapi_extra={"parameters": [IF_NONE_MATCH]},
-    responses=NOT_MODIFIED | problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
+    openapi_extra=CONDITIONAL,
+    responses=NOT_MODIFIED | _VENUE_RESPONSES,
 )
-def get_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+def get_venue(venue_id: str, call: Call) -> Response:
     """Return a stored venue with the number of plans that are ready."""
-    record = _stored(tenant, venue_id, runtime)
-    content, etag = venue_representation(record, runtime)
-    return not_modified(request, etag) or tagged_answer([content], JSON, etag)
+    content, etag = _representation(call.venue(venue_id), call)
+    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
 
 
-@router.get(
-    "/{venue_id}/plans",
-    summary="List the plans of a venue",
-    responses=problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
-)
+@router.get("/{venue_id}/plans", summary="List the plans of a venue", responses=_VENUE_RESPONSES)
 def list_venue_plans(
     venue_id: str,
-    runtime: Running,
-    tenant: Tenant,
+    call: Call,
+    page: Page,
     level: Annotated[
         float | None, Query(ge=-1000, le=1000, allow_inf_nan=False, description="Level of the plans.")
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
 ) -> VenuePlanList:
     """List the plans of a venue from the lowest level up, with the state of their pose grids.
 
     Paging returns every plan that stays in the venue on the same level exactly once.
     """
-    record = _stored(tenant, venue_id, runtime)
-    after = None if cursor is None else parse_venue_cursor(cursor)
-    found = runtime.store.venues.plans(record.id, limit=limit + 1, after=after, level=level)
-    page = found[:limit]
-    more = venue_cursor_text(VenuePlace(page[-1].level, page[-1].plan_id)) if len(found) > limit else None
-    return VenuePlanList(plans=plan_entries(page, runtime), next_cursor=more)
+    find = partial(call.store.venues.plans, call.venue(venue_id).id, level=level)
+    found, more = page.read(find, lambda member: VenuePlace(member.level, member.plan_id), parse_venue_cursor)
+    return VenuePlanList(plans=_plan_entries(found, call), next_cursor=more)
 
 
 @router.put(
     "/{venue_id}",
     summary="Replace a venue",
     response_model=VenueAnswer,
-    openapi_extra={"requestBody": _body(VenueDocument), "parameters": UNLESS_CHANGED},
-    responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
+    openapi_extra={"requestBody": json_body(VenueDocument), "parameters": UNLESS_CHANGED},
+    responses=problem_responses(
+        InvalidRequestError, *BODY_ERRORS, *STORE_ERRORS, UnknownVenueError, RevisionMismatchError
+    ),
 )
-async def replace_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def replace_venue(venue_id: str, call: Call) -> Response:
     """Replace the name, anchor and plans of a venue; fields that are left out are reset."""
-    content = await _read(request, runtime)
+    content = await call.read_json()
 
     def store() -> Response:
-        current = _stored(tenant, venue_id, runtime)
-        expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = _document(VenueDocument, content.read(), runtime)
-        record = runtime.store.venues.change(
-            tenant,
+        current = call.venue(venue_id)
+        expected = call.expected_revision(current)
+        document = _document(VenueDocument, content.read(), call)
+        record = call.store.venues.change(
+            call.tenant,
             current.id,
             name=document.name,
             anchor=_anchor(document.anchor),
             drop_anchor=document.anchor is None,
-            members=_members(document.plans, runtime),
+            members=_members(document.plans, call),
             replace_members=True,
-            max_plans=runtime.settings.plans.max_venue_plans,
+            max_plans=call.settings.plans.max_venue_plans,
             expected=expected,
         )
-        return _written(request, record, runtime, status.HTTP_200_OK)
+        return _change_answer(call, record, created=False)
 
-    return await runtime.uploads.run(client, store)
+    return await call.upload(store)
 
 
 @router.patch(
     "/{venue_id}",
     summary="Change a venue",
     response_model=VenueAnswer,
-    openapi_extra={"requestBody": _VENUE_CHANGE, "parameters": [*UNLESS_CHANGED, IDEMPOTENCY_KEY]},
+    openapi_extra={
+        "requestBody": json_body(VenueChangeDocument, **{MULTIPART: LEVELS_FORM}),
+        "parameters": [*UNLESS_CHANGED, IDEMPOTENCY_KEY],
+    },
     responses=problem_responses(
-        *REFUSED_UPLOADS,
-        UnknownVenueError,
-        RevisionMismatchError,
-        TooManyFloorPlansError,
-        IdempotencyKeyReusedError,
-        IdempotencyInProgressError,
+        *UPLOAD_ERRORS, UnknownVenueError, RevisionMismatchError, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS
     ),
 )
-async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
+async def change_venue(venue_id: str, call: Call) -> Response:
     """Change the name, the anchor or some plans of a venue.
 
     A form has a plan file as for `POST /venues`: every level with rooms becomes a plan of the venue, or nothing is
     stored. With an idempotency key, a repeated request does not add the plans again.
     """
-    if media_type(request, (JSON, MULTIPART)) == MULTIPART:
-        return await _add_levels(venue_id, request, runtime, tenant, client)
-    content = await _read(request, runtime)
+    if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
+        return await _add_levels(venue_id, call)
+    content = await call.read_json()
 
     def store() -> Response:
-        current = _stored(tenant, venue_id, runtime)
-        expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        document = _document(VenueChangeDocument, content.read(), runtime)
+        current = call.venue(venue_id)
+        expected = call.expected_revision(current)
+        document = _document(VenueChangeDocument, content.read(), call)
         given = document.model_fields_set
         if not given:
             raise InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
-        record = runtime.store.venues.change(
-            tenant,
+        record = call.store.venues.change(
+            call.tenant,
             current.id,
             name=document.name if "name" in given else None,
             anchor=_anchor(document.anchor),
             drop_anchor="anchor" in given and document.anchor is None,
-            members=_members(document.plans, runtime),
+            members=_members(document.plans, call),
             removed=_removed(document),
-            max_plans=runtime.settings.plans.max_venue_plans,
+            max_plans=call.settings.plans.max_venue_plans,
             expected=expected,
         )
-        return _written(request, record, runtime, status.HTTP_200_OK)
+        return _change_answer(call, record, created=False)
 
-    return await runtime.uploads.run(client, store)
+    return await call.upload(store)
 
 
 @router.delete(
@@ -278,59 +226,61 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
     status_code=status.HTTP_204_NO_CONTENT,
     summary="Delete a venue",
     openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(UnknownVenueError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError),
+    responses=problem_responses(UnknownVenueError, RevisionMismatchError, *READ_ERRORS),
 )
-def delete_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
+def delete_venue(venue_id: str, call: Call) -> None:
     """Delete a venue; its floor plans are kept."""
-    current = _stored(tenant, venue_id, runtime)
-    expected = expected_revision(request, current.id, current.revision_id, what="venue")
-    if not runtime.store.venues.delete(tenant, current.id, expected=expected):
+    current = call.venue(venue_id)
+    if not call.store.venues.delete(call.tenant, current.id, expected=call.expected_revision(current)):
         raise UnknownVenueError(venue_id)
 
 
-async def _add_levels(venue_id: str, request: Request, runtime: Runtime, tenant: str, client: str) -> Response:
-    idempotent = IdempotentRequest(
-        runtime.store.idempotency_keys, request, tenant, f"PATCH /venues/{venue_id}"[:_MAX_ROUTE]
-    )
-    uploaded = await read_upload(request, runtime, LevelsForm)
+async def _add_levels(venue_id: str, call: ApiCall) -> Response:
+    idempotent, limits = call.idempotent(), call.settings.plans
+    uploaded = await read_upload(call, LevelsForm)
 
     def store(token: str) -> Response:
-        current = _stored(tenant, venue_id, runtime)
-        expected = expected_revision(request, current.id, current.revision_id, what="venue")
-        record = add_levels_to_venue(uploaded, runtime, tenant, client, current, token, expected)
-        return _written(request, record, runtime, status.HTTP_200_OK)
+        current = call.venue(venue_id)
+        expected = call.expected_revision(current)
+        plans = prepare_levels(uploaded, call, uploaded.options.name or current.name or _DEFAULT_NAME)
+        record, stored = call.store.venue_imports.extend(
+            call.tenant,
+            current.id,
+            token,
+            plans,
+            max_plans=limits.max_floorplans,
+            max_venue_plans=limits.max_venue_plans,
+            expected=expected,
+        )
+        _announce(plans, stored, call)
+        return _change_answer(call, record, created=False)
 
-    return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
-
-
-def _stored(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
-    record = runtime.store.venues.get(tenant, venue_id) if is_id(venue_id) else None
-    if record is None:
-        raise UnknownVenueError(venue_id)
-    return record
-
-
-async def _read(request: Request, runtime: Runtime) -> UploadedFile:
-    media_type(request, (JSON,))
-    return await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
+    return await uploaded.store(call, idempotent.run, uploaded.parts, store)
 
 
-def _document(model: type[Model], content: bytes, runtime: Runtime) -> Model:
+def _announce(plans: list[NewPlan], records: list[PlanRecord], call: ApiCall) -> None:
+    """Tell the provider of grids about stored plans; there are no records if an earlier attempt stored them."""
+    # The grids that an earlier attempt left are computed later.
+    for record, new in zip(records, plans, strict=False):
+        call.runtime.grids.on_plan_stored(record, new.grid)
+
+
+def _document(model: type[Model], content: bytes, call: ApiCall) -> Model:
     # A plan has four values, and one more to remove it.
-    return parse_document(model, content, 5 * runtime.settings.plans.max_venue_plans + _FURTHER_VALUES)
+    return parse_document(model, content, 5 * call.settings.plans.max_venue_plans + _FURTHER_VALUES)
 
 
 def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
     return None if document is None else Anchor(**document.model_dump())
 
 
-def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[VenueMember]:
+def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
     """Return the plans of a venue in a request.
 
     Raises:
         InvalidRequestError: too many plans, duplicates, or invalid ids.
     """
-    limit = runtime.settings.plans.max_venue_plans
+    limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise InvalidRequestError(
             [("plans", f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)")]
@@ -353,11 +303,54 @@ def _removed(document: VenueChangeDocument) -> set[str]:
     return removed
 
 
-def _written(request: Request, record: VenueRecord, runtime: Runtime, code: int) -> Response:
-    add_log_fields(request, venue=record.id, revision=record.revision_id)
-    content, etag = venue_representation(record, runtime)
-    path = str(request.app.url_path_for("get_venue", venue_id=record.id))
-    headers = {"Content-Location": path, "ETag": etag}
-    if code == status.HTTP_201_CREATED:
-        headers["Location"] = path
-    return Response(content, code, headers, JSON)
+def _change_answer(call: ApiCall, record: VenueRecord, *, created: bool) -> Response:
+    call.log(venue=record.id, revision=record.revision_id)
+    content, etag = _representation(record, call)
+    return call.change_answer(content, etag, call.path_of("get_venue", venue_id=record.id), created=created)
+
+
+def _summary(record: VenueRecord) -> VenueSummary:
+    """Return a venue as an item of a list."""
+    return VenueSummary(
+        id=record.id,
+        revision=record.revision_id,
+        name=record.name,
+        anchor=None if record.anchor is None else VenueAnchorAnswer(**asdict(record.anchor)),
+        plans=record.plans,
+        created_at=record.created_at,
+        updated_at=record.updated_at,
+    )
+
+
+def _representation(record: VenueRecord, call: ApiCall) -> tuple[bytes, str]:
+    """Return a venue as JSON, and its entity tag."""
+    counts = call.runtime.venue_plans.counts(record.tenant, record.id)
+    answer = VenueAnswer(
+        **_summary(record).model_dump(),
+        revision_number=record.revision,
+        plans_ready=counts.ready,
+        plans_failed=counts.failed,
+    )
+    content = answer.model_dump_json().encode()
+    return content, revision_etag(record.revision_id, content)
+
+
+def _plan_entries(members: list[VenueMember], call: ApiCall) -> list[VenuePlanAnswer]:
+    """Return the plans of a venue; a plan that was just deleted is left out."""
+    summaries = call.store.plans.summaries([member.plan_id for member in members])
+    states = dict(zip([summary.id for summary in summaries], call.runtime.grids.states(summaries), strict=True))
+    by_id = {summary.id: summary for summary in summaries}
+    return [
+        VenuePlanAnswer(
+            floorplan_id=member.plan_id,
+            revision=by_id[member.plan_id].revision_id,
+            level=member.level,
+            name=member.name or by_id[member.plan_id].name,
+            status=states[member.plan_id].status,
+            progress=states[member.plan_id].progress,
+            rooms=by_id[member.plan_id].room_count,
+            area_m2=by_id[member.plan_id].area_m2,
+        )
+        for member in members
+        if member.plan_id in by_id
+    ]

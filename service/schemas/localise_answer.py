@@ -50,11 +50,11 @@ class GeoPose(ResponseModel):
 
 
 _LATENT_DISTANCE = Field(
-    ge=0, le=2, description="Distance between the latents of the pose's layout and of the panorama."
+    ge=0, le=2, description="Distance between the latents of the pose's layout and of the photograph."
 )
 _COST = Field(
     ge=0,
-    description="Matching cost between the walls around the pose and the panorama, dimensionless; lower is better. "
+    description="Matching cost between the walls around the pose and the photograph, dimensionless; lower is better. "
     "Candidates are ranked by it and by hints. Candidates that were refined less than the first come last, and their "
     "costs are not comparable with the others.",
 )
@@ -91,7 +91,7 @@ class CandidateAnswer(ResponseModel):
 
 
 class PosteriorAnswer(ResponseModel):
-    """Posterior over places, given that the panorama is of this plan; all lists have one entry per place."""
+    """Posterior over places, given that the photograph is of this plan; all lists have one entry per place."""
 
     step_m: float = Field(description="Distance between neighbouring places on the plan's pose grid.")
     x_m: list[Metres]
@@ -149,7 +149,7 @@ class LocaliseAnswer(ResponseModel):
     room: str
     room_id: str = Field(description="`id` of the room, unique in the plan.")
     confidence: Share | None = Field(
-        description="Probability that the position is right within 1 m: the probability that the panorama is of this "
+        description="Probability that the position is right within 1 m: the probability that the photograph is of this "
         "plan, times the share of this place in the posterior over all places (of all plans of a venue). Null for a "
         "model without confidence.",
     )
@@ -158,20 +158,20 @@ class LocaliseAnswer(ResponseModel):
     )
     probability_elsewhere: Share | None = Field(
         default=None,
-        description="Probability that the panorama is of none of the places of the plan (of a venue: of the plans that "
-        "were searched). It sums to 1 with the probabilities of the candidates and of all places that are near no "
+        description="Probability that the photograph is of none of the places of the plan (of a venue: of the plans "
+        "that were searched). It sums to 1 with the probabilities of the candidates and of all places that are near no "
         "candidate. Null if `confidence` is null.",
     )
     warnings: list[str] = Field(
-        description="Parts of the request that were not followed, such as a hint that the panorama contradicts."
+        description="Parts of the request that were not followed, such as a hint that the photograph contradicts."
     )
     heading_source: Literal["given", "panorama", "searched"] = Field(
-        description="Source of the heading: the request, the panorama's metadata, or the search."
+        description="Source of the heading: the request, the photograph's metadata, or the search."
     )
     stage: Literal["retrieval", "vdr", "lpo"] = Field(description="Last stage that ran.")
     covariance_m2: Covariance | None = Field(
         description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m. Along a "
-        "direction that the panorama does not constrain, as in a corridor, it is that of the whole room. Null unless "
+        "direction that the photograph does not constrain, as in a corridor, it is that of the whole room. Null unless "
         "`stage` is `lpo`, and for a model without confidence."
     )
     heading_std_deg: Degrees | None = Field(

@@ -7,22 +7,16 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from service.schemas.fields import Finite
+from service.schemas.form_validators import needs, reject_underscores
 from service.schemas.photographs import PhotographFields
-from service.schemas.query_fields import CameraFields, HintFields, check_plan_or_venue
+from service.schemas.query_fields import CameraFields, HintFields, PlaceFields
 
 HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
 
 
-class LocaliseForm(CameraFields, HintFields, PhotographFields):
+class LocaliseForm(PlaceFields, CameraFields, HintFields, PhotographFields):
     """Form fields of a query, without the photograph; an empty field counts as left out."""
 
-    venue_id: str | None = Field(None, min_length=1, description="Id of a venue, to search all its plans.")
-    floorplan_id: str | None = Field(
-        None,
-        min_length=1,
-        description="Id of the floor plan. Either this or `venue_id` is required.",
-        validate_default=True,
-    )
     heading_deg: Annotated[float, Finite] | None = Field(
         None,
         ge=-360,
@@ -54,26 +48,12 @@ class LocaliseForm(CameraFields, HintFields, PhotographFields):
             raise ValueError("works for one plan, not for a venue")
         return value
 
-    @field_validator("heading_deg", "heading_tolerance_deg", mode="before")
-    @classmethod
-    def _reject_underscores(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
+    _check_numbers = field_validator("heading_deg", "heading_tolerance_deg", mode="before")(reject_underscores)
+    _check_tolerance = field_validator("heading_tolerance_deg")(needs("heading_deg"))
 
     @field_validator("floorplan_id")
     @classmethod
-    def _plan_or_venue(cls, value: str | None, given: ValidationInfo) -> str | None:
-        if "venue_id" in given.data:
-            check_plan_or_venue(value, given.data["venue_id"])
+    def _check_level(cls, value: str | None, given: ValidationInfo) -> str | None:
         if value is not None and given.data.get("level") is not None:
             raise ValueError("level needs venue_id instead of floorplan_id")
-        return value
-
-    @field_validator("heading_tolerance_deg")
-    @classmethod
-    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
-        # Generated clients send defaults too.
-        if value > 0.0 and given.data.get("heading_deg", 0.0) is None:
-            raise ValueError("needs heading_deg")
         return value

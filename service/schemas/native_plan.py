@@ -82,7 +82,9 @@ class FloorPlanDocument(BaseModel):
 
     name: str = Field("floor plan", description="Name of the plan.")
     ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling height of rooms without their own.")
-    camera_height_m: float = Field(1.5, ge=MIN_CAMERA_HEIGHT_M, description="Camera height of panoramas of this plan.")
+    camera_height_m: float = Field(
+        1.5, ge=MIN_CAMERA_HEIGHT_M, description="Camera height of photographs of this plan."
+    )
     north_deg: float | None = Field(
         None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
     )

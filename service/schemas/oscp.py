@@ -112,7 +112,7 @@ class OscpRequest(_Sent):
 
 
 class OscpQuaternion(ResponseModel):
-    """Rotation from the camera (x right, y along the panorama's centre, z up) to east, north, up."""
+    """Rotation from the camera (x right, y along the photograph's centre, z up) to east, north, up."""
 
     x: float
     y: float

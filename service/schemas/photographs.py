@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -10,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from lalaloc_core.photograph import Intrinsics, StatedCamera
 from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
 from service.schemas.fields import Degrees, Finite, ResponseModel, Score, Share, SignedDegrees
+from service.schemas.form_validators import parse_json, reject_underscores
 
 Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
 ValueSource = Literal["given", "gpano", "exif", "estimated", "assumed"]
@@ -70,22 +70,10 @@ class PhotographFields(BaseModel):
         f"{MAX_ROLL_DEG:g} either way. Default: as for `pitch_deg`.",
     )
 
-    @field_validator("intrinsics", mode="before")
-    @classmethod
-    def _parse_intrinsics(cls, value: object) -> object:
-        if not isinstance(value, str):
-            return value
-        try:
-            return json.loads(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError('not a JSON object such as {"fx": 2870, "fy": 2868}') from error
-
-    @field_validator("hfov_deg", "pitch_deg", "roll_deg", mode="before")
-    @classmethod
-    def _reject_underscored_angles(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
+    _parse_intrinsics = field_validator("intrinsics", mode="before")(
+        parse_json('a JSON object such as {"fx": 2870, "fy": 2868}')
+    )
+    _check_angles = field_validator("hfov_deg", "pitch_deg", "roll_deg", mode="before")(reject_underscores)
 
     @property
     def stated_camera(self) -> StatedCamera:

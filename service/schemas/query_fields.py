@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
@@ -13,6 +12,7 @@ from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.localise.query import DEFAULT_STD_M, RADIUS_RANGE_M, UNKNOWN_RANGE_M
 from service.schemas.fields import Finite
+from service.schemas.form_validators import parse_json, reject_underscores
 
 
 class CameraFields(BaseModel):
@@ -40,12 +40,9 @@ class CameraFields(BaseModel):
         json_schema_extra={"maximum": 100},
     )
 
-    @field_validator("camera_height_m", "camera_height_std_m", "top_k", mode="before")
-    @classmethod
-    def _reject_underscores(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
+    _check_camera_numbers = field_validator("camera_height_m", "camera_height_std_m", "top_k", mode="before")(
+        reject_underscores
+    )
 
     @field_validator("top_k")
     @classmethod
@@ -56,21 +53,33 @@ class CameraFields(BaseModel):
         return value
 
 
-def check_plan_or_venue(floorplan_id: str | None, venue_id: str | None) -> None:
-    """Check that a request names one plan or one venue.
+class PlaceFields(BaseModel):
+    """Form fields for the plan or the venue that is searched."""
 
-    Raises:
-        PydanticCustomError: it names neither.
-        ValueError: it names both.
-    """
-    if floorplan_id is None and venue_id is None:
-        raise PydanticCustomError("missing", "missing")
-    if floorplan_id is not None and venue_id is not None:
-        raise ValueError("set floorplan_id or venue_id, not both")
+    venue_id: str | None = Field(None, min_length=1, description="Id of a venue, to search all its plans.")
+    floorplan_id: str | None = Field(
+        None,
+        min_length=1,
+        description="Id of the floor plan. Either this or `venue_id` is required.",
+        validate_default=True,
+    )
+
+    @field_validator("floorplan_id")
+    @classmethod
+    def _check_place(cls, value: str | None, given: ValidationInfo) -> str | None:
+        # An invalid venue is missing from the data and reported already.
+        if "venue_id" in given.data:
+            if value is None and given.data["venue_id"] is None:
+                raise PydanticCustomError("missing", "missing")
+            if value is not None and given.data["venue_id"] is not None:
+                raise ValueError("set floorplan_id or venue_id, not both")
+        return value
 
 
 _MAX_ROOMS = 100
 _A_POINT = '{"x_m": 3.5, "y_m": 2.0}'
+_parse_point = parse_json(f"a JSON object such as {_A_POINT}", dict)
+_parse_rooms = parse_json('a JSON array such as ["kitchen", "hall"]')
 _ON_EARTH = '{"latitude": 48.13722, "longitude": 11.57569}'
 
 
@@ -127,7 +136,7 @@ class HintFields(BaseModel):
     )
     strict: bool = Field(
         False,
-        description="Search only places that agree with the hints and the given heading. Otherwise a panorama that "
+        description="Search only places that agree with the hints and the given heading. Otherwise a photograph that "
         "clearly contradicts them overrules them, with a warning in the answer.",
     )
 
@@ -136,12 +145,7 @@ class HintFields(BaseModel):
     def _parse_point(cls, value: object) -> object:
         if not isinstance(value, str):
             return value
-        try:
-            found = json.loads(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError(f"not a JSON object such as {_A_POINT}") from error
-        if not isinstance(found, dict):
-            raise ValueError(f"not a JSON object such as {_A_POINT}")
+        found: Any = _parse_point(value)
         # Chosen by the keys, so that errors are about the kind of point that was meant.
         return (EarthPoint if found.keys() & EarthPoint.model_fields.keys() else PlanPoint).model_validate(found)
 
@@ -152,17 +156,9 @@ class HintFields(BaseModel):
             return value
         if not value.lstrip().startswith("["):
             return [value]
-        try:
-            return json.loads(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError('not a JSON array such as ["kitchen", "hall"]') from error
+        return _parse_rooms(value)
 
-    @field_validator("radius_m", "level", mode="before")
-    @classmethod
-    def _reject_underscores(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
+    _check_hint_numbers = field_validator("radius_m", "level", mode="before")(reject_underscores)
 
     @field_validator("radius_m")
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -14,9 +13,10 @@ from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.measured_motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
+from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import PhotographFields, ViewAnswer
-from service.schemas.query_fields import CameraFields, check_plan_or_venue
+from service.schemas.query_fields import CameraFields, PlaceFields
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
 AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
@@ -87,7 +87,15 @@ class StatedHeading(BaseModel):
     heading_tolerance_deg: float
 
 
-class SequenceForm(CameraFields, PhotographFields):
+# Fields that do not go with a value of `motion`, and the message about them.
+_WRONG_MOTION = {
+    "camera_heights_m": ("turn", "does not go with motion=turn; send camera_height_m"),
+    "relative_heading_deg": ("walk", "needs motion=turn"),
+    "motions": ("turn", "does not go with motion=turn; send relative_heading_deg"),
+}
+
+
+class SequenceForm(PlaceFields, CameraFields, PhotographFields):
     """Form fields of a query with several photographs; an empty field counts as left out.
 
     The fields about the camera hold for all photographs.
@@ -97,12 +105,6 @@ class SequenceForm(CameraFields, PhotographFields):
         None,
         min_length=1,
         description="Id of a venue, to search all its plans. A measured motion links places of one plan.",
-    )
-    floorplan_id: str | None = Field(
-        None,
-        min_length=1,
-        description="Id of the floor plan. Either this or `venue_id` is required.",
-        validate_default=True,
     )
     motion: Literal["walk", "turn"] = Field(
         "walk",
@@ -141,59 +143,20 @@ class SequenceForm(CameraFields, PhotographFields):
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
     )
 
-    @field_validator("floorplan_id")
-    @classmethod
-    def _check_place(cls, value: str | None, given: ValidationInfo) -> str | None:
-        if "venue_id" in given.data:
-            check_plan_or_venue(value, given.data["venue_id"])
-        return value
+    _parse_lists = field_validator(
+        "motions", "headings_deg", "relative_heading_deg", "camera_heights_m", mode="before"
+    )(parse_json("a JSON array", list))
+    _check_numbers = field_validator("heading_tolerance_deg", "relative_heading_std_deg", mode="before")(
+        reject_underscores
+    )
+    _check_tolerance = field_validator("heading_tolerance_deg")(needs("headings_deg"))
 
-    @field_validator("motions", "headings_deg", "relative_heading_deg", "camera_heights_m", mode="before")
+    @field_validator(*_WRONG_MOTION)
     @classmethod
-    def _parse_array(cls, value: object) -> object:
-        if not isinstance(value, str):
-            return value
-        try:
-            found = json.loads(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError("not a JSON array") from error
-        if not isinstance(found, list):
-            raise ValueError("not a JSON array")
-        return found
-
-    @field_validator("heading_tolerance_deg", "relative_heading_std_deg", mode="before")
-    @classmethod
-    def _reject_underscores(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
-
-    @field_validator("heading_tolerance_deg")
-    @classmethod
-    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
-        if value > 0.0 and given.data.get("headings_deg", ()) is None:
-            raise ValueError("needs headings_deg")
-        return value
-
-    @field_validator("camera_heights_m")
-    @classmethod
-    def _check_heights(cls, value: object, given: ValidationInfo) -> object:
-        if value is not None and given.data.get("motion") == "turn":
-            raise ValueError("does not go with motion=turn; send camera_height_m")
-        return value
-
-    @field_validator("relative_heading_deg")
-    @classmethod
-    def _check_relative(cls, value: object, given: ValidationInfo) -> object:
-        if value is not None and given.data.get("motion") == "walk":
-            raise ValueError("needs motion=turn")
-        return value
-
-    @field_validator("motions")
-    @classmethod
-    def _check_motions(cls, value: object, given: ValidationInfo) -> object:
-        if value is not None and given.data.get("motion") == "turn":
-            raise ValueError("does not go with motion=turn; send relative_heading_deg")
+    def _check_motion(cls, value: object, given: ValidationInfo) -> object:
+        motion, fault = _WRONG_MOTION[given.field_name or ""]
+        if value is not None and given.data.get("motion") == motion:
+            raise ValueError(fault)
         return value
 
     def faults(self, photographs: int) -> list[tuple[str, str]]:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import math
 from datetime import datetime
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN
 from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
+from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import PhotographFields, ReadView
-from service.schemas.query_fields import CameraFields, EarthPoint, PlanPoint, check_plan_or_venue
+from service.schemas.query_fields import CameraFields, EarthPoint, PlaceFields, PlanPoint
 
 # `Odometry` checks the limits of motions, which this only describes.
 Step = Annotated[float, Finite, Field(json_schema_extra={"minimum": -MAX_STEP_M, "maximum": MAX_STEP_M})]
@@ -31,7 +31,7 @@ MAX_PATH = 200
 _DRIFT, _LEAST_M, _TURN_PER_M_DEG, _LEAST_DEG = 0.05, 0.02, 2.0, 1.0
 
 
-class SessionDocument(CameraFields):
+class SessionDocument(PlaceFields, CameraFields):
     """Begin of a session: the plan or venue, the camera, and what is known about the place of the first photograph."""
 
     model_config = ConfigDict(
@@ -40,12 +40,6 @@ class SessionDocument(CameraFields):
 
     venue_id: str | None = Field(
         None, min_length=1, description="Id of a venue; the camera can move between its plans."
-    )
-    floorplan_id: str | None = Field(
-        None,
-        min_length=1,
-        description="Id of the floor plan. Either this or `venue_id` is required.",
-        validate_default=True,
     )
     near: PlanPoint | EarthPoint | None = Field(
         None,
@@ -61,13 +55,6 @@ class SessionDocument(CameraFields):
     level: Annotated[float, Finite] | None = Field(
         None, description="Level of the venue that the first photograph is on. Needs `venue_id`."
     )
-
-    @field_validator("floorplan_id")
-    @classmethod
-    def _plan_or_venue(cls, value: str | None, given: ValidationInfo) -> str | None:
-        if "venue_id" in given.data:
-            check_plan_or_venue(value, given.data["venue_id"])
-        return value
 
     @model_validator(mode="after")
     def _check_near(self) -> Self:
@@ -118,29 +105,9 @@ class PhotographForm(PhotographFields):
         0.0, ge=0, le=45, description="Largest error of `heading_deg`, as in `POST /localise`. Needs `heading_deg`."
     )
 
-    @field_validator("covariance", mode="before")
-    @classmethod
-    def _parse_rows(cls, value: object) -> object:
-        if not isinstance(value, str):
-            return value
-        try:
-            return json.loads(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError("not a JSON array of three rows") from error
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _reject_underscores(cls, value: object) -> object:
-        if isinstance(value, str) and "_" in value:
-            raise ValueError("not a number")
-        return value
-
-    @field_validator("heading_tolerance_deg")
-    @classmethod
-    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
-        if value > 0.0 and given.data.get("heading_deg", 0.0) is None:
-            raise ValueError("needs heading_deg")
-        return value
+    _parse_covariance = field_validator("covariance", mode="before")(parse_json("a JSON array of three rows"))
+    _check_numbers = field_validator("*", mode="before")(reject_underscores)
+    _check_tolerance = field_validator("heading_tolerance_deg")(needs("heading_deg"))
 
     @model_validator(mode="after")
     def _check_motion(self) -> Self:

@@ -70,7 +70,7 @@ class PlanContentAnswer(ResponseModel):
     rooms: list[RoomAnswer]
     area_m2: SquareMetres = Field(description="Sum of the rooms' floor areas.")
     bounds: BoundsAnswer
-    camera_height_m: float = Field(description="Camera height of panoramas of this plan.")
+    camera_height_m: float = Field(description="Camera height of photographs of this plan.")
     warnings: list[str] = Field(
         description="Likely mistakes in the plan, such as overlapping rooms, rooms without a door or improbable "
         "ceilings."

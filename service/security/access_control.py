@@ -9,15 +9,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import Scope
 
-from service.errors import (
-    ExposedWithoutKeysError,
-    InsufficientScopeError,
-    IssuerUnavailableError,
-    RateLimitedError,
-    StoreUnavailableError,
-    TooManyRefusedKeysError,
-    UnauthenticatedError,
-)
+from service import errors
 from service.security.exposure import check_origin, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import PresentedKey, parse_authorization, parse_token
@@ -30,13 +22,13 @@ from service.telemetry import add_log_fields
 
 # Errors of `AuthorisationMiddleware`, besides 404 and 405.
 REFUSALS = (
-    UnauthenticatedError,
-    InsufficientScopeError,
-    ExposedWithoutKeysError,
-    RateLimitedError,
-    TooManyRefusedKeysError,
-    StoreUnavailableError,
-    IssuerUnavailableError,
+    errors.UnauthenticatedError,
+    errors.InsufficientScopeError,
+    errors.ExposedWithoutKeysError,
+    errors.RateLimitedError,
+    errors.TooManyRefusedKeysError,
+    errors.StoreUnavailableError,
+    errors.IssuerUnavailableError,
 )
 _NO_KEY = "an API key is required: send `Authorization: Bearer lalaloc_...`"
 _MALFORMED = "the Authorization header must be `Bearer lalaloc_...`, with one API key"
@@ -79,7 +71,7 @@ class AccessControl:
         if not self._needs_keys:
             self._check_local(request, request.method)
             if Permission.ADMIN in permissions_needed(routed_path(request.scope)).values():
-                raise InsufficientScopeError(Permission.ADMIN, None)
+                raise errors.InsufficientScopeError(Permission.ADMIN, None)
             return anyone(_client_of(request))
         is_read = request.method in ("GET", "HEAD")
         if is_read and is_page(routed_path(request.scope)) and "authorization" not in request.headers:
@@ -89,7 +81,7 @@ class AccessControl:
         await self._rates.count(identity)
         needed = _needed(request)
         if needed not in identity.permissions:
-            raise InsufficientScopeError(needed, identity.permissions)
+            raise errors.InsufficientScopeError(needed, identity.permissions)
         return Caller(identity.tenant, identity, identity.permissions, client=identity.tenant)
 
     async def charge(self, caller: Caller, sent_bytes: int) -> None:
@@ -116,7 +108,7 @@ class AccessControl:
             if presented is not None:
                 return await self._holder_of_key(request, presented) is not None
             return self._tokens is not None and token is not None and await self._tokens.verify(token) is not None
-        except (StoreUnavailableError, IssuerUnavailableError, UnauthenticatedError):
+        except (errors.StoreUnavailableError, errors.IssuerUnavailableError, errors.UnauthenticatedError):
             return False
 
     def check_handshake(self, request: Request) -> None:
@@ -139,7 +131,7 @@ class AccessControl:
         """
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
-            raise ExposedWithoutKeysError("over a loopback address", "" if server is None else str(server[0]))
+            raise errors.ExposedWithoutKeysError("over a loopback address", "" if server is None else str(server[0]))
         # Only proxies use Unix sockets, and they pass on the host name that their clients use.
         if server is not None and server[1] is not None:
             headers = Headers(scope=request.scope)
@@ -148,7 +140,7 @@ class AccessControl:
     async def _identity_of(self, request: Request) -> Identity:
         values = Headers(scope=request.scope).getlist("authorization")
         if not values:
-            raise UnauthenticatedError(_NO_KEY + self._or_token)
+            raise errors.UnauthenticatedError(_NO_KEY + self._or_token)
         client = _client_of(request)
         presented = parse_authorization(values)
         try:
@@ -158,13 +150,13 @@ class AccessControl:
                     await self._rates.check_refused(client)
                 identity = await self._holder_of_key(request, presented)
                 if identity is None:
-                    raise UnauthenticatedError(_REFUSED)
+                    raise errors.UnauthenticatedError(_REFUSED)
                 return identity
             token = parse_token(values)
             if self._tokens is None or token is None:
-                raise UnauthenticatedError(_MALFORMED + self._or_token)
+                raise errors.UnauthenticatedError(_MALFORMED + self._or_token)
             return await self._tokens.verify(token)
-        except UnauthenticatedError:
+        except errors.UnauthenticatedError:
             await self._rates.count_refused(client)
             raise
 
@@ -178,7 +170,7 @@ class AccessControl:
         key = await self._keys.find(presented)
         if key is not None and key.is_expired(datetime.now(UTC)):
             add_log_fields(request, key=key.id, tenant=key.tenant)
-            raise UnauthenticatedError(
+            raise errors.UnauthenticatedError(
                 f"the API key expired at {key.expires_at:%Y-%m-%dT%H:%M:%SZ}; use its successor, or ask the operator"
             )
         return None if key is None else Identity.of_key(key)

@@ -22,16 +22,8 @@ from urllib.parse import quote
 
 from starlette.requests import Request
 
-from service.errors import (
-    ExposedWithoutKeysError,
-    InsufficientScopeError,
-    IssuerUnavailableError,
-    RateLimitedError,
-    StoreUnavailableError,
-    TooManyRefusedKeysError,
-    UnauthenticatedError,
-)
-from service.security.access_control import routed_path
+from service.errors import StoreUnavailableError
+from service.security.access_control import REFUSALS, routed_path
 from service.security.permissions import Caller, Permission, permissions_needed, template_of
 from service.storage.audit_log import AuditLog
 from service.storage.records import ANONYMOUS, DONE, AuditEntry
@@ -39,14 +31,7 @@ from service.telemetry import LOGGER_NAME
 from service.telemetry.log_fields import log_fields_of
 
 # Refusals that are audited, besides those of changes.
-AUDITED_REFUSALS = (
-    UnauthenticatedError,
-    InsufficientScopeError,
-    ExposedWithoutKeysError,
-    RateLimitedError,
-    TooManyRefusedKeysError,
-    IssuerUnavailableError,
-)
+AUDITED_REFUSALS = tuple(error for error in REFUSALS if error is not StoreUnavailableError)
 # Statuses of refusals by routes that are not audited otherwise: photographs where features are required, or too many.
 REFUSED = frozenset({403, 429})
 # nginx's status for a client that disconnected before the answer; a change may have been made.
@@ -54,6 +39,7 @@ CLIENT_CLOSED = 499
 READING = frozenset({"GET", "HEAD"})
 _METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _DETAIL = "lalaloc.audit_detail"
+# Interval (s) at which counted entries are stored.
 _FLUSH_S = 60.0
 # Different entries per actor and minute, and of all actors; further ones are counted without resource and address.
 _MAX_PER_ACTOR, _MAX_COUNTED = 20, 1000
@@ -119,12 +105,10 @@ class AuditTrail:
 
     Args:
         log: the stored log.
-        flush_s: interval (s) at which counted entries are stored.
     """
 
-    def __init__(self, log: AuditLog, *, flush_s: float = _FLUSH_S) -> None:
+    def __init__(self, log: AuditLog) -> None:
         self._log = log
-        self._flush_s = flush_s
         self._lock = threading.Lock()
         self._counted: dict[AuditEntry, AuditEntry] = {}
         self._per_actor = Counter[str]()
@@ -207,19 +191,10 @@ class AuditTrail:
         logging.getLogger(LOGGER_NAME).error("audit entries are not stored", extra={"fields": fields})
 
     def _run(self) -> None:
-        while not self._stop.wait(self._flush_s):
+        while not self._stop.wait(_FLUSH_S):
             self.flush()
 
 
 def _same(entry: AuditEntry) -> AuditEntry:
     """Return the part of an entry in which counted entries are equal."""
-    return AuditEntry(
-        actor=entry.actor,
-        tenant=entry.tenant,
-        address=entry.address,
-        action=entry.action,
-        resource=entry.resource,
-        status=entry.status,
-        result=entry.result,
-        created_at=_NO_TIME,
-    )
+    return replace(entry, count=1, request_id=None, detail=None, created_at=_NO_TIME)

@@ -79,7 +79,7 @@ class LpoSettings(SettingGroup):
 
 
 class DecodeSettings(SettingGroup):
-    """Decoding panoramas."""
+    """Decoding photographs."""
 
     prefix = "decode_"
 
@@ -87,13 +87,14 @@ class DecodeSettings(SettingGroup):
         default=2,
         ge=1,
         le=64,
-        description="Processes that decode panoramas, one at a time each. One is reserved for idle tenants.",
+        description="Processes that decode photographs, one at a time each. One is reserved for idle tenants.",
     )
     stall_s: Seconds = Field(
-        default=4.0, description="Timeout for decoding one panorama; the process is then replaced and the query fails."
+        default=4.0,
+        description="Timeout for decoding one photograph; the process is then replaced and the query fails.",
     )
     memory_bytes: int = Field(
-        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one panorama; enforced on Linux."
+        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one photograph; enforced on Linux."
     )
 
 
@@ -345,7 +346,8 @@ class StorageSettings(SettingGroup):
         default=0.0,
         ge=0.0,
         le=366 * 86400.0,
-        description="Lifetime of kept answers, which a link reopens; panoramas are never kept. 0: no answers are kept.",
+        description="Lifetime of kept answers, which a link reopens; photographs are never kept. 0: no answers are "
+        "kept.",
     )
     max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is deleted first.")
     session_ttl_s: float = Field(

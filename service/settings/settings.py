@@ -19,21 +19,7 @@ from lalaloc_core.bundle import default_bundle
 from lalaloc_core.errors import ConfigError
 from service.capacity.cores import CoreShares, share_cores, usable_cores
 from service.capacity.fair_share import with_headroom
-from service.settings.setting_groups import (
-    AccessSettings,
-    ComputeSettings,
-    DatabaseSettings,
-    DecodeSettings,
-    GridSettings,
-    ImportSettings,
-    LpoSettings,
-    PhotographSettings,
-    PlanSettings,
-    RequestSettings,
-    SettingGroup,
-    StorageSettings,
-    UploadSettings,
-)
+from service.settings import setting_groups as groups
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
@@ -87,18 +73,18 @@ class Settings(BaseModel):
         description="URL of an OpenTelemetry collector, `http://collector:4318/v1/traces`, for spans of requests and "
         "their stages. Needs the extra `otel`.",
     )
-    database: DatabaseSettings = DatabaseSettings()
-    compute: ComputeSettings = ComputeSettings()
-    lpo: LpoSettings = LpoSettings()
-    decode: DecodeSettings = DecodeSettings()
-    imports: ImportSettings = ImportSettings()
-    access: AccessSettings = AccessSettings()
-    uploads: UploadSettings = UploadSettings()
-    requests: RequestSettings = RequestSettings()
-    grids: GridSettings = GridSettings()
-    storage: StorageSettings = StorageSettings()
-    plans: PlanSettings = PlanSettings()
-    photographs: PhotographSettings = PhotographSettings()
+    database: groups.DatabaseSettings = groups.DatabaseSettings()
+    compute: groups.ComputeSettings = groups.ComputeSettings()
+    lpo: groups.LpoSettings = groups.LpoSettings()
+    decode: groups.DecodeSettings = groups.DecodeSettings()
+    imports: groups.ImportSettings = groups.ImportSettings()
+    access: groups.AccessSettings = groups.AccessSettings()
+    uploads: groups.UploadSettings = groups.UploadSettings()
+    requests: groups.RequestSettings = groups.RequestSettings()
+    grids: groups.GridSettings = groups.GridSettings()
+    storage: groups.StorageSettings = groups.StorageSettings()
+    plans: groups.PlanSettings = groups.PlanSettings()
+    photographs: groups.PhotographSettings = groups.PhotographSettings()
 
     def __init__(self, **values: Any) -> None:
         """Check the values.
@@ -207,7 +193,7 @@ def settings_table() -> str:
 def _fields() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
     """Yield the name, the path of attributes and the field of every setting."""
     for name, field in Settings.model_fields.items():
-        if isinstance(field.default, SettingGroup):
+        if isinstance(field.default, groups.SettingGroup):
             for inner, inner_field in type(field.default).model_fields.items():
                 yield field.default.prefix + inner, (name, inner), inner_field
         else:

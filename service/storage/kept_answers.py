@@ -1,4 +1,4 @@
-"""Answers that are kept for a while, so that a link opens them again; the panoramas are never stored."""
+"""Answers that are kept for a while, so that a link opens them again; the photographs are never stored."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import and_, delete, select
 
 from service.storage.database import Database
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
@@ -65,15 +65,8 @@ class KeptAnswers:
 
     def delete(self, tenant: str, answer_id: str) -> bool:
         """Delete an answer; False without one."""
-        statement = delete(KEPT_ANSWERS).where(_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id)
-
-        def work(connection: Connection) -> bool:
-            freed = deleted_bytes(connection, statement)
-            if freed:
-                self._quota.settle(connection, tenant, StoredBytes(answers=-freed))
-            return freed > 0
-
-        return self._database.freeing(work)
+        own = and_(_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id)
+        return self._quota.purge("answers", KEPT_ANSWERS, own) > 0
 
     def purge(self, *, kept_s: float) -> int:
         """Delete answers older than `kept_s` (s), and return their number."""

@@ -40,7 +40,7 @@ class PlanLookup:
             StoreBusyError: all connections are in use.
             DamagedDataError: the plan's document is damaged.
         """
-        if (known := self._during_outage(tenant, plan_id)) is not None:
+        if self._breaker.is_open and (known := self._recent(tenant, plan_id)) is not None:
             return known
         begin_s = monotonic()
         try:
@@ -49,23 +49,11 @@ class PlanLookup:
             if isinstance(error, StoreBusyError) or self._store.answered_since(begin_s):
                 # The database answers, so the plan may have been deleted.
                 raise
-            return self._despite(error, tenant, plan_id)
+            self._breaker.trip()
+            if (known := self._recent(tenant, plan_id)) is None:
+                raise
+            return known
         return await parsed(found, self._store.plans, reads)
-
-    def _during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """Return a recently read plan from memory if the database failed a moment ago."""
-        return self._recent(tenant, plan_id) if self._breaker.is_open else None
-
-    def _despite(self, error: StoreUnavailableError, tenant: str, plan_id: str) -> PlanRecord:
-        """Return a recently read plan, because the database failed.
-
-        Raises:
-            StoreUnavailableError: the plan was not read recently.
-        """
-        self._breaker.trip()
-        if (known := self._recent(tenant, plan_id)) is None:
-            raise error
-        return known
 
     def _recent(self, tenant: str, plan_id: str) -> PlanRecord | None:
         return self._store.plan_cache.recent(tenant, plan_id, self._max_age_s)

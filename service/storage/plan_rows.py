@@ -16,7 +16,7 @@ from lalaloc_core.localise.query import DEFAULT_STD_M
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_places import place_columns
-from service.storage.records import ComputedGrid, GridKey, Original, PlanRecord
+from service.storage.records import GridKey, NewPlan, Original, PlanRecord
 from service.storage.statements import write_all_chunks, write_chunks
 from service.storage.stored_bytes import ROW_BYTES, StoredBytes
 from service.storage.stored_grids import grid_bytes, insert_grid, insert_grids
@@ -37,20 +37,11 @@ class PlanContent:
     grid: tuple[GridKey, PackedGrid] | None
 
     @classmethod
-    def prepare(
-        cls, record: PlanRecord, original: Original, document: PlanDocument | None, grid: ComputedGrid | None
-    ) -> Self:
-        """Prepare the rows of a record.
-
-        Args:
-            record: the plan at its new revision.
-            original: the uploaded file.
-            document: the plan's stored form, if it is made already.
-            grid: the plan's own grid, if it is computed already.
-        """
-        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
-        document = document or PlanDocument.from_plan(record.plan)
-        return cls(document, original, hashlib.sha256(original.content).hexdigest(), packed)
+    def prepare(cls, revision_id: str, new: NewPlan) -> Self:
+        """Prepare the rows of a new revision."""
+        packed = None if new.grid is None else (new.grid.key(revision_id), pack(new.grid.grid, new.grid.prototypes))
+        document = new.document or PlanDocument.from_plan(new.plan)
+        return cls(document, new.original, hashlib.sha256(new.original.content).hexdigest(), packed)
 
     @property
     def stored(self) -> StoredBytes:
@@ -61,27 +52,18 @@ class PlanContent:
         return StoredBytes(plans=plan, grids=0 if self.grid is None else grid_bytes(self.grid[1]))
 
 
-def new_record(
-    plan: FloorPlan,
-    original: Original,
-    *,
-    plan_id: str,
-    tenant: str,
-    number: int,
-    created_at: datetime,
-    updated_at: datetime,
-) -> PlanRecord:
-    """Return the record of a plan at a new revision."""
+def new_record(new: NewPlan, plan_id: str, tenant: str, now: datetime) -> PlanRecord:
+    """Return the record of a plan at its first revision."""
     return PlanRecord(
         id=plan_id,
         tenant=tenant,
         revision_id=uuid.uuid4().hex,
-        revision=number,
-        created_at=created_at,
-        updated_at=updated_at,
-        plan=plan,
+        revision=1,
+        created_at=now,
+        updated_at=now,
+        plan=new.plan,
         failure=None,
-        report=original.report,
+        report=new.original.report,
     )
 
 

@@ -22,8 +22,8 @@ from service.storage.plan_rows import (
     new_record,
     revision_values,
 )
-from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord, PlanSummary
-from service.storage.statements import damaged, lock_plan_of, newest_first, select_summaries
+from service.storage.records import Cursor, NewPlan, PlanRecord, PlanSummary
+from service.storage.statements import damaged, lock_plan_of, newest_first, select_revisions, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
@@ -68,18 +68,7 @@ class Plans:
         """Set the function that parses documents; it returns None for a damaged one."""
         self._parse = parse
 
-    def add(
-        self,
-        tenant: str,
-        plan_id: str,
-        plan: FloorPlan,
-        *,
-        original: Original,
-        limit: int,
-        document: PlanDocument | None = None,
-        grid: ComputedGrid | None = None,
-        later_bytes: int = 0,
-    ) -> PlanRecord:
+    def add(self, tenant: str, plan_id: str, new: NewPlan, *, limit: int) -> PlanRecord:
         """Store a plan, its uploaded file, and its grid if it is already computed.
 
         An existing id is a repeated upload whose first answer was lost; the stored plan is returned.
@@ -87,26 +76,21 @@ class Plans:
         Args:
             tenant: owner of the plan.
             plan_id: a new id, or the id of a repeated upload; callers never choose it.
-            plan: the plan.
-            original: the uploaded file.
+            new: the plan.
             limit: maximum number of the tenant's plans.
-            document: the plan's stored form, if it is made already.
-            grid: the plan's own grid.
-            later_bytes: expected size of the own grid if it is computed later; there must be room for it.
 
         Raises:
             TooManyFloorPlansError: the tenant has `limit` plans already.
             StorageQuotaError: the tenant would store too many bytes.
         """
-        now = datetime.now(UTC)
-        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
-        content = PlanContent.prepare(record, original, document, grid)
+        record = new_record(new, plan_id, tenant, datetime.now(UTC))
+        content = PlanContent.prepare(record.revision_id, new)
         with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
                 if count_plans(connection, tenant) >= limit:
                     raise TooManyFloorPlansError(limit)
-                self._quota.check(connection, tenant, content.stored.total + later_bytes)
+                self._quota.check(connection, tenant, content.stored.total + new.later_bytes)
                 if insert_plan(connection, self._database, record, content):
                     self._quota.settle(connection, tenant, content.stored)
                     # Exact now, because settling locks the tenant.
@@ -121,17 +105,7 @@ class Plans:
         return record
 
     def add_revision(
-        self,
-        tenant: str,
-        plan_id: str,
-        plan: FloorPlan,
-        *,
-        original: Original,
-        keep: int,
-        expected: str | None = None,
-        document: PlanDocument | None = None,
-        grid: ComputedGrid | None = None,
-        later_bytes: int = 0,
+        self, tenant: str, plan_id: str, new: NewPlan, *, keep: int, expected: str | None = None
     ) -> PlanRecord:
         """Store a new revision of a plan, and delete revisions beyond `keep`.
 
@@ -140,22 +114,17 @@ class Plans:
         Args:
             tenant: owner of the plan.
             plan_id: id of the plan.
-            plan: the new plan.
-            original: the uploaded file.
+            new: the new plan.
             keep: maximum number of revisions.
             expected: id of the revision that the plan must have; None for any.
-            document: the plan's stored form, if it is made already.
-            grid: the plan's own grid.
-            later_bytes: as for `add`.
 
         Raises:
             UnknownFloorPlanError: the tenant has no such plan.
             RevisionMismatchError: the plan is not at revision `expected`.
             StorageQuotaError: the tenant would store too many bytes.
         """
-        now = datetime.now(UTC)
-        record = new_record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
-        content = PlanContent.prepare(record, original, document, grid)
+        record = new_record(new, plan_id, tenant, datetime.now(UTC))
+        content = PlanContent.prepare(record.revision_id, new)
         with self._database.writing(grows_by=content.stored.total) as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -168,7 +137,7 @@ class Plans:
             record = replace(record, revision=number, created_at=row.created_at)
             freed = _delete_revisions(connection, own, grids_before=number - 1, before=number - keep + 1)
             change = content.stored - freed
-            self._quota.check(connection, tenant, change.total + later_bytes)
+            self._quota.check(connection, tenant, change.total + new.later_bytes)
             insert_revision(connection, record, content)
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**revision_values(record)))
             self._quota.settle(connection, tenant, change, changed_plan=plan_id)
@@ -249,17 +218,9 @@ class Plans:
 
     def stored(self, revision_id: str) -> StoredPlan | None:
         """Return a plan at a revision with its unparsed document, regardless of tenant. Callers check access first."""
-        columns = REVISIONS.c
-        query = select(
-            columns.plan_id.label("id"),
-            columns.id.label("revision_id"),
-            columns.number.label("revision"),
-            FLOORPLANS.c.created_at,
-            columns.created_at.label("updated_at"),
-            columns.report,
-        ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.id == columns.plan_id)
+        query = select_revisions(REVISIONS.c.report, current=False).where(REVISIONS.c.id == revision_id)
         with self._database.reading() as connection:
-            row = connection.execute(query.where(columns.id == revision_id)).one_or_none()
+            row = connection.execute(query).one_or_none()
             if row is None:
                 return None
             return StoredPlan(**row._mapping, document=_document(connection, revision_id))
@@ -305,29 +266,26 @@ class Plans:
         self._cache.forget(tenant, plan_id)
         return deleted
 
-    def set_failure(self, revision_id: str, reason: str) -> None:
-        """Store the error of the computation of a revision's own grid."""
-        self._set_failure(revision_id, reason)
+    def set_failure(self, revision_id: str, reason: str | None) -> None:
+        """Store the error of the computation of a revision's own grid; None deletes it."""
+        with self._database.writing() as connection:
+            plan = lock_plan_of(connection, revision_id)
+            if plan is not None:
+                connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
+                self._quota.settle(connection, plan.tenant, StoredBytes(), refuse=False, changed_plan=plan.id)
 
     def clear_failures(self) -> None:
         """Delete all stored errors, so that these grids are computed again."""
         with self._database.reading() as connection:
             failed = connection.scalars(select(REVISIONS.c.id).where(REVISIONS.c.failure.is_not(None))).all()
         for revision_id in failed:
-            self._set_failure(revision_id, None)
+            self.set_failure(revision_id, None)
 
     def current_revisions(self, revision_ids: Collection[str]) -> set[str]:
         """Return the revisions among `revision_ids` that are the current ones of their plans."""
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
             return set(connection.scalars(query))
-
-    def _set_failure(self, revision_id: str, reason: str | None) -> None:
-        with self._database.writing() as connection:
-            plan = lock_plan_of(connection, revision_id)
-            if plan is not None:
-                connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
-                self._quota.settle(connection, plan.tenant, StoredBytes(), refuse=False, changed_plan=plan.id)
 
     def _delete(self, connection: Connection, tenant: str, plan_id: str, expected: str | None) -> bool:
         mine = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
@@ -390,14 +348,4 @@ def _select_current(tenant: str, plan_id: str) -> Any:
 
 def _select_heads(*, current: bool) -> Any:
     """Return a query for the columns of `PlanRecord` except `plan`, at the current or at every revision."""
-    link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
-    return select(
-        FLOORPLANS.c.id,
-        FLOORPLANS.c.tenant,
-        REVISIONS.c.id.label("revision_id"),
-        REVISIONS.c.number.label("revision"),
-        FLOORPLANS.c.created_at,
-        REVISIONS.c.created_at.label("updated_at"),
-        REVISIONS.c.failure,
-        REVISIONS.c.report,
-    ).join_from(FLOORPLANS, REVISIONS, link)
+    return select_revisions(FLOORPLANS.c.tenant, REVISIONS.c.failure, REVISIONS.c.report, current=current)

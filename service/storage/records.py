@@ -9,7 +9,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
 from service.storage.grid_format import SortedPrototypes
-from service.stored_plan import PlanHead
+from service.stored_plan import PlanDocument, PlanHead
 
 # Tenant of all callers without API keys.
 DEFAULT_TENANT = "default"
@@ -63,6 +63,27 @@ class Original:
     content: bytes
     media_type: str = JSON
     report: str | None = None
+
+
+@dataclass(frozen=True)
+class NewPlan:
+    """Plan, or revision of one, that is stored.
+
+    Attributes:
+        plan: the plan.
+        original: the uploaded file.
+        document: the plan's stored form, if it is made already.
+        grid: its own grid, if it is computed already.
+        later_bytes: expected size of its own grid if that is computed later; there must be room for it.
+        level: its level, if it is stored with its venue.
+    """
+
+    plan: FloorPlan
+    original: Original
+    document: PlanDocument | None = None
+    grid: ComputedGrid | None = None
+    later_bytes: int = 0
+    level: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from sqlalchemy import Connection, Row, delete, func, select, update
+from sqlalchemy import Connection, Row, and_, delete, func, select, update
 
 from service.errors import (
     PhotographOutOfOrderError,
@@ -193,15 +193,8 @@ class Sessions:
 
     def delete(self, tenant: str, session_id: str) -> bool:
         """Delete a session; False without one."""
-        statement = delete(SESSIONS).where(_COLUMNS.tenant == tenant, _COLUMNS.id == session_id)
-
-        def work(connection: Connection) -> bool:
-            freed = deleted_bytes(connection, statement)
-            if freed:
-                self._quota.settle(connection, tenant, StoredBytes(sessions=-freed))
-            return freed > 0
-
-        return self._database.freeing(work)
+        own = and_(_COLUMNS.tenant == tenant, _COLUMNS.id == session_id)
+        return self._quota.purge("sessions", SESSIONS, own) > 0
 
     def purge(self) -> int:
         """Delete expired sessions, and return their number."""

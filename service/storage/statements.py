@@ -95,6 +95,13 @@ def damaged(part: str, plan_id: str, revision_id: str) -> DamagedDataError:
 
 def select_summaries(*, current: bool = True) -> Any:
     """Return a query for the columns of `PlanSummary`, of all plans at their current or at every revision."""
+    numbers = (REVISIONS.c.room_count, REVISIONS.c.area_m2, REVISIONS.c.camera_height_m)
+    anchored = FLOORPLANS.c.latitude.is_not(None).label("anchored")
+    return select_revisions(FLOORPLANS.c.name, *numbers, REVISIONS.c.failure, anchored, current=current)
+
+
+def select_revisions(*columns: Any, current: bool) -> Any:
+    """Return a query for ids, numbers and times of plans at their current or at every revision, and more columns."""
     link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
     return select(
         FLOORPLANS.c.id,
@@ -102,12 +109,7 @@ def select_summaries(*, current: bool = True) -> Any:
         REVISIONS.c.number.label("revision"),
         FLOORPLANS.c.created_at,
         REVISIONS.c.created_at.label("updated_at"),
-        FLOORPLANS.c.name,
-        REVISIONS.c.room_count,
-        REVISIONS.c.area_m2,
-        REVISIONS.c.camera_height_m,
-        REVISIONS.c.failure,
-        FLOORPLANS.c.latitude.is_not(None).label("anchored"),
+        *columns,
     ).join_from(FLOORPLANS, REVISIONS, link)
 
 

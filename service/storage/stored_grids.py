@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, or_, select, update
@@ -222,7 +223,7 @@ class GridLeases:
         columns = GRID_LEASES.c
         until_s = self._database.now_s() + lease_s
         values = {"owner": owner, "lease_until_s": until_s, "length_s": lease_s, "progress": 0.0}
-        statement = self._database.insert(GRID_LEASES).values(**_columns(key), **values, attempts=1)
+        statement = self._database.insert(GRID_LEASES).values(**asdict(key), **values, attempts=1)
         statement = statement.on_conflict_do_update(
             index_elements=list(GRID_LEASES.primary_key),
             set_=values | {"attempts": columns.attempts + 1},
@@ -286,7 +287,7 @@ def insert_grids(connection: Connection, grids: Sequence[tuple[GridKey, PackedGr
 
 def _row(key: GridKey, packed: PackedGrid) -> dict[str, Any]:
     return {
-        **_columns(key),
+        **asdict(key),
         "poses": packed.poses,
         "size_bytes": len(packed.content),
         "sha256": packed.sha256,
@@ -306,17 +307,8 @@ def _unpacked(key: GridKey, content: bytes | bytearray | None, sha256: str) -> P
     return grid
 
 
-def _columns(key: GridKey) -> dict[str, Any]:
-    return {
-        "revision_id": key.revision_id,
-        "model_sha256": key.model_sha256,
-        "step_m": key.step_m,
-        "camera_height_mm": key.camera_height_mm,
-    }
-
-
 def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
-    return [table.c[name] == value for name, value in _columns(key).items()]
+    return [table.c[name] == value for name, value in asdict(key).items()]
 
 
 def _drop_older_models(connection: Connection, key: GridKey) -> int:

@@ -10,37 +10,14 @@ from datetime import UTC, datetime
 
 from sqlalchemy import Connection, select, update
 
-from lalaloc_core.floorplan import FloorPlan
 from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_rows import PlanContent, count_plans, insert_plans, new_record
-from service.storage.records import ComputedGrid, Original, PlanRecord, VenueMember, VenueRecord
+from service.storage.records import NewPlan, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, VENUES
 from service.storage.venue_rows import check_count, check_members, find_venue, insert_members, insert_venue, lock_venue
-from service.stored_plan import PlanDocument
-
-
-@dataclass(frozen=True, kw_only=True)
-class NewPlan:
-    """Plan that is stored with its venue.
-
-    Attributes:
-        plan: the plan.
-        level: its level in the venue.
-        original: the uploaded file.
-        document: its stored form, if it is made already.
-        grid: its own grid, if it is computed already.
-        later_bytes: expected size of its own grid if that is computed later.
-    """
-
-    plan: FloorPlan
-    level: float
-    original: Original
-    document: PlanDocument | None = None
-    grid: ComputedGrid | None = None
-    later_bytes: int = 0
 
 
 class VenueImports:
@@ -183,22 +160,9 @@ class _Batch:
     def of(cls, tenant: str, token: str, plans: Sequence[NewPlan]) -> _Batch:
         """Prepare plans, whose ids are the same for every attempt of a request."""
         now = datetime.now(UTC)
-        records = [
-            new_record(
-                new.plan,
-                new.original,
-                plan_id=hashlib.sha256(f"{token} {number}".encode()).hexdigest()[:32],
-                tenant=tenant,
-                number=1,
-                created_at=now,
-                updated_at=now,
-            )
-            for number, new in enumerate(plans)
-        ]
-        contents = [
-            PlanContent.prepare(record, new.original, new.document, new.grid)
-            for record, new in zip(records, plans, strict=True)
-        ]
+        ids = [hashlib.sha256(f"{token} {number}".encode()).hexdigest()[:32] for number in range(len(plans))]
+        records = [new_record(new, plan_id, tenant, now) for new, plan_id in zip(plans, ids, strict=True)]
+        contents = [PlanContent.prepare(record.revision_id, new) for record, new in zip(records, plans, strict=True)]
         members = [VenueMember(record.id, new.level) for record, new in zip(records, plans, strict=True)]
         return cls(tenant, now, records, contents, members, sum(new.later_bytes for new in plans))
 

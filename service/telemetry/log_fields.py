@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _SCOPE_KEY = "lalaloc.log_fields"
 
 
-@dataclass
+@dataclass(slots=True)
 class RequestLogFields:
     """Fields of one request; None if unknown.
 
@@ -59,33 +59,10 @@ def attach_log_fields(scope: MutableMapping[str, Any], log_fields: RequestLogFie
     scope[_SCOPE_KEY] = log_fields
 
 
-def add_log_fields(
-    request: HTTPConnection,
-    *,
-    plan: str | None = None,
-    venue: str | None = None,
-    revision: str | None = None,
-    stage: str | None = None,
-    clock: StageClock | None = None,
-    rejection: str | None = None,
-    key: str | None = None,
-    tenant: str | None = None,
-) -> None:
-    """Set fields of a request; omitted fields keep their value. Never pass secrets."""
+def add_log_fields(request: HTTPConnection, **fields: str | StageClock | None) -> None:
+    """Set attributes of a request's `RequestLogFields`; those that are None keep their value. Never pass secrets."""
     log_fields = log_fields_of(request.scope)
-    if log_fields is None:
-        return
-    fields = {
-        "plan": plan,
-        "venue": venue,
-        "revision": revision,
-        "stage": stage,
-        "clock": clock,
-        "rejection": rejection,
-        "key": key,
-        "tenant": tenant,
-    }
-    for name, value in fields.items():
+    for name, value in fields.items() if log_fields is not None else ():
         if value is not None:
             setattr(log_fields, name, value)
 

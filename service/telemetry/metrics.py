@@ -61,24 +61,14 @@ class Telemetry:
         self._collectors: dict[str, Collector] = {}
         ProcessCollector(registry=self.registry)
         self.requests = self.counter("lalaloc_http_requests", "Answered requests.", ["method", "route", "status"])
-        self.request_seconds = Histogram(
-            "lalaloc_http_request_seconds",
-            "Duration of requests, including the upload.",
-            ["route"],
-            buckets=_SECONDS,
-            registry=self.registry,
+        self.request_seconds = self._histogram(
+            "lalaloc_http_request_seconds", "Duration of requests, including the upload.", ["route"]
         )
         self.rejections = self.counter("lalaloc_rejections", "Refused requests, by problem kind.", ["reason"])
         self.disconnects = self.counter(
             "lalaloc_disconnects", "Requests whose client disconnected before the end of the answer.", ["route"]
         )
-        self.stage_seconds = Histogram(
-            "lalaloc_stage_seconds",
-            "Duration of each stage of a query.",
-            ["stage"],
-            buckets=_SECONDS,
-            registry=self.registry,
-        )
+        self.stage_seconds = self._histogram("lalaloc_stage_seconds", "Duration of each stage of a query.", ["stage"])
         self.answers = self.counter("lalaloc_localise_answers", "Answered queries, by last stage.", ["stage"])
         self.lpo_missed = self.counter(
             "lalaloc_lpo_missed", "LPO jobs without a result in time, by reason.", ["reason"]
@@ -96,11 +86,8 @@ class Telemetry:
         self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Pose grids found in memory.")
         self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Pose grids not found in memory.")
         self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Pose grids evicted from memory.")
-        self.grid_seconds = Histogram(
-            "lalaloc_grid_seconds",
-            "Duration of the computation of a pose grid.",
-            buckets=_GRID_SECONDS,
-            registry=self.registry,
+        self.grid_seconds = self._histogram(
+            "lalaloc_grid_seconds", "Duration of the computation of a pose grid.", buckets=_GRID_SECONDS
         )
 
     def observe_answer(self, timings_ms: Mapping[str, float], stage: str) -> None:
@@ -156,6 +143,11 @@ class Telemetry:
             self.registry.unregister(self._collectors[name])
         self._collectors[name] = collector
         self.registry.register(collector)
+
+    def _histogram(
+        self, name: str, meaning: str, labels: Sequence[str] = (), buckets: Sequence[float] = _SECONDS
+    ) -> Histogram:
+        return Histogram(name, meaning, labels, buckets=buckets, registry=self.registry)
 
     def _gauge(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Gauge:
         if name not in self._gauges:

@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from service.cli.entry_point import main
 from service.errors import StoreFullError
 from service.storage import database, disk_reserve
-from service.storage.records import DEFAULT_TENANT, Original
+from service.storage.records import DEFAULT_TENANT, NewPlan, Original
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, original_of, upload, wait_for
@@ -37,7 +37,7 @@ def _open(folder: Path) -> Store:
 
 
 def _add(store: Store, plan_id: str, size: int) -> None:
-    store.plans.add("a", plan_id, PLAN, original=Original(bytes(size)), limit=100)
+    store.plans.add("a", plan_id, NewPlan(PLAN, Original(bytes(size))), limit=100)
 
 
 def _make_old(folder: Path) -> None:
@@ -101,7 +101,7 @@ def test_old_file_shrinks_after_it_was_compacted(tmp_path: Path, monkeypatch: py
 def test_service_returns_space_by_itself(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     # Stored without an upload, whose time and speed are limited.
     store, plan_id = Store(database_of(tmp_path)), "0" * 32
-    store.plans.add(DEFAULT_TENANT, plan_id, PLAN, original=Original(bytes(20 * MIB)), limit=100)
+    store.plans.add(DEFAULT_TENANT, plan_id, NewPlan(PLAN, Original(bytes(20 * MIB))), limit=100)
     store.close()
     if not _file(tmp_path).exists():
         pytest.skip("about SQLite's file")

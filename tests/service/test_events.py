@@ -166,11 +166,14 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
         plan_id = upload(client, HALL, wait=False)
         runtime = app.state.runtime
 
+        async def authorised() -> bool:
+            return True
+
         async def read() -> list[bytes]:
             events = PlanEvents(
                 runtime.store, runtime.grids, runtime.admission, runtime.reads, max_s=0.5, heartbeat_s=0.05
             )
-            return [chunk async for chunk in events.stream(plan_id)]
+            return [chunk async for chunk in events.stream(plan_id, authorised)]
 
         chunks = asyncio.run(read())
         assert chunks.count(b": heartbeat\n\n") >= 3

@@ -21,7 +21,7 @@ from service.capacity.fair_share import FairQueue, FairSemaphore, Shares, max_pe
 from service.capacity.threads import BoundedReads, IdleCores, Threads
 from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
-from service.storage.records import Original
+from service.storage.records import NewPlan, Original
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
@@ -381,7 +381,7 @@ def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Pa
     # Larger than the socket buffers.
     content, plan_id = bytes(8 * 2**20), "a" * 32
     store = Store(database_of(tmp_path))
-    store.plans.add("default", plan_id, FloorPlan.from_dict(FLAT), original=Original(content), limit=1)
+    store.plans.add("default", plan_id, NewPlan(FloorPlan.from_dict(FLAT), Original(content)), limit=1)
     store.close()
     with start_app(tmp_path, max_reads=8) as client, ExitStack() as attack:
         path = f"/floorplans/{plan_id}/original"

@@ -44,7 +44,7 @@ from service.grids.heights import check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
 from service.settings import Settings
 from service.storage.plan_lookup import PlanLookup
-from service.storage.records import Original, PlanRecord
+from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
@@ -118,7 +118,7 @@ def _permits() -> FairSemaphore:
 
 
 def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
-    return store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=20)
+    return store.plans.add("default", plan_id, NewPlan(plan, Original(b"{}")), limit=20)
 
 
 @pytest.fixture
@@ -446,7 +446,7 @@ def test_sweep_drops_deleted_revisions_from_memory(open_store: OpenStore, make_g
         grids.compute(record, 1.5).result(30.0)
         assert store.plans.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
-    elsewhere.plans.add_revision("default", "changed", PLAN, original=Original(b""), keep=5)
+    elsewhere.plans.add_revision("default", "changed", NewPlan(PLAN, Original(b"")), keep=5)
     Sweeper(store, grids, Telemetry(), sweep_s=5.0, keep_answers_s=0.0).sweep()
     assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
@@ -461,7 +461,7 @@ def test_sweep_cancels_revisions_replaced_remotely(
     futures = [grids.compute(_add(store, HALL), 1.5)]
     wait_for(lambda: encoders.embedded > 0)
     for _ in range(3):
-        record = elsewhere.plans.add_revision("default", "p", HALL, original=Original(b""), keep=5)
+        record = elsewhere.plans.add_revision("default", "p", NewPlan(HALL, Original(b"")), keep=5)
         futures.append(grids.compute(record, 1.5))
     Sweeper(store, grids, Telemetry(), sweep_s=5.0, keep_answers_s=0.0).sweep()
     encoders.go_on.set()
@@ -476,7 +476,7 @@ def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids:
     store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
     future = grids.compute(record, 1.5)
     wait_for(lambda: len(grids._jobs.remote()) == 1)
-    store.plans.add_revision("default", "p", PLAN, original=Original(b""), keep=5)
+    store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
     grids.cancel(record.revision_id)
     grids.poll_remote()
     assert isinstance(future.exception(30.0), PlanNotReadyError)
@@ -535,7 +535,7 @@ def test_grid_of_replaced_revision_is_cancelled(
     encoders.go_on.clear()
     future = grids.compute(record, 1.5)
     wait_for(lambda: encoders.embedded > 0)
-    new = store.plans.add_revision("default", "p", PLAN, original=Original(b""), keep=5)
+    new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
     grids.forget({record.revision_id})
     encoders.go_on.set()
     assert isinstance(future.exception(30.0), PlanNotReadyError)

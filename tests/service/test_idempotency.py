@@ -32,7 +32,7 @@ from service.http.idempotent_request import IdempotentRequest, parts_sha256
 from service.http.uploads import Parts
 from service.pools.job_queue import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
-from service.storage.records import Claimed, Original
+from service.storage.records import Claimed, NewPlan, Original
 from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
@@ -189,7 +189,7 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
             return client.post("/floorplans", content=CONTENT, headers=headers)
 
         assert_problem(send(), 409, "idempotency-in-progress")
-        store.plans.add("default", plan_id, FloorPlan.from_json(CONTENT), original=Original(CONTENT), limit=10)
+        store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
         wait_for(lambda: send().status_code == 201, 10.0)
         again = send()
         assert again.json()["id"] == plan_id
@@ -262,14 +262,14 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def _idempotent(store: Store) -> IdempotentRequest:
     scope = {"type": "http", "method": "POST", "path": "/x", "headers": [(b"idempotency-key", b"a")], "state": {}}
-    return IdempotentRequest(store.idempotency_keys, Request(scope), "default", "POST /x")
+    return IdempotentRequest(store.idempotency_keys, Request(scope), "default")
 
 
 def test_failed_but_stored_upload_is_found_by_the_retry(store: Store) -> None:
     failures = iter([StoreUnavailableError(), None])
 
     def work(token: str) -> Response:
-        store.plans.add("default", token, FloorPlan.from_json(CONTENT), original=Original(CONTENT), limit=10)
+        store.plans.add("default", token, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
         if (failure := next(failures)) is not None:
             raise failure
         return Response(token)

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from service.capacity.fair_share import max_per_client
-from service.schemas import LimitsAnswer
+from service.schemas.service_state import LimitsAnswer
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
 

@@ -16,7 +16,7 @@ from service.query.geopose import geopose_at
 from service.query.oscp import distance_to_plan_m
 from service.schemas import EarthPoint
 from service.storage.plan_places import distances_m
-from service.storage.records import Original
+from service.storage.records import NewPlan, Original
 from service.storage.store import Store
 from tests.core.test_earth import PLACES
 from tests.service.conftest import FLAT
@@ -45,7 +45,7 @@ def test_near_plans_are_found_anywhere(store: Store, place: tuple[float, float])
     for number, (longitude, latitude) in enumerate([place, antipode, *far]):
         anchor = {"longitude": longitude, "latitude": latitude, "north_deg": 0.0}
         plan = FloorPlan.from_dict(FLAT | {"anchor": anchor})
-        store.plans.add("default", f"{number:032x}", plan, original=Original(b"{}"), limit=10)
+        store.plans.add("default", f"{number:032x}", NewPlan(plan, Original(b"{}")), limit=10)
     for azimuth_deg in azimuths_deg:
         longitude, latitude = _beside(place, azimuth_deg, 150.0)
         rows = store.venues.searchable_plans_near("default", latitude, longitude, WITHIN_M, "model", 0.5)

@@ -28,7 +28,7 @@ from service.plan_files.rendition_cache import RenditionCache
 from service.plan_files.renditions import plan_layout
 from service.settings import Settings
 from service.storage import Store
-from service.storage.records import Original
+from service.storage.records import NewPlan, Original
 from service.stored_plan import Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
 from tests.growth import assert_no_worse_than_linear
@@ -79,7 +79,7 @@ def cache(store: Store) -> Iterator[RenditionCache]:
 def _add(store: Store, document: dict[str, Any] = FLAT) -> str:
     """Store a plan, and return its revision."""
     plan = FloorPlan.from_dict(document)
-    return store.plans.add("default", "p", plan, original=Original(b"{}"), limit=10).revision_id
+    return store.plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10).revision_id
 
 
 async def _started(work: Coroutine[Any, Any, Rendition]) -> asyncio.Task[Rendition]:

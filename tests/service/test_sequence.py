@@ -13,7 +13,8 @@ import pytest
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.sequence import Motion
-from service.schemas import SequenceForm, StatedMotion
+from service.schemas import SequenceForm
+from service.schemas.sequence import StatedMotion
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
 
 MOTION = {"distance_m": 1.5, "distance_std_m": 0.1, "turn_deg": 30, "turn_std_deg": 3}

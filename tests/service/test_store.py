@@ -48,6 +48,7 @@ from service.storage.records import (
     Cursor,
     GridKey,
     InProgress,
+    NewPlan,
     Original,
     StoredAnswer,
     VenueMember,
@@ -106,7 +107,7 @@ def _url(folder: Path) -> str:
 def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
     """Add a plan and return the id of its revision."""
     plan = FloorPlan.from_dict({**FLAT, "name": name})
-    return store.plans.add(tenant, plan_id, plan, original=Original(b"{}"), limit=100).revision_id
+    return store.plans.add(tenant, plan_id, NewPlan(plan, Original(b"{}")), limit=100).revision_id
 
 
 def _key(revision_id: str, **changes: object) -> GridKey:
@@ -171,7 +172,7 @@ def test_plan_cache_saves_parsing_unless_disabled(tmp_path: Path) -> None:
         assert reads[0].plan.to_dict() == reads[1].plan.to_dict()
         assert store.plan_cache.revisions() == ({revision_id} if same else set())
     changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
-    kept.plans.add_revision("default", "p", changed, original=Original(b"{}"), keep=5)
+    kept.plans.add_revision("default", "p", NewPlan(changed, Original(b"{}")), keep=5)
     records = [kept.plans.get("default", "p"), kept.plans.get("default", "p", revision_id)]
     assert [record and record.plan.name for record in records] == ["changed", "Flat 3"]
     assert kept.plans.delete("default", "p")
@@ -184,7 +185,7 @@ def test_plan_cache_saves_parsing_unless_disabled(tmp_path: Path) -> None:
 def test_stored_plan_is_visible_to_other_processes(open_store: OpenStore, size: int) -> None:
     first, second = open_store(), open_store()
     original = np.random.default_rng(1).bytes(size)
-    added = first.plans.add("default", "p1", PLAN, original=Original(original), limit=10)
+    added = first.plans.add("default", "p1", NewPlan(PLAN, Original(original)), limit=10)
     record = second.plans.get("default", "p1")
     assert record is not None
     assert record.plan.to_dict() == PLAN.to_dict()
@@ -198,7 +199,7 @@ def test_stored_plan_is_visible_to_other_processes(open_store: OpenStore, size: 
 
 def test_plan_is_stored_with_its_grid(store: Store) -> None:
     computed = ComputedGrid(model_sha256="m1", grid=_grid())
-    record = store.plans.add("default", "p1", PLAN, original=Original(b"{}"), limit=10, grid=computed)
+    record = store.plans.add("default", "p1", NewPlan(PLAN, Original(b"{}"), grid=computed), limit=10)
     _assert_same(store.grids.get(computed.key(record.revision_id)), computed.grid)
 
 
@@ -207,16 +208,16 @@ def test_failed_insert_stores_nothing(store: Store, broken: str) -> None:
     grid = ComputedGrid(model_sha256=None if broken == "grid" else "m1", grid=_grid())  # pyright: ignore[reportArgumentType]
     original = None if broken == "original" else b"{}"
     with pytest.raises(Exception, match=r"(?i)not.null|buffer"):
-        store.plans.add("default", "p", PLAN, original=Original(original), limit=10, grid=grid)  # pyright: ignore[reportArgumentType]
+        store.plans.add("default", "p", NewPlan(PLAN, Original(original), grid=grid), limit=10)  # pyright: ignore[reportArgumentType]
     assert store.plans.get("default", "p") is None
     assert _filled_tables(store) == []
 
 
 def test_plan_limit_is_per_tenant(store: Store) -> None:
     _add(store, tenant="one")
-    store.plans.add("two", "b", PLAN, original=Original(b"{}"), limit=1)
+    store.plans.add("two", "b", NewPlan(PLAN, Original(b"{}")), limit=1)
     with pytest.raises(TooManyFloorPlansError, match="1 stored floor plans"):
-        store.plans.add("two", "c", PLAN, original=Original(b"{}"), limit=1)
+        store.plans.add("two", "c", NewPlan(PLAN, Original(b"{}")), limit=1)
     assert [summary.id for summary in store.plans.list_plans("two", limit=10)] == ["b"]
 
 
@@ -227,7 +228,7 @@ def test_plan_limit_holds_under_concurrency(open_store: OpenStore, monkeypatch: 
 
     def add(number: int) -> bool:
         try:
-            stores[number % 2].plans.add("default", f"p{number}", PLAN, original=Original(b"{}"), limit=5)
+            stores[number % 2].plans.add("default", f"p{number}", NewPlan(PLAN, Original(b"{}")), limit=5)
         except TooManyFloorPlansError:
             return False
         return True
@@ -244,7 +245,7 @@ def test_plan_is_hidden_from_other_tenants(store: Store) -> None:
     assert store.plans.list_plans("two", limit=10) == []
     assert not store.plans.delete("two", "p")
     with pytest.raises(UnknownFloorPlanError):
-        store.plans.add_revision("two", "p", PLAN, original=Original(b""), keep=5)
+        store.plans.add_revision("two", "p", NewPlan(PLAN, Original(b"")), keep=5)
     assert store.plans.get("one", "p") is not None
 
 
@@ -252,7 +253,7 @@ def test_plan_is_hidden_from_other_tenants(store: Store) -> None:
 def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) -> None:
     first, second = open_store(), open_store()
     original = bytes(CHUNK_BYTES + 1)
-    added = first.plans.add("default", "p", PLAN, original=Original(original), limit=10)
+    added = first.plans.add("default", "p", NewPlan(PLAN, Original(original)), limit=10)
 
     def delete_elsewhere(*arguments: Any) -> None:
         if arguments[2].startswith(half_way):
@@ -283,13 +284,13 @@ def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore) -> None:
         return store
 
     assert watching().plans.get("default", "p") is not None
-    watching().plans.add("default", "p", PLAN, original=Original(b"{}"), limit=10)
+    watching().plans.add("default", "p", NewPlan(PLAN, Original(b"{}")), limit=10)
     assert in_use == [0, 0]
 
 
 def test_warnings_are_stored_and_not_recomputed(open_store: OpenStore) -> None:
     plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
-    open_store().plans.add("default", "p", plan, original=Original(b"{}"), limit=10)
+    open_store().plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
     found = open_store().plans.get("default", "p")
     assert found is not None
     assert found.plan.warnings == plan.warnings
@@ -299,7 +300,7 @@ def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> N
     rooms = [{"name": name, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]} for name in ("one", "other")]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms})
     store = open_store()
-    store.plans.add("default", "p", plan, original=Original(b"{}"), limit=10)
+    store.plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
     with store._database.writing() as connection:
         connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
     found = open_store().plans.get("default", "p")
@@ -321,14 +322,14 @@ def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[s
     summary = again.plans.summary("default", "p")
     assert summary is not None
     assert original_of(again, "p") == b"{}"
-    again.plans.add_revision("default", "p", PLAN, original=Original(b"{}"), keep=5)
+    again.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"{}")), keep=5)
     assert again.plans.get("default", "p") is not None
     assert again.plans.delete("default", "p")
 
 
 @pytest.mark.parametrize("cut_off", [True, False])
 def test_damaged_original_is_an_error(store: Store, cut_off: bool) -> None:
-    added = store.plans.add("default", "p", PLAN, original=Original(bytes(CHUNK_BYTES + 1)), limit=10)
+    added = store.plans.add("default", "p", NewPlan(PLAN, Original(bytes(CHUNK_BYTES + 1))), limit=10)
     with store._database.writing() as connection:
         last = ORIGINAL_CHUNKS.c.number == 1
         connection.execute(
@@ -340,7 +341,7 @@ def test_damaged_original_is_an_error(store: Store, cut_off: bool) -> None:
 
 def test_deleted_plan_leaves_no_rows(store: Store) -> None:
     revision_id = _add(store, "p")
-    store.plans.add_revision("default", "p", PLAN, original=Original(b"second"), keep=5)
+    store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"second")), keep=5)
     _put(store, _key(revision_id))
     store.leases.claim(_key(revision_id, camera_height_mm=1600), "me", 60.0)
     assert store.plans.delete("default", "p")
@@ -380,8 +381,8 @@ def test_summaries_skip_missing_plans(store: Store) -> None:
 
 
 def test_repeated_upload_is_stored_once(store: Store) -> None:
-    first = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
-    again = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
+    first = store.plans.add("default", "p", NewPlan(PLAN, Original(b"{}")), limit=1)
+    again = store.plans.add("default", "p", NewPlan(PLAN, Original(b"{}")), limit=1)
     assert (again.revision_id, again.revision) == (first.revision_id, 1)
     assert len(store.plans.list_plans("default", limit=10)) == 1
 
@@ -392,7 +393,7 @@ def test_repeated_upload_is_stored_once(store: Store) -> None:
 def test_old_revision_stays_readable(store: Store) -> None:
     old = _add(store, "p")
     smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
-    new = store.plans.add_revision("default", "p", smaller, original=Original(b"new"), keep=5, expected=old)
+    new = store.plans.add_revision("default", "p", NewPlan(smaller, Original(b"new")), keep=5, expected=old)
     current = store.plans.get("default", "p")
     assert current is not None
     assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
@@ -408,9 +409,9 @@ def test_old_revision_stays_readable(store: Store) -> None:
 
 def test_unexpected_revision_is_rejected(store: Store) -> None:
     old = _add(store, "p")
-    new = store.plans.add_revision("default", "p", PLAN, original=Original(b"2"), keep=5, expected=old)
+    new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"2")), keep=5, expected=old)
     with pytest.raises(RevisionMismatchError, match=new.revision_id):
-        store.plans.add_revision("default", "p", PLAN, original=Original(b"3"), keep=5, expected=old)
+        store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"3")), keep=5, expected=old)
     assert original_of(store, "p") == b"2"
 
 
@@ -420,7 +421,7 @@ def test_one_of_two_concurrent_revisions_is_rejected(open_store: OpenStore) -> N
 
     def add(store: Store) -> bool:
         try:
-            store.plans.add_revision("default", "p", PLAN, original=Original(b"x"), keep=5, expected=old)
+            store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"x")), keep=5, expected=old)
         except RevisionMismatchError:
             return False
         return True
@@ -434,7 +435,7 @@ def test_revisions_and_grids_are_limited(store: Store) -> None:
     for number in range(4):
         _put(store, _key(ids[-1]))
         ids.append(
-            store.plans.add_revision("default", "p", PLAN, original=Original(b"%d" % number), keep=3).revision_id
+            store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"%d" % number)), keep=3).revision_id
         )
     kept = [store.plans.get("default", "p", revision_id) is not None for revision_id in ids]
     assert kept == [False, False, True, True, True]
@@ -838,7 +839,7 @@ def test_migration_counts_stored_bytes(store: Store, url: str) -> None:
 def test_migration_fills_in_places(store: Store, url: str) -> None:
     anchored = FloorPlan.from_dict({**FLAT, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0})
     for plan_id, plan in (("p", PLAN), ("q", anchored), ("r", PLAN)):
-        store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=100)
+        store.plans.add("default", plan_id, NewPlan(plan, Original(b"{}")), limit=100)
     columns = select(*(getattr(FLOORPLANS.c, name) for _, name in _OF_PLACES)).order_by(FLOORPLANS.c.id)
     with store._database.writing() as connection:
         written = connection.execute(columns).all()

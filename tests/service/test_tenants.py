@@ -17,7 +17,16 @@ from sqlalchemy import func, select
 from lalaloc_core.floorplan import FloorPlan
 from service.cli.entry_point import main
 from service.errors import StorageQuotaError
-from service.storage.records import Claimed, ComputedGrid, GridKey, OperatorLimits, Original, StoredAnswer, VenueMember
+from service.storage.records import (
+    Claimed,
+    ComputedGrid,
+    GridKey,
+    NewPlan,
+    OperatorLimits,
+    Original,
+    StoredAnswer,
+    VenueMember,
+)
 from service.storage.store import Store
 from service.storage.tables import AUDIT_LOG, IDEMPOTENCY, METADATA, TENANTS
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
@@ -48,7 +57,7 @@ def store(url: str) -> Iterator[Store]:
 def _add(store: Store, tenant: str, plan_id: str, size: int = MIB, **options: object) -> str:
     """Store a plan with a file of some size, and return the id of its revision."""
     original = Original(bytes(size))
-    return store.plans.add(tenant, plan_id, PLAN, original=original, limit=100, **options).revision_id  # pyright: ignore[reportArgumentType]
+    return store.plans.add(tenant, plan_id, NewPlan(PLAN, original, **options), limit=100).revision_id  # pyright: ignore[reportArgumentType]
 
 
 def _keep_answer(store: Store, tenant: str, key: str, size: int) -> Claimed:
@@ -119,7 +128,7 @@ def test_stored_bytes_follow_every_change(store: Store) -> None:
         assert store.grids.put(height_key, _grid(count=1000), keep=2, always_keep_mm=1500)
     _recounted(store, "a")
     for _ in range(4):
-        store.plans.add_revision("a", "p" * 32, PLAN, original=Original(bytes(MIB)), keep=2)
+        store.plans.add_revision("a", "p" * 32, NewPlan(PLAN, Original(bytes(MIB))), keep=2)
         _recounted(store, "a")
     assert store.quota.account("a").used.plans == pytest.approx(4 * MIB, rel=0.01)
     store.venues.add("a", "v", "venue", None, [VenueMember("p" * 32), VenueMember("q" * 32)], limit=9)
@@ -147,7 +156,7 @@ def test_tenant_cannot_store_more_than_its_quota(store: Store) -> None:
     with pytest.raises(StorageQuotaError, match=r"needs .* more; the limit is 10485760 .*LALALOC_MAX_STORED_BYTES"):
         _add(store, "a", "q")
     with pytest.raises(StorageQuotaError):
-        store.plans.add_revision("a", "p0", PLAN, original=Original(bytes(MIB)), keep=2)
+        store.plans.add_revision("a", "p0", NewPlan(PLAN, Original(bytes(MIB))), keep=2)
     store.tenants.change_limits("a", stored_bytes=store.quota.account("a").used.total)
     with pytest.raises(StorageQuotaError, match="lalaloc-service tenants limit"):
         store.venues.add("a", "v", "venue", None, [], limit=9)

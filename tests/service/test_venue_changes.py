@@ -21,7 +21,7 @@ from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.render.sampling import PoseSet
 from service.capacity.bounded_cache import BoundedCache
 from service.storage import Store
-from service.storage.records import GridKey, Original, VenueMember
+from service.storage.records import GridKey, NewPlan, Original, VenueMember
 from service.storage.tables import FLOORPLANS, TENANTS
 from service.venues import venue_plans
 from service.venues.plan_indices import Indexed
@@ -72,7 +72,7 @@ class Changes:
     def upload(self) -> None:
         self._count += 1
         plan_id, plan = f"{self._count:032x}", FloorPlan.from_dict({**FLAT, "name": f"plan {self._count}"})
-        record = self.store.plans.add(TENANT, plan_id, plan, original=Original(b"{}"), limit=99)
+        record = self.store.plans.add(TENANT, plan_id, NewPlan(plan, Original(b"{}")), limit=99)
         self.plans[plan_id] = record.revision_id
         self.place(plan_id)
 
@@ -87,7 +87,7 @@ class Changes:
 
     def replace(self) -> None:
         plan_id, plan = self.some(), FloorPlan.from_dict({**FLAT, "name": f"again {self._rng.random()}"})
-        record = self.store.plans.add_revision(TENANT, plan_id, plan, original=Original(b"{}"), keep=3)
+        record = self.store.plans.add_revision(TENANT, plan_id, NewPlan(plan, Original(b"{}")), keep=3)
         self.plans[plan_id] = record.revision_id
 
     def prepare(self) -> None:
@@ -160,7 +160,7 @@ def test_other_changes_leave_the_rows_in_memory(replicas: list[Replica], monkeyp
     before = first.rows()
     second.store.answers.add(TENANT, f"{1:032x}", lambda answer_id: answer_id, limit=9)
     monkeypatch.setattr(first.store.venues, "searchable_plans", lambda *_: pytest.fail("read of the rows"))
-    second.store.plans.add(TENANT, "a" * 32, FloorPlan.from_dict(FLAT), original=Original(b"{}"), limit=99)
+    second.store.plans.add(TENANT, "a" * 32, NewPlan(FloorPlan.from_dict(FLAT), Original(b"{}")), limit=99)
     assert first.rows() == before
 
 

@@ -20,9 +20,8 @@ from lalaloc_core.floorplan import FloorPlan
 from service.errors import UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_cache import plan_bytes
-from service.storage.records import Original
+from service.storage.records import NewPlan, Original
 from service.storage.store import Store
-from service.storage.venue_imports import NewPlan
 from tests.importers.conftest import zip_file
 from tests.importers.test_ifc import DUPLEX, ifc_flat, ifc_house
 from tests.importers.test_roomplan import two_stories
@@ -333,7 +332,7 @@ def new_plans(count: int = 3) -> list[NewPlan]:
 def test_plans_of_a_long_file_do_not_displace_those_in_use(tmp_path: Path) -> None:
     cache_bytes = 30 * plan_bytes(FloorPlan.from_dict(FLAT))
     store = Store(f"sqlite:///{tmp_path / 'store.sqlite3'}", plan_cache_bytes=cache_bytes)
-    used = store.plans.add("t", "used", FloorPlan.from_dict(FLAT), original=Original(b"{}"), limit=99)
+    used = store.plans.add("t", "used", NewPlan(FloorPlan.from_dict(FLAT), Original(b"{}")), limit=99)
     store.venue_imports.add("t", uuid.uuid4().hex, "street", new_plans(60), max_plans=99, max_venues=9)
     assert store.plan_cache.revisions() == {used.revision_id}
     read = store.plans.list_plans("t", limit=99)[0]

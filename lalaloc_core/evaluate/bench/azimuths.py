@@ -58,7 +58,9 @@ def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, 
     return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
 
 
-def _measure(encoders: PhotographEncoder, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> AzimuthMeasures:
+def _measure(
+    encoders: PhotographEncoder, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]
+) -> AzimuthMeasures:
     """Compare the predictions from a panorama with the plan around the camera."""
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])

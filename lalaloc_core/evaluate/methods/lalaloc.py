@@ -20,14 +20,13 @@ from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Pre
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, Refiner, StageClock, localise
-from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.render.sampling import PoseSet
 

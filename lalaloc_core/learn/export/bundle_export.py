@@ -45,9 +45,9 @@ from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.view_network import ViewNetwork
 
 PARITY_TOLERANCE = 1e-4

@@ -20,11 +20,11 @@ from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.image_features import WallModes
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import StyleMixing, Trunk
 
 

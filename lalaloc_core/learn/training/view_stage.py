@@ -21,7 +21,7 @@ from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
-from lalaloc_core.nets.view_network import ViewNetwork, ViewFeatures
+from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 
 # Size of the spheres from which views of photographs are cut, about as fine as the views.
 PHOTOGRAPH_SIZE = (384, 768)

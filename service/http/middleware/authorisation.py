@@ -82,13 +82,10 @@ class AuthorisationMiddleware:
                 trail.count(entry_of(scope, CLIENT_CLOSED, caller=caller))
 
     async def _handle(self, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["method"] in READING:
-            await self._read(access, caller, scope, receive, send)
-        else:
+        """Handle a request, and charge the caller for the bytes of the answer to a read."""
+        if scope["method"] not in READING:
             await self._app(scope, receive, send)
-
-    async def _read(self, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle a read, and charge the caller for the bytes of the answer."""
+            return
         sent_bytes = 0
 
         async def counting(message: Message) -> None:

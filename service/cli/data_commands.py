@@ -1,14 +1,20 @@
-"""Commands about tenants and their data: `lalaloc-service tenants list|limit|purge` and `compact`."""
+"""Commands about stored data: `lalaloc-service tenants`, `audit`, `compact`, `backup` and `restore`."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from service.cli.command_parts import audit, configured_store, tenant_name, text_table
+from service.settings import Settings
+from service.storage.backup import back_up, database_file, restore
 from service.storage.records import OperatorLimits
 
 _DEFAULT = "default"
@@ -108,3 +114,72 @@ def _weight(given: str) -> float:
     if not 0.01 <= weight <= 100.0:
         raise argparse.ArgumentTypeError(f"a number from 0.01 to 100, or '{_DEFAULT}'")
     return weight
+
+
+def add_audit_commands(commands: Any) -> None:
+    """Add the group `audit` to the commands."""
+    audit = commands.add_parser("audit", help="export the audit log").add_subparsers(required=True)
+    export = audit.add_parser("export", help="print the entries as lines of JSON, oldest first")
+    export.add_argument("--tenant", type=tenant_name, help="only entries of this tenant")
+    export.add_argument(
+        "--since", type=_moment, metavar="TIME", help="only entries from this time on: 2026-01-31T12:00Z"
+    )
+    export.add_argument("--until", type=_moment, metavar="TIME", help="only entries before this time")
+    export.set_defaults(run=_export)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    with configured_store() as store:
+        entries = store.audit_log.export(tenant=arguments.tenant, since=arguments.since, until=arguments.until)
+        try:
+            for entry in entries:
+                detail = None if entry.detail is None else json.loads(entry.detail)
+                line = asdict(entry) | {"created_at": entry.created_at.isoformat(), "detail": detail}
+                print(json.dumps(line))
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # A reader such as `head` has enough; the interpreter must not write the rest at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _moment(given: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(given)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"'{given[:64]}' is no time such as 2026-01-31T12:00Z") from error
+    # Without a time zone it is UTC, as in the entries.
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    if not 1970 <= moment.year < 9999:
+        raise argparse.ArgumentTypeError(f"the year is {moment.year}; give one from 1970 to 9998")
+    return moment
+
+
+def add_backup_commands(commands: Any) -> None:
+    """Add `backup` and `restore` to the commands."""
+    saving = commands.add_parser("backup", help="copy an SQLite database to a new file, also while the service runs")
+    saving.add_argument("file", type=Path, help="the new file")
+    saving.set_defaults(run=_back_up)
+
+    restoring = commands.add_parser(
+        "restore", help="replace an SQLite database by a backup, also of an earlier version; stop the service first"
+    )
+    restoring.add_argument("file", type=Path, help="the backup")
+    restoring.add_argument("--yes", action="store_true", required=True, help="confirm the replacement")
+    restoring.set_defaults(run=_restore)
+
+
+def _back_up(arguments: argparse.Namespace) -> int:
+    database = database_file(Settings.load().database_url)
+    size = back_up(database, arguments.file)
+    print(f"copied '{database}' to '{arguments.file}' ({size} bytes)")
+    return 0
+
+
+def _restore(arguments: argparse.Namespace) -> int:
+    database = database_file(Settings.load().database_url)
+    earlier = restore(arguments.file, database)
+    print(f"restored '{database}' from '{arguments.file}'")
+    if earlier is not None:
+        print(f"the database before is '{earlier}'; delete it when nothing is missing")
+    return 0
