@@ -152,13 +152,12 @@ def test_session_of_the_readme_has_its_result(tmp_path: Path) -> None:
     *statements, question = re.findall(r"^>>> (.*)$", session, re.MULTILINE)
     [expected] = re.findall(r"^\(.*$", session, re.MULTILINE)
     with running_service(0, {"LALALOC_DATA_DIR": str(tmp_path)}) as service:
-        names: dict[str, Any] = {}
-        for statement in statements:
-            exec(
-                statement.replace("http://127.0.0.1:8000", service.url).replace("examples/", f"{ROOT}/examples/"), names
-            )
+        names: dict[str, Any] = vars(lalaloc_client).copy()
+        code = "\n".join(statements).replace("http://127.0.0.1:8000", service.url)
+        exec(code.replace("examples/", f"{ROOT}/examples/"), names)
+        names["service"].close()
     room, position, confidence = eval(question, names)
-    expected_room, expected_position, expected_confidence = eval(expected, vars(lalaloc_client))
+    expected_room, expected_position, expected_confidence = eval(expected, names)
     assert room == expected_room
     assert (position.x_m, position.y_m) == pytest.approx((expected_position.x_m, expected_position.y_m), abs=0.1)
     assert confidence == pytest.approx(expected_confidence, abs=0.05)
