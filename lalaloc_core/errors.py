@@ -22,6 +22,7 @@ LaLaLocError
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 # Largest number of levels named in a message.
@@ -142,11 +143,7 @@ class DatasetError(InvalidInputError):
 
     def __reduce__(self) -> tuple[Callable[..., DatasetError], tuple[object, ...]]:
         """Support pickling, so that errors of worker processes keep their attributes."""
-        return _dataset_error, (self.reason, self.scene, self.room, self.path)
-
-
-def _dataset_error(reason: str, scene: str | None, room: str | None, path: Path | None) -> DatasetError:
-    return DatasetError(reason, scene=scene, room=room, path=path)
+        return partial(DatasetError, scene=self.scene, room=self.room, path=self.path), (self.reason,)
 
 
 class ConfigError(LaLaLocError, ValueError):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import layout_depth
 
 # ImageNet statistics, for training from its weights.
 IMAGE_MEAN = (0.485, 0.456, 0.406)

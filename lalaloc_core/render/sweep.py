@@ -40,7 +40,7 @@ class SweptLayouts:
     behind_m: Float[np.ndarray, "m"]
 
 
-def swept_views(
+def sweep_layouts(
     position_m: Float[np.ndarray, "n 2"],
     heading: Float[np.ndarray, "n"],
     room_index: Int[np.ndarray, "n"],

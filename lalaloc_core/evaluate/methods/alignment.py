@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
-from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import layout_depth
 
 
 def depth_aligner(*, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> PoseOptimiser:
