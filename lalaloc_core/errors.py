@@ -5,7 +5,7 @@ LaLaLocError
 │   ├── InvalidFloorPlanError    a floor plan is invalid; names the room
 │   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
 │   ├── MissingExtraError        a format needs a package that is not installed; names the extra
-│   ├── InvalidPhotographError     a picture is not a usable panorama or photograph, or a statement about it is invalid
+│   ├── InvalidPhotographError     a picture is not a usable photograph, or a statement about it is invalid
 │   ├── InvalidFeaturesError     features of a photograph are damaged or out of range
 │   ├── ForeignFeaturesError     features of a photograph are another model's
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
@@ -81,7 +81,7 @@ class MissingExtraError(InvalidInputError):
 
 
 class InvalidPhotographError(InvalidInputError):
-    """A picture is not a usable panorama or photograph, or a statement about it is invalid."""
+    """A picture is not a usable photograph, or a statement about it is invalid."""
 
 
 class InvalidFeaturesError(InvalidInputError):

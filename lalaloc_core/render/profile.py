@@ -134,7 +134,7 @@ def wall_profile(
     walls_m: Float[Array, "b n 4"],
     columns: int,
 ) -> Float[Array, "b {columns}"]:
-    """Return the wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
+    """Return the wall profile (m) of each pose, one value per azimuth column of a sphere with that heading.
 
     Positions are inside the room that `walls_m` closes, segments (x0, y0, x1, y1) of each pose's own room. `heading` is
     the azimuth of the centre column, radians.

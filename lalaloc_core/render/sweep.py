@@ -1,4 +1,4 @@
-"""Layout views of many poses at once: each wall fills only the columns between the azimuths of its ends.
+"""Layouts of many poses at once: each wall fills only the columns between the azimuths of its ends.
 
 `render.layout` casts every ray at every wall, and in large rooms most of these pairs miss. Here the azimuths of a
 wall's ends give the columns it can fill, and the nearest wall of each column wins. The cost grows with the number of
@@ -24,7 +24,7 @@ _PAIRS = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class SweptLayouts:
-    """Layout views of n poses in w columns each.
+    """Layouts of n poses in w columns each.
 
     Attributes:
         distance_m: (n, w) distance to the nearest wall of the pose's own room; inf outside a room.
@@ -48,7 +48,7 @@ def sweep_layouts(
     columns: int,
     eye_m: float | Float[np.ndarray, "m"],
 ) -> SweptLayouts:
-    """Render the layout views of poses of a plan, or of several plans with a joined table.
+    """Render the layouts of poses of a plan, or of several plans with a joined table.
 
     Positions are inside their rooms; `heading` is the azimuth of the centre column, radians. An opening is visible if
     its sill is below the eye and its head above; `eye_m` is one height, or that for each opening face of the table.

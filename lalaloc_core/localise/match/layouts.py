@@ -17,7 +17,7 @@ from lalaloc_core.render.sweep import profiles_at, sweep_layouts
 
 @dataclass(frozen=True, eq=False)
 class SeenThrough:
-    """Views through openings.
+    """Walls seen through openings.
 
     Attributes:
         row: (m,) numbers of the poses, rising.
@@ -55,7 +55,7 @@ class Layouts:
     Attributes:
         log_profile: (n, w) log wall profiles (m).
         kind: (n, w) codes as in `conventions.OPENING_CLASSES`; None if the plan has no openings.
-        seen: views through openings; None without any.
+        seen: walls seen through openings; None without any.
     """
 
     log_profile: Float[np.ndarray, "n w"]

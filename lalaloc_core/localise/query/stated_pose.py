@@ -11,7 +11,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.query.camera_height import DEFAULT_STD_M, CameraHeight
 
 HeadingSource = Literal["given", "panorama", "searched"]
-# Largest error (degrees) of the compass heading in a panorama's metadata.
+# Largest error (degrees) of the compass heading in a photograph's metadata.
 COMPASS_TOLERANCE_DEG = 20.0
 
 
@@ -31,9 +31,9 @@ def known_heading(
     compass_heading: float | None,
     compass_tolerance_deg: float = COMPASS_TOLERANCE_DEG,
 ) -> KnownHeading:
-    """Return the given heading, else the panorama's if north is known, else none.
+    """Return the given heading, else the photograph's if north is known, else none.
 
-    `heading_deg` is given with the largest error `tolerance_deg`. `compass_heading` is in the panorama's metadata,
+    `heading_deg` is given with the largest error `tolerance_deg`. `compass_heading` is in the photograph's metadata,
     clockwise from true north (radians); `north` is the azimuth of true north in the plan (radians).
     """
     if heading_deg is not None:
