@@ -12,12 +12,11 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
-from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, grid_candidate, likeliest
 from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query
-from lalaloc_core.render.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sampling import PoseSet
 
 # Limits of the number of pairs of a pose and a hypothesis that are compared in full.
 _MIN_COMPARED, _MAX_COMPARED = 1024, 4096
@@ -31,17 +30,6 @@ _MARGIN = 0.35
 _CALIBRATING = 256
 # Best pairs that are searched for distinct candidates at first.
 _FIRST_RANKED = 1024
-
-
-def build_grid(
-    plan: FloorPlan, encoder: LayoutEncoder, *, step_m: float, camera_height_m: float, latents: bool = True
-) -> PoseGrid:
-    """Return the plan's pose grid with every layout rendered and, with `latents`, encoded, which is slow."""
-    poses = pose_grid(plan, step_m)
-    if not latents:
-        return PoseGrid.without_latents(poses, encoder.rendered(plan, poses), step_m, camera_height_m)
-    embedded, profile_m = encoder.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
-    return PoseGrid(poses, embedded, profile_m, step_m, camera_height_m)
 
 
 def grid_costs(

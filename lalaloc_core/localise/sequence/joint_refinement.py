@@ -38,12 +38,12 @@ class SequenceJob:
         heading: (m, t) headings (radians) in the frames, as in `query.Query`.
         roll: (m, t) angles (radians) to add for the photographs' headings.
         turnable: (t,) pictures whose heading is searched.
-        walls_m, log_profile, precision: as in `poses.RefinementJob`.
+        walls_m, log_profile, precision: as in `refine.RefinementJob`.
         trusted: (m, t - 1) motions that each path follows.
         motion_scale: factor that scales the motions' residuals to those of azimuth columns.
         height_offset: (m,) start of δ.
         height_free: whether δ is solved for.
-        height_stiffness, height_bounds: as in `poses.RefinementJob`.
+        height_stiffness, height_bounds: as in `refine.RefinementJob`.
         height_apart: standard deviation of ε; 0 if all pictures have the same relative error.
     """
 
