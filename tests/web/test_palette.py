@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 from PIL import ImageColor
 
-from lalaloc_core.draw.canvas import (
-    ON_PAPER,
-    ON_PHOTOGRAPH,
-)
+from lalaloc_core.draw.canvas import ON_PAPER, ON_PHOTOGRAPH
 
 STYLE = (Path(__file__).parents[2] / "web" / "src" / "style.css").read_text(encoding="utf-8")
 LIGHT, DARK = STYLE.split("@media (prefers-color-scheme: dark)", 1)

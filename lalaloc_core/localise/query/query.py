@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.localise.query.camera_height import CameraHeight
 from lalaloc_core.localise.query.predictions import (
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
     PredictedRoomType,
 )
+from lalaloc_core.localise.query.stated_pose import CameraHeight
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,7 @@ refinement by wall profiles on numpy; `latent_refiner.py` refines by latents on 
 package, so it exports plain values and the refiner on numpy alone.
 """
 
-from lalaloc_core.localise.refine.descent_methods import (
-    refine_walls,
-    refined_by_walls,
-)
+from lalaloc_core.localise.refine.descent_methods import refine_walls, refined_by_walls
 from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement_problem import LpoConfig, Problem
 
