@@ -4,7 +4,8 @@ The query side:
 
     floorplan/   plans: rooms, openings, anchors, validation
     importers/   import and export of plan files of other tools
-    panorama/    photographs as files: decoding, metadata, levelling
+    bundle/      the model bundle: manifest, fitted parameters, files
+    photograph/  photographs as files: decoding, metadata, levelling
     render/      the layout renderer
     nets/        the networks in torch
     localise/    encoders, matching cost, retrieval, VDR, LPO, posterior

@@ -2,7 +2,7 @@
 
 Plan frame: right-handed, metres, x to the right, y up on the drawing, z up from the floor.
 Azimuth: clockwise from the plan's +y seen from above; azimuth 0 is +y and π/2 is +x.
-Heading of a panorama: azimuth of its centre column.
+Heading of a photograph: azimuth of its centre column.
 Angles are radians inside the code; degrees are used only in the HTTP API, on the command line and in files.
 """
 

@@ -5,7 +5,7 @@ LaLaLocError
 │   ├── InvalidFloorPlanError    a floor plan is invalid; names the room
 │   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
 │   ├── MissingExtraError        a format needs a package that is not installed; names the extra
-│   ├── InvalidPhotographError     a picture is not a usable panorama or photograph, or a statement about it is invalid
+│   ├── InvalidPhotographError     a picture is not a usable photograph, or a statement about it is invalid
 │   ├── InvalidFeaturesError     features of a photograph are damaged or out of range
 │   ├── ForeignFeaturesError     features of a photograph are another model's
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
@@ -22,6 +22,7 @@ LaLaLocError
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 # Largest number of levels named in a message.
@@ -80,7 +81,7 @@ class MissingExtraError(InvalidInputError):
 
 
 class InvalidPhotographError(InvalidInputError):
-    """A picture is not a usable panorama or photograph, or a statement about it is invalid."""
+    """A picture is not a usable photograph, or a statement about it is invalid."""
 
 
 class InvalidFeaturesError(InvalidInputError):
@@ -142,11 +143,7 @@ class DatasetError(InvalidInputError):
 
     def __reduce__(self) -> tuple[Callable[..., DatasetError], tuple[object, ...]]:
         """Support pickling, so that errors of worker processes keep their attributes."""
-        return _dataset_error, (self.reason, self.scene, self.room, self.path)
-
-
-def _dataset_error(reason: str, scene: str | None, room: str | None, path: Path | None) -> DatasetError:
-    return DatasetError(reason, scene=scene, room=room, path=path)
+        return partial(DatasetError, scene=self.scene, room=self.room, path=self.path), (self.reason,)
 
 
 class ConfigError(LaLaLocError, ValueError):

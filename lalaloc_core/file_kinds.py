@@ -1,4 +1,4 @@
-"""Kinds of files that are neither a panorama nor a floor plan, detected from the content, for error messages."""
+"""Kinds of files that are neither a photograph nor a floor plan, detected from the content, for error messages."""
 
 from __future__ import annotations
 

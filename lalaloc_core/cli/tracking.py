@@ -168,7 +168,7 @@ def _height_m(answer: Tracked) -> float:
 def _picture(plan: FloorPlan, found: list[Tracked]) -> str:
     import numpy as np
 
-    from lalaloc_core.draw.path import DrawnPath, draw_path
+    from lalaloc_core.draw.plan_overlays import DrawnPath, draw_path
 
     position_m = np.stack([answer.pose.position_m for answer in found])
     is_sure = [answer.pose.mode == "tracking" for answer in found]

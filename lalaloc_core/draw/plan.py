@@ -188,7 +188,7 @@ def _size_m(bounds_m: Bounds) -> tuple[float, float]:
 
 
 def _view_box(bounds_m: Bounds, seen_m: Sequence[tuple[float, float]]) -> tuple[float, float, float, float]:
-    """Return left, top, width and height of the view, y pointing down."""
+    """Return left, top, width and height of the view box, y pointing down."""
     width, height = _size_m(bounds_m)
     left, top = bounds_m[0] - _MARGIN_M, -bounds_m[3] - _MARGIN_M
     right, bottom = left + width, top + height

@@ -11,8 +11,7 @@ from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import FloorPlan
 from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_STD_M
-from lalaloc_core.floorplan.rooms import Room
-from lalaloc_core.floorplan.types import room_type_from_label
+from lalaloc_core.floorplan.rooms import Room, room_type_from_label
 
 __all__ = [
     "DEFAULT_CAMERA_HEIGHT_M",

@@ -57,7 +57,7 @@ class FloorPlan:
     """A validated floor plan; build one with `FloorPlan.from_dict` or `FloorPlan.from_json`.
 
     Attributes:
-        camera_height_m: height of the camera assumed for panoramas of this plan.
+        camera_height_m: height of the camera assumed for photographs of this plan.
         warnings: problems that do not prevent use, such as overlapping rooms.
         north: azimuth of true north (radians), None if unknown.
         opening_kinds: kinds of openings that the plan shows completely.

@@ -1,7 +1,8 @@
-"""Rooms: outline, holes, free-standing walls, and the free floor that a camera can stand on."""
+"""Rooms: outline, holes, free-standing walls, the free floor that a camera can stand on, and types by labels."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -17,6 +18,25 @@ _WALL_CORE_M = 1e-3
 # `interior_point` tests a lattice over the floor, then finer ones around the best point. The exact answer, the centre
 # of the largest inscribed circle, takes seconds for a spiral of two hundred vertices.
 _LATTICE, _FINER_LATTICE, _ROUNDS = 20, 7, 5
+
+# Further words for each room type, besides its name.
+_SYNONYMS = {
+    "bathroom": ("bath", "shower", "toilet", "wc", "restroom", "washroom"),
+    "corridor": ("hall", "hallway", "passage", "landing"),
+    "entrance": ("foyer", "entry", "vestibule", "lobby"),
+    "living": ("lounge", "family", "studio"),
+    "office": ("den", "study", "workspace"),
+    "closet": ("wardrobe",),
+    "storage": ("pantry", "store", "basement", "attic"),
+    "laundry": ("utility",),
+    "stairs": ("staircase", "stairwell", "stair"),
+    "balcony": ("terrace", "patio", "porch", "deck", "garden", "outdoor"),
+    "meeting": ("conference", "auditorium", "classroom"),
+    "dining": ("breakfast",),
+    "kitchen": ("kitchenette",),
+    "bedroom": ("nursery",),
+}
+_TYPES = {word: kind for kind, words in _SYNONYMS.items() for word in words} | {name: name for name in ROOM_TYPES}
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
@@ -129,3 +149,12 @@ def _farthest(
     distance_m = np.asarray(shapely.distance(shapely.points(points), floor.boundary))
     chosen = int(distance_m.argmax())
     return points[chosen], float(distance_m[chosen])
+
+
+def room_type_from_label(label: str) -> str:
+    """Return the room type of a label ("Living room 2": living), `unknown` if it has no known word.
+
+    The first known word decides.
+    """
+    words = re.findall(r"[a-z]+", label.casefold())
+    return next((_TYPES[word] for word in words if word in _TYPES), ROOM_TYPES[0])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 class HorizonAttention(nn.Module):
     """Attention over the sectors with a learnt bias by offset, and a feed-forward layer.
 
-    The bias depends on offsets, not on positions, so rolling the panorama rolls the ring. The offsets of a full circle
+    The bias depends on offsets, not on positions, so rolling the sphere rolls the ring. The offsets of a full circle
     are circular; those of a part of it are not.
     """
 

@@ -52,7 +52,7 @@ class WallModes:
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """Predictions of an image encoder for a batch of panoramas.
+    """Predictions of an image encoder for a batch of spheres.
 
     Attributes:
         ring: (b, c, s) features to compare with the layout encoder's.
@@ -66,7 +66,7 @@ class ImageFeatures:
 
 
 def first_rows(features: ImageFeatures, count: int) -> ImageFeatures:
-    """Return the predictions for the first `count` panoramas of a batch."""
+    """Return the predictions for the first `count` spheres of a batch."""
     structure = features.structure
     if structure is not None:
         structure = StructureFeatures(**{name: value[:count] for name, value in vars(structure).items()})

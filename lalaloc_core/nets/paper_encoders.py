@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import layout_depth
 
 # ImageNet statistics, for training from its weights.
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -31,7 +31,7 @@ class PaperConfig:
         width: channels of the first stage; each later stage doubles them. ResNets have 64.
         latent_size: features of a latent.
         layout_height, profile_columns: size of the layout depth, pixels.
-        image_height, image_width: size of the panorama, pixels.
+        image_height, image_width: size of the sphere, pixels.
     """
 
     layout_depth: Literal[18, 50] = 18
@@ -147,7 +147,7 @@ class PaperLayoutEncoder(nn.Module):
 
 
 class PaperImageEncoder(nn.Module):
-    """Image encoder: RGB panorama to a latent."""
+    """Image encoder: RGB sphere to a latent."""
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()

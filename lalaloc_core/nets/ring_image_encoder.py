@@ -41,9 +41,9 @@ class _ImageBlock(nn.Module):
 
 
 class RingImageEncoder(nn.Module):
-    """Image encoder: panorama and camera height to a ring and a wall profile.
+    """Image encoder: sphere and camera height to a ring and a wall profile.
 
-    The camera height gives the metric scale that a single panorama lacks.
+    The camera height gives the metric scale that a single sphere lacks.
     """
 
     def __init__(self, config: RingConfig) -> None:

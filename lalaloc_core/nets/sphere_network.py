@@ -181,7 +181,7 @@ class HorizonEncoder(nn.Module):
 
 
 class TrunkImageEncoder(HorizonEncoder):
-    """Image encoder: panorama and camera height to ring, wall profile, openings, ceiling height and room type."""
+    """Image encoder: sphere and camera height to ring, wall profile, openings, ceiling height and room type."""
 
     def __init__(self, config: TrunkEncoderConfig, ring: RingConfig) -> None:
         super().__init__(config, ring.sectors, ring.profile_columns // ring.sectors, circular=True)
@@ -191,7 +191,7 @@ class TrunkImageEncoder(HorizonEncoder):
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ImageFeatures:
-        """Encode panoramas.
+        """Encode spheres.
 
         Pixels are 0 to 255 of any type, (b, h, w, 3); `styles` is for training only.
         """

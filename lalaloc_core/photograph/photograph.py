@@ -24,10 +24,17 @@ from lalaloc_core.photograph.levelling import (
 )
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
-from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture, orientation_of, scaled, turned
+from lalaloc_core.photograph.picture_files import (
+    FORMATS,
+    NEUTRAL,
+    PhotographLimits,
+    opened_picture,
+    orientation_of,
+    scaled,
+    turned,
+)
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
 from lalaloc_core.photograph.spheres import read_sphere
-from lalaloc_core.photograph.spheres import warm_up as warm_up_spheres
 from lalaloc_core.photograph.stated_camera import StatedCamera
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
@@ -138,11 +145,14 @@ def open_picture(
 
 def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
     """Read small pictures, so that codecs and detectors are loaded before the first request."""
-    warm_up_spheres(height=sphere_size[0], width=sphere_size[1])
-    buffer = io.BytesIO()
-    Image.new("RGB", (256, 192)).save(buffer, "JPEG")
-    stated = StatedCamera(projection="perspective", hfov_deg=70.0)
-    open_photograph(buffer.getvalue(), sphere_size=sphere_size, stated=stated, patch_size=patch_size)
+    sphere = StatedCamera(projection="equirectangular")
+    for name, height, stated in (
+        *((name, 128, sphere) for name in FORMATS),
+        ("JPEG", 192, StatedCamera(projection="perspective", hfov_deg=70.0)),
+    ):
+        buffer = io.BytesIO()
+        Image.new("RGB", (256, height), NEUTRAL).save(buffer, name)
+        open_photograph(buffer.getvalue(), sphere_size=sphere_size, stated=stated, patch_size=patch_size)
 
 
 def open_photograph(

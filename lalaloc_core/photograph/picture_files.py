@@ -39,7 +39,7 @@ _SIDEWAYS = {5, 6, 7, 8}
 
 @dataclass(frozen=True, kw_only=True)
 class PhotographLimits:
-    """Limits of panoramas, checked on the file's header before its pixels are allocated.
+    """Limits of photographs, checked on the file's header before its pixels are allocated.
 
     Attributes:
         max_pixels: width times height.

@@ -169,8 +169,8 @@ def _projection(
     if twice_as_wide and hfov == TWO_PI and looks_spherical():
         return "equirectangular", "estimated"
     if stated.hfov_deg is not None:
-        return ("cylindrical" if exif.panorama or hfov > _WIDEST_LENS else "perspective"), "assumed"
-    if exif.panorama:
+        return ("cylindrical" if exif.strip or hfov > _WIDEST_LENS else "perspective"), "assumed"
+    if exif.strip:
         return "cylindrical", "exif"
     if exif.focal is None and twice_as_wide:
         raise InvalidPhotographError(

@@ -6,7 +6,6 @@ Three kinds of metadata are used: the EXIF orientation, the visible part of the 
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import replace
 
@@ -19,7 +18,6 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
-    FORMATS,
     NEUTRAL,
     PhotographLimits,
     opened_picture,
@@ -75,15 +73,6 @@ def read_sphere(
         if not sphere.level:
             canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll))
         return np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
-
-
-def warm_up(*, height: int, width: int) -> None:
-    """Read a small picture of every format, so that codecs are loaded before the first request."""
-    picture = Image.new("RGB", (256, 128), NEUTRAL)
-    for picture_format in FORMATS:
-        buffer = io.BytesIO()
-        picture.save(buffer, picture_format)
-        read_sphere(buffer.getvalue(), height=height, width=width)
 
 
 def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PhotographLimits) -> None:

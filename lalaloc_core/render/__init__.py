@@ -1,14 +1,13 @@
 """Layout renderer: bare walls, floor and ceiling of a plan from the pose of a camera, in closed form.
 
-Begin with `profile.py`, which casts rays at walls. `layout.py` adds openings and the rooms behind them, `depth.py` adds
-floor and ceiling, and `gradient.py` computes derivatives by the pose. These modules run on numpy and on torch alike.
+Begin with `profile.py`, which casts rays at walls, and adds floor and ceiling. `layout.py` adds openings and the rooms
+behind them, and `gradient.py` computes derivatives by the pose. These modules run on numpy and on torch alike.
 `sweep.py` renders many poses of a plan at once, for numpy only; search and training use it. `sampling.py` draws poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.
 """
 
-from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.layout import RenderedLayout, render_layout
-from lalaloc_core.render.profile import cast_rays, wall_profile
+from lalaloc_core.render.profile import back_project, cast_rays, layout_depth, wall_profile
 from lalaloc_core.render.sweep import profiles_at
 
 __all__ = [

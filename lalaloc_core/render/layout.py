@@ -1,4 +1,4 @@
-"""The layout view: per azimuth, the distance to the wall, the opening in it, and the distance behind that opening.
+"""The layout by azimuth, the distance to the wall, the opening in it, and the distance behind that opening.
 
 In closed form, for numpy and torch. The distance is to the wall itself; doors, windows and passages are parts of it.
 """
@@ -39,7 +39,7 @@ def render_layout(
     columns: int,
     camera_height_m: Float[Array, "b"] | float,
 ) -> RenderedLayout:
-    """Render the layout view of each pose, one value per azimuth column of a panorama with that heading.
+    """Render the layout of each pose, one value per azimuth column of a sphere with that heading.
 
     The distances are differentiable in position and heading almost everywhere. Positions are inside their rooms; use
     double precision far from the plan's origin. `heading` is the azimuth of the centre column, radians. An opening is

@@ -1,18 +1,20 @@
 """Wall profile: horizontal distance from the camera to the nearest wall of its room per azimuth, in closed form.
 
 A floor plan is an extrusion, so one 2-D ray per azimuth column against the room's wall segments determines the whole
-bare layout. The code uses the array API: it runs on numpy arrays (service) and on torch tensors (training and LPO),
-where the result is differentiable in position and heading almost everywhere.
+bare layout, and layout depth follows from the wall profile. The code uses the array API: it runs on numpy arrays
+(service) and on torch tensors (training and LPO), where the result is differentiable in position and heading almost
+everywhere.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from array_api_compat import array_namespace, device
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import Array, column_azimuths
+from lalaloc_core.conventions import Array, column_azimuths, row_elevations, unit_rays
 
 # A ray may miss both of two adjoining walls at their corner by rounding; each wall is widened by this share.
 CORNER_TOLERANCE = 1e-5
@@ -132,7 +134,7 @@ def wall_profile(
     walls_m: Float[Array, "b n 4"],
     columns: int,
 ) -> Float[Array, "b {columns}"]:
-    """Return the wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
+    """Return the wall profile (m) of each pose, one value per azimuth column of a sphere with that heading.
 
     Positions are inside the room that `walls_m` closes, segments (x0, y0, x1, y1) of each pose's own room. `heading` is
     the azimuth of the centre column, radians.
@@ -140,3 +142,34 @@ def wall_profile(
     xp = array_namespace(position_m, heading, walls_m)
     relative = xp.asarray(column_azimuths(columns), dtype=position_m.dtype, device=device(position_m))
     return cast_rays(position_m, heading[:, None] + relative[None, :], walls_m)
+
+
+def layout_depth(
+    profile_m: Float[Array, "b w"],
+    camera_height_m: Float[Array, "b"],
+    ceiling_height_m: Float[Array, "b"],
+    rows: int,
+) -> Float[Array, "b {rows} w"]:
+    """Return the range (m) along each pixel's ray to the nearest of wall, floor and ceiling.
+
+    `range = min(wall / cos e, camera / -sin e below the horizon, (ceiling - camera) / sin e above it)`. Heights are
+    over the floor, the ceiling's above the camera's. The image's `rows` cover elevation +90° to -90°.
+    """
+    xp = array_namespace(profile_m, camera_height_m, ceiling_height_m)
+    elevation = row_elevations(rows)
+    like = {"dtype": profile_m.dtype, "device": device(profile_m)}
+    inverse_cosine = xp.asarray(1.0 / np.cos(elevation), **like)
+    inverse_sine = xp.asarray(1.0 / np.abs(np.sin(elevation)), **like)
+    above = xp.asarray(elevation > 0.0, device=device(profile_m))
+    clearance = xp.where(above[None, :], (ceiling_height_m - camera_height_m)[:, None], camera_height_m[:, None])
+    horizontal = clearance * inverse_sine[None, :]
+    return xp.minimum(profile_m[:, None, :] * inverse_cosine[None, :, None], horizontal[:, :, None])
+
+
+def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
+    """Return each depth image as a point cloud (m) in the camera frame: x right, y forward (centre column), z up."""
+    xp = array_namespace(depth_m)
+    batch, rows, columns = depth_m.shape
+    azimuth, elevation = column_azimuths(columns)[None, :], row_elevations(rows)[:, None]
+    rays = xp.asarray(unit_rays(azimuth, elevation), dtype=depth_m.dtype, device=device(depth_m))
+    return xp.reshape(depth_m[..., None] * rays[None], (batch, rows * columns, 3))

@@ -1,4 +1,4 @@
-"""Layout views of many poses at once: each wall fills only the columns between the azimuths of its ends.
+"""Layouts of many poses at once: each wall fills only the columns between the azimuths of its ends.
 
 `render.layout` casts every ray at every wall, and in large rooms most of these pairs miss. Here the azimuths of a
 wall's ends give the columns it can fill, and the nearest wall of each column wins. The cost grows with the number of
@@ -24,7 +24,7 @@ _PAIRS = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class SweptLayouts:
-    """Layout views of n poses in w columns each.
+    """Layouts of n poses in w columns each.
 
     Attributes:
         distance_m: (n, w) distance to the nearest wall of the pose's own room; inf outside a room.
@@ -40,7 +40,7 @@ class SweptLayouts:
     behind_m: Float[np.ndarray, "m"]
 
 
-def swept_views(
+def sweep_layouts(
     position_m: Float[np.ndarray, "n 2"],
     heading: Float[np.ndarray, "n"],
     room_index: Int[np.ndarray, "n"],
@@ -48,7 +48,7 @@ def swept_views(
     columns: int,
     eye_m: float | Float[np.ndarray, "m"],
 ) -> SweptLayouts:
-    """Render the layout views of poses of a plan, or of several plans with a joined table.
+    """Render the layouts of poses of a plan, or of several plans with a joined table.
 
     Positions are inside their rooms; `heading` is the azimuth of the centre column, radians. An opening is visible if
     its sill is below the eye and its head above; `eye_m` is one height, or that for each opening face of the table.
@@ -59,10 +59,10 @@ def swept_views(
     behind_m = [np.empty(0, np.float32)]
     at_eye = np.flatnonzero((walls.sill_m < eye_m) & (eye_m < walls.head_m))
     for part in _parts(room_index, walls, columns):
-        rays = _Rays.cast(heading[part], columns)
-        distance, wall = _nearest(position_m[part], rays, room_index[part], walls)
+        rays = _Rays.cast(position_m[part], heading[part], columns)
+        distance, wall = _nearest(rays, room_index[part], walls)
         distance_m[part] = distance
-        row, column, number = _openings(position_m[part], rays, distance, wall, walls, at_eye)
+        row, column, number = _openings(rays, distance, wall, walls, at_eye)
         kind[row + part.start, column] = walls.opening_kind[number]
         leads_on = np.isin(walls.opening_kind[number], (DOOR_CODE, PASSAGE_CODE)) & (walls.behind[number] >= 0)
         row, column, number = row[leads_on], column[leads_on], number[leads_on]
@@ -91,8 +91,8 @@ def profiles_at(
     walls = plan.wall_table
     distance_m = np.empty((len(position_m), columns), dtype)
     for part in _parts(room_index, walls, columns):
-        rays = _Rays.cast(heading[part], columns)
-        distance_m[part], _ = _nearest(position_m[part], rays, room_index[part], walls)
+        rays = _Rays.cast(position_m[part], heading[part], columns)
+        distance_m[part], _ = _nearest(rays, room_index[part], walls)
     return distance_m
 
 
@@ -100,16 +100,17 @@ def profiles_at(
 class _Rays:
     """Rays of b poses in w columns: components of their unit vectors, stored once if all headings are equal."""
 
+    position_m: Float[np.ndarray, "b 2"]
     heading: Float[np.ndarray, "b"]
     columns: int
     x: Float[np.ndarray, "k w"]
     y: Float[np.ndarray, "k w"]
 
     @classmethod
-    def cast(cls, heading: Float[np.ndarray, "b"], columns: int) -> _Rays:
+    def cast(cls, position_m: Float[np.ndarray, "b 2"], heading: Float[np.ndarray, "b"], columns: int) -> _Rays:
         distinct = heading[:1] if (heading == heading[0]).all() else heading
         azimuth = distinct[:, None] + column_azimuths(columns)[None]
-        return cls(heading, columns, np.sin(azimuth), np.cos(azimuth))
+        return cls(position_m, heading, columns, np.sin(azimuth), np.cos(azimuth))
 
     def along(self, row: Int[np.ndarray, "m"], column: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
         """Return the (m, 2) unit vectors of rays."""
@@ -130,10 +131,10 @@ def _parts(room_index: Int[np.ndarray, "n"], walls: WallTable, columns: int) -> 
 
 
 def _nearest(
-    position_m: Float[np.ndarray, "b 2"], rays: _Rays, room_index: Int[np.ndarray, "b"], walls: WallTable
+    rays: _Rays, room_index: Int[np.ndarray, "b"], walls: WallTable
 ) -> tuple[Float[np.ndarray, "b w"], Int[np.ndarray, "b w"]]:
     """Return each ray's distance (m) to the nearest wall, and the wall's index in the table, -1 for none."""
-    columns = rays.columns
+    columns, position_m = rays.columns, rays.position_m
     pose, wall = _room_wall_pairs(walls, room_index)
     start, end = walls.start_m[wall] - position_m[pose], walls.end_m[wall] - position_m[pose]
     edge = end - start
@@ -178,7 +179,6 @@ def _room_wall_pairs(walls: WallTable, room_index: Int[np.ndarray, "b"]) -> tupl
 
 
 def _openings(
-    position_m: Float[np.ndarray, "b 2"],
     rays: _Rays,
     distance_m: Float[np.ndarray, "b w"],
     wall: Int[np.ndarray, "b w"],
@@ -197,7 +197,7 @@ def _openings(
     row, column = np.nonzero(has_opening[wall])
     wall = wall[row, column]
     edge = walls.end_m[wall] - walls.start_m[wall]
-    met_m = position_m[row] + distance_m[row, column][:, None] * rays.along(row, column)
+    met_m = rays.position_m[row] + distance_m[row, column][:, None] * rays.along(row, column)
     from_start = met_m - walls.start_m[wall]
     share = (from_start * edge).sum(axis=1) / np.square(edge).sum(axis=1)
     place = wall + share

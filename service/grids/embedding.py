@@ -75,7 +75,7 @@ def embed(
         if not latents:
             return PoseGrid.without_latents(poses, whole, step_m, camera_height_m)
         profile_m = np.exp(whole.log_profile)
-        return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
+        return PoseGrid(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
 
 
 def embed_small(

@@ -63,7 +63,7 @@ class RemotePhotographEncoder(PhotographEncoder):
 
     def query(
         self,
-        view: Photograph,
+        photograph: Photograph,
         heading: float | None,
         camera_height: CameraHeight,
         *,
@@ -76,9 +76,9 @@ class RemotePhotographEncoder(PhotographEncoder):
             InvalidPhotographError: see `PhotographEncoder.query`.
             DeadlineExceededError: no answer in time, or two replicas died.
         """
-        self.check(view)
+        self.check(photograph)
         for _ in range(_ATTEMPTS):
-            response = self._encoder.query.remote(view, heading, camera_height, heading_tolerance, others)
+            response = self._encoder.query.remote(photograph, heading, camera_height, heading_tolerance, others)
             try:
                 return response.result(timeout_s=self._deadline_s)
             except TimeoutError:

@@ -18,8 +18,7 @@ from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograp
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 CAMERA_M = 1.4

@@ -116,5 +116,5 @@ def test_picture_cropped_later_has_no_focal_length() -> None:
 
 def test_panorama_mode_has_no_focal_length() -> None:
     lens = read({Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26})
-    assert lens.panorama
+    assert lens.strip
     assert lens.focal is None

@@ -29,8 +29,7 @@ from lalaloc_core.localise.refine import LpoConfig, RefinementJob
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.localise.search.pipeline import LocaliseConfig
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.core.questions import CAMERA_M, BareRoom, paint, question_at
 from tests.core.test_headings import COLUMNS, RING
 from tests.strategies import Scene, convex_polygons, crooked_flat, plan_of, present, room_polygons, scene_of, seeds

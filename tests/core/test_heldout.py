@@ -24,8 +24,7 @@ from lalaloc_core.learn.heldout.outlines import AREAS_M2, sample_outline
 from lalaloc_core.learn.heldout.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.tracing import Tracer
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.core.questions import run_info
 
 HOMES = 4

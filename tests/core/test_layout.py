@@ -23,7 +23,7 @@ from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_view
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.render.sweep import SweptLayouts, profiles_at, swept_views
+from lalaloc_core.render.sweep import SweptLayouts, profiles_at, sweep_layouts
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, scene_of, seeds, spiral
 
 COLUMNS, EYE_M = 64, 1.5
@@ -170,7 +170,7 @@ def full_behind_m(view: SweptLayouts) -> np.ndarray:
 
 def assert_the_same(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, misses: float = 0.0) -> None:
     """Check that both renderers agree on all rays but a share `misses` that graze a corner, where rounding decides."""
-    swept = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
+    swept = sweep_layouts(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
     cast = render_layout(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
     differs = ~np.isclose(swept.distance_m, cast.distance_m, rtol=1e-4) | (swept.kind != cast.kind)
     differs |= ~np.isclose(full_behind_m(swept), cast.behind_m, rtol=1e-3)
@@ -226,7 +226,7 @@ def test_free_standing_walls_have_two_sides() -> None:
     poses = pose_grid(plan, 0.7)
     assert_the_same(plan, poses, np.zeros(len(poses)), misses=1e-3)
     assert len(
-        swept_views(poses.position_m, np.zeros(len(poses)), poses.room_index, plan.wall_table, COLUMNS, EYE_M).row
+        sweep_layouts(poses.position_m, np.zeros(len(poses)), poses.room_index, plan.wall_table, COLUMNS, EYE_M).row
     )
 
 

@@ -31,8 +31,7 @@ from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, coun
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.core.questions import prediction_of, run_info
 from tests.strategies import Scene, crooked_flat, plan_of, present, rectangle, scenes
 

@@ -22,7 +22,6 @@ from lalaloc_core.localise.match import (
     LowestCosts,
     MatchingConfig,
     MatchingCost,
-    PairLimits,
     PoseGrid,
     coarse_costs,
     layouts_at,
@@ -407,11 +406,11 @@ def test_pair_costs_equal_the_full_matrix(building: Building, grid: PoseGrid, qu
 
 
 @pytest.mark.parametrize(
-    "limits", [PairLimits(at_most=6000, at_least=200, window=0.5), PairLimits(at_most=300, at_least=300)]
+    "limits", [{"at_most": 6000, "at_least": 200, "window": 0.5}, {"at_most": 300, "at_least": 300}]
 )
 @pytest.mark.parametrize("hinted", [False, True])
 def test_likeliest_pairs_equal_a_complete_coarse_pass(
-    building: Building, grid: PoseGrid, queries: list[Query], limits: PairLimits, hinted: bool
+    building: Building, grid: PoseGrid, queries: list[Query], limits: dict[str, Any], hinted: bool
 ) -> None:
     compared, rng = 0, np.random.default_rng(2)
     for query in queries[:8]:
@@ -420,7 +419,7 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
         every = coarse_costs(binned, matching_cost, room_index)
         every = every if penalty is None else every + penalty[:, None]
-        found, pair = likeliest(binned, matching_cost, room_index, limits, penalty)
+        found, pair = likeliest(binned, matching_cost, room_index, penalty, **limits)
         count = int((every <= every.min() + limits.window).sum())
         count = min(max(count, limits.at_least), limits.at_most)
         np.testing.assert_allclose(found[:count], np.sort(every.ravel())[:count], atol=1e-6)

@@ -21,8 +21,7 @@ from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, largest_simple_part, signed_area
 from lalaloc_core.learn.data.structured3d import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL, Structured3D, scene_numbers
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from lalaloc_core.render.sampling import random_poses
 from tests.strategies import crooked_flat, plan_of, plans, rectangle, room_polygons, same_ring, seeds
 from tests.structured3d_scene import (

@@ -23,8 +23,7 @@ from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, contac
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.strategies import seeds
 
 ROWS, COLUMNS = 64, 128

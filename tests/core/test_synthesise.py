@@ -46,8 +46,7 @@ from lalaloc_core.learn.synth.scene.lighting import MOODS
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot, stage_rooms
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.strategies import present, seeds
 
 # A seed whose first homes have four rooms each.

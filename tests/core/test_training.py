@@ -43,7 +43,7 @@ from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encod
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.image_features import ImageFeatures, WallModes
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
-from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.profile import back_project, layout_depth
 from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.render.sweep import profiles_at
 from tests.strategies import crooked_flat, seeds

@@ -10,9 +10,8 @@ import pytest
 
 from lalaloc_core.conventions import OPENING_CLASSES, row_elevations
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.layout import RenderedLayout, render_layout
-from lalaloc_core.render.profile import cast_rays
+from lalaloc_core.render.profile import cast_rays, layout_depth
 from tests.service.conftest import upload
 from tests.web.conftest import EXAMPLES, Visit
 

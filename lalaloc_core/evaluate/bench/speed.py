@@ -31,8 +31,7 @@ from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import layout_depth, wall_profile
 from lalaloc_core.render.reference import reference_depth
 from lalaloc_core.render.sampling import pose_grid, random_poses
 

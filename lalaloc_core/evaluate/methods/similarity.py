@@ -23,7 +23,7 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Question, grid_key
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.search.pipeline import StageClock
-from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.profile import back_project, layout_depth
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 

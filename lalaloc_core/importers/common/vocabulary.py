@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Mapping
 from typing import Literal
 
-from lalaloc_core.floorplan.types import room_type_from_label
+from lalaloc_core.floorplan.rooms import room_type_from_label
 
 Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
 

@@ -17,7 +17,7 @@ from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, build_decoder, build_layout_encoder
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
-from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.profile import back_project, layout_depth
 
 
 class LayoutStage(TrainingStage):

@@ -5,9 +5,9 @@ in other homes (`localise.match.cohort`), the uncertainty that the image encoder
 logistic model of the signals is fitted on validation queries and on photographs of unknown places
 (`lalaloc_core.evaluate.calibrate`).
 
-`confidence_of` computes the confidence of an answer; `sequence.search` combines it for several photographs. The classes
-of the logistic model (`bundle.ConfidenceModel`, `bundle.LogisticModel`) are in `bundle.py`, because their weights are
-part of the manifest.
+`confidence_of` computes the confidence of an answer; `sequence.sequence_search` combines it for several photographs.
+The classes of the logistic model (`bundle.ConfidenceModel`, `bundle.LogisticModel`) are in `bundle`, because their
+weights are part of the manifest.
 """
 
 from __future__ import annotations

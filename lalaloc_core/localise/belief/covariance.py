@@ -54,7 +54,9 @@ def pose_uncertainty(
     covariance = (axes * variance) @ axes.T
     heading_std = None
     if by_heading is not None and model.heading_factor is not None:
-        heading_std = _heading_std(by_heading, model.heading_factor)
+        heading_std = _ANY_HEADING_STD
+        if by_heading > 0.0:
+            heading_std = min(math.sqrt(model.heading_factor / by_heading), _ANY_HEADING_STD)
     return PoseUncertainty(0.5 * (covariance + covariance.T), heading_std)
 
 
@@ -76,8 +78,3 @@ def marginal_information(
     if by_heading > 0.0:
         by_position = by_position - np.outer(cross, cross) / by_heading
     return by_position, float(left)
-
-
-def _heading_std(information: float, factor: float) -> float:
-    """Return the standard deviation (radians) of a heading."""
-    return min(math.sqrt(factor / information), _ANY_HEADING_STD) if information > 0.0 else _ANY_HEADING_STD

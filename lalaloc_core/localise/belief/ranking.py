@@ -23,7 +23,7 @@ _OBLIQUE = np.array([1.0, 0.6180, 0.2719, 0.1133])
 
 
 def photograph_heading(query: Query, candidate: Candidate) -> float:
-    """Return the azimuth (radians) of the panorama's centre column that a candidate implies."""
+    """Return the azimuth (radians) of the photograph's centre column that a candidate implies."""
     return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
 
 

@@ -6,7 +6,7 @@ compares it. `cohort.py` costs poses of other homes, to tell a good cost from ch
 """
 
 from lalaloc_core.localise.match.binned_layouts import BinnedLayouts
-from lalaloc_core.localise.match.coarse_pass import LowestCosts, PairLimits, coarse_costs, likeliest
+from lalaloc_core.localise.match.coarse_pass import LowestCosts, coarse_costs, likeliest
 from lalaloc_core.localise.match.cohort import Cohort, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.match.layouts import Layouts, layouts_at
 from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
@@ -19,7 +19,6 @@ __all__ = [
     "LowestCosts",
     "MatchingConfig",
     "MatchingCost",
-    "PairLimits",
     "PoseGrid",
     "coarse_costs",
     "cohort_of",

@@ -16,8 +16,6 @@ rising bounds until no other can be among the wanted ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -82,29 +80,21 @@ class LowestCosts:
         self._cost, self._place, self._kept = [cost], [place], len(cost)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairLimits:
-    """Limits of the number of pairs of a pose and a hypothesis.
-
-    There are at least `at_least` pairs if so many exist; those beyond cost at most `window` more than the best.
-    """
-
-    at_most: int
-    at_least: int
-    window: float = 0.0
-
-
 def likeliest(
     binned: BinnedLayouts,
     matching_cost: MatchingCost,
     room_index: Int[np.ndarray, "n"],
-    limits: PairLimits,
     hint_cost: Float[np.ndarray, "n"] | None = None,
+    *,
+    at_most: int,
+    at_least: int,
+    window: float = 0.0,
 ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
     """Return the coarse costs, rising, and the pairs (pose times number of hypotheses, plus hypothesis) of the best.
 
-    The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow. `hint_cost` is added to
-    the costs of every pose; infinite excludes it.
+    There are at least `at_least` pairs if so many exist; those beyond cost at most `window` more than the best. The
+    result equals the best of all `coarse_costs`; some pairs beyond these and `at_most` can follow. `hint_cost` is added
+    to the costs of every pose; infinite excludes it.
     """
     table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
     shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
@@ -116,9 +106,9 @@ def likeliest(
     # Short integers sort fastest.
     order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
     least_after = np.minimum.accumulate(bound[order][::-1])[::-1]
-    best, least = LowestCosts(limits.at_most), LowestCosts(limits.at_least)
+    best, least = LowestCosts(at_most), LowestCosts(at_least)
     lowest, first, count = np.inf, 0, _FIRST_CHUNK
-    while first < len(order) and least_after[first] <= min(best.bound, max(lowest + limits.window, least.bound)):
+    while first < len(order) and least_after[first] <= min(best.bound, max(lowest + window, least.bound)):
         pose = order[first : first + count]
         cost = _at_best_offset(binned.rows[pose] @ table, room_costs[:, room_index[pose]], shape)
         cost = cost if hint_cost is None else cost + hint_cost[pose, None]

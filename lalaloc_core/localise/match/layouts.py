@@ -12,12 +12,12 @@ from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import WallTable
 from lalaloc_core.render.sampling import PoseSet
-from lalaloc_core.render.sweep import profiles_at, swept_views
+from lalaloc_core.render.sweep import profiles_at, sweep_layouts
 
 
 @dataclass(frozen=True, eq=False)
 class SeenThrough:
-    """Views through openings.
+    """Walls seen through openings.
 
     Attributes:
         row: (m,) numbers of the poses, rising.
@@ -34,7 +34,11 @@ class SeenThrough:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays."""
-        return self.row.nbytes + self.column.nbytes + self.kind.nbytes + self.log_behind.nbytes
+        return sum(array.nbytes for array in vars(self).values())
+
+    def chosen(self, kept: Int[np.ndarray, "k"]) -> SeenThrough:
+        """Return some of the entries."""
+        return SeenThrough(*(array[kept] for array in vars(self).values()))
 
     def entries(self, pose: Int[np.ndarray, "k"]) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
         """Return the entries of some poses: for each entry the place of its pose in `pose`, and its number."""
@@ -51,7 +55,7 @@ class Layouts:
     Attributes:
         log_profile: (n, w) log wall profiles (m).
         kind: (n, w) codes as in `conventions.OPENING_CLASSES`; None if the plan has no openings.
-        seen: views through openings; None without any.
+        seen: walls seen through openings; None without any.
     """
 
     log_profile: Float[np.ndarray, "n w"]
@@ -74,7 +78,7 @@ class Layouts:
         if seen is not None:
             place = np.searchsorted(index, seen.row)
             kept = np.flatnonzero(index[np.minimum(place, len(index) - 1)] == seen.row)
-            seen = SeenThrough(place[kept], seen.column[kept], seen.kind[kept], seen.log_behind[kept])
+            seen = replace(seen.chosen(kept), row=place[kept])
         kind = None if self.kind is None else self.kind[index]
         return Layouts(self.log_profile[index], self.room_index[index], kind, seen)
 
@@ -82,8 +86,8 @@ class Layouts:
         """Return the layouts at every azimuth whose column is a multiple of `stride`."""
         seen = self.seen
         if seen is not None:
-            kept = np.flatnonzero(seen.column % stride == 0)
-            seen = SeenThrough(seen.row[kept], seen.column[kept] // stride, seen.kind[kept], seen.log_behind[kept])
+            seen = seen.chosen(np.flatnonzero(seen.column % stride == 0))
+            seen = replace(seen, column=seen.column // stride)
         kind = None if self.kind is None else self.kind[:, ::stride]
         return Layouts(np.ascontiguousarray(self.log_profile[:, ::stride]), self.room_index, kind, seen)
 
@@ -93,10 +97,10 @@ def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"],
     if not plan.opening_faces:
         profile_m = profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
         return Layouts(np.log(profile_m), poses.room_index)
-    view = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, columns, plan.camera_height_m)
-    behind = view.row, view.column, view.kind[view.row, view.column], np.log(view.behind_m)
-    seen = SeenThrough(*behind) if len(view.row) else None
-    return Layouts(np.log(view.distance_m), poses.room_index, view.kind, seen)
+    swept = sweep_layouts(poses.position_m, heading, poses.room_index, plan.wall_table, columns, plan.camera_height_m)
+    behind = swept.row, swept.column, swept.kind[swept.row, swept.column], np.log(swept.behind_m)
+    seen = SeenThrough(*behind) if len(swept.row) else None
+    return Layouts(np.log(swept.distance_m), poses.room_index, swept.kind, seen)
 
 
 def layouts_of_plans(plans: Sequence[FloorPlan], poses: Sequence[PoseSet], columns: int) -> list[Layouts]:
@@ -110,19 +114,19 @@ def layouts_of_plans(plans: Sequence[FloorPlan], poses: Sequence[PoseSet], colum
     eye_m = np.repeat([plan.camera_height_m for plan in plans], [len(table.sill_m) for table in tables])
     position_m = np.concatenate([part.position_m for part in poses])
     room_index = np.concatenate([part.room_index + shift for part, shift in zip(poses, rooms, strict=False)])
-    view = swept_views(position_m, np.zeros(len(position_m)), room_index, WallTable.joined(tables), columns, eye_m)
-    log_profile, log_behind = np.log(view.distance_m), np.log(view.behind_m)
-    kind, through = view.kind[view.row, view.column], np.searchsorted(view.row, first)
+    heading, walls = np.zeros(len(position_m)), WallTable.joined(tables)
+    swept = sweep_layouts(position_m, heading, room_index, walls, columns, eye_m)
+    log_profile, log_behind = np.log(swept.distance_m), np.log(swept.behind_m)
+    kind, through = swept.kind[swept.row, swept.column], np.searchsorted(swept.row, first)
     layouts = []
     for number, (plan, part) in enumerate(zip(plans, poses, strict=True)):
         own, seen = slice(first[number], first[number + 1]), slice(through[number], through[number + 1])
         if not plan.opening_faces:
             layouts.append(Layouts(log_profile[own], part.room_index))
             continue
-        behind = view.row[seen] - own.start, view.column[seen], kind[seen], log_behind[seen]
-        layouts.append(
-            Layouts(log_profile[own], part.room_index, view.kind[own], SeenThrough(*behind) if len(behind[0]) else None)
-        )
+        behind = swept.row[seen] - own.start, swept.column[seen], kind[seen], log_behind[seen]
+        ways = SeenThrough(*behind) if len(behind[0]) else None
+        layouts.append(Layouts(log_profile[own], part.room_index, swept.kind[own], ways))
     return layouts
 
 
@@ -141,7 +145,5 @@ def joined_layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -
         first += len(part)
     if not seen:
         return Layouts(log_profile, room_index, kind)
-    through = SeenThrough(
-        *(np.concatenate([getattr(part, name) for part in seen]) for name in ("row", "column", "kind", "log_behind"))
-    )
-    return Layouts(log_profile, room_index, kind, through)
+    through = zip(*(vars(part).values() for part in seen), strict=True)
+    return Layouts(log_profile, room_index, kind, SeenThrough(*map(np.concatenate, through)))

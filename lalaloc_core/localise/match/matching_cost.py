@@ -1,4 +1,4 @@
-"""Matching cost: how badly a pose fits a panorama, by its walls, openings, ceiling and room type.
+"""Matching cost: how badly a pose fits a photograph, by its walls, openings, ceiling and room type.
 
 Every term is a negative log likelihood per azimuth, up to constants, and close to 0 for a perfect fit. The errors of
 neighbouring azimuths are correlated, so each term has a weight in units of the walls', fitted on validation queries
@@ -106,7 +106,7 @@ class Terms(NamedTuple):
         )
 
 
-class _Views(NamedTuple):
+class _Gathered(NamedTuple):
     """Layouts of m poses, ready to be compared.
 
     `opening` is the place of each azimuth's class in a row of w x c losses. The e azimuths `pose`, `column` have a view
@@ -159,9 +159,9 @@ class MatchingCost:
         best = np.empty(cost.shape, np.intp)
         for first in range(0, len(layouts), _CHUNK):
             part = slice(first, first + _CHUNK)
-            views = self._views(layouts, np.arange(len(layouts))[part])
+            gathered = self._gathered(layouts, np.arange(len(layouts))[part])
             for row, hypothesis in enumerate(hypotheses):
-                cost[row, part], best[row, part] = self._compared(views, hypothesis[None])
+                cost[row, part], best[row, part] = self._compared(gathered, hypothesis[None])
         return cost, self.offsets[best]
 
     def pairs(
@@ -171,16 +171,16 @@ class MatchingCost:
         cost, best = np.empty(len(pose), np.float32), np.empty(len(pose), np.intp)
         for first in range(0, len(pose), _CHUNK):
             part = slice(first, first + _CHUNK)
-            cost[part], best[part] = self._compared(self._views(layouts, pose[part]), hypothesis[part])
+            cost[part], best[part] = self._compared(self._gathered(layouts, pose[part]), hypothesis[part])
         return cost, self.offsets[best]
 
     def terms(self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]) -> Terms:
         """Return the terms of the cost of poses that each have their own hypothesis and δ."""
         every = np.arange(len(layouts))
-        views = self._views(layouts, every)
+        gathered = self._gathered(layouts, every)
         return Terms(
-            walls=self._walls(views, hypothesis, offset[None])[0].astype(np.float64),
-            openings=self._openings(views, hypothesis).astype(np.float64),
+            walls=self._walls(gathered, hypothesis, offset[None])[0].astype(np.float64),
+            openings=self._openings(gathered, hypothesis).astype(np.float64),
             ceiling=self._ceilings(offset)[every, layouts.room_index],
             room_type=self._room_types[layouts.room_index],
             height=self._query.camera_height.penalty(offset),
@@ -190,12 +190,12 @@ class MatchingCost:
         self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]
     ) -> Float[np.ndarray, "n w"]:
         """Return the probability by azimuth that the prediction is of the pose's own wall, not of one behind it."""
-        views = self._views(layouts, np.arange(len(layouts)))
-        share = np.ones(views.log_profile.shape)
-        k, pose, column = hypothesis[views.pose], views.pose, views.column
+        gathered = self._gathered(layouts, np.arange(len(layouts)))
+        share = np.ones(gathered.log_profile.shape)
+        k, pose, column = hypothesis[gathered.pose], gathered.pose, gathered.column
         moved = offset[pose].astype(np.float32)
-        shut = self._likelihood(views.log_profile[pose, column] - moved, (k, column))
-        opened = views.odds * self._likelihood(views.log_behind - moved, (k, column))
+        shut = self._likelihood(gathered.log_profile[pose, column] - moved, (k, column))
+        opened = gathered.odds * self._likelihood(gathered.log_behind - moved, (k, column))
         share[pose, column] = shut / (shut + opened)
         return share
 
@@ -252,7 +252,7 @@ class MatchingCost:
         likelihood = self._first.likelihood(log_m, place)
         return likelihood if self._rival is None else likelihood + self._rival.likelihood(log_m, place)
 
-    def _views(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Views:
+    def _gathered(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Gathered:
         """Gather the layouts of some poses."""
         opening = None
         if layouts.kind is not None:
@@ -266,34 +266,34 @@ class MatchingCost:
             share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
             odds = share / (1.0 - share)
         log_profile = layouts.log_profile[pose].astype(np.float32, copy=False)
-        return _Views(log_profile, opening, layouts.room_index[pose], row, column, log_behind, odds)
+        return _Gathered(log_profile, opening, layouts.room_index[pose], row, column, log_behind, odds)
 
     def _compared(
-        self, views: _Views, hypothesis: Int[np.ndarray, "#m"]
+        self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]
     ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
         """Return the cost of poses under their hypotheses, one each or one for all, and the number of the best δ."""
-        cost = self._walls(views, hypothesis, self.offsets[:, None])
-        cost += self.room_costs[:, views.room_index]
-        return cost.min(axis=0) + self._weights.openings * self._openings(views, hypothesis), cost.argmin(axis=0)
+        cost = self._walls(gathered, hypothesis, self.offsets[:, None])
+        cost += self.room_costs[:, gathered.room_index]
+        return cost.min(axis=0) + self._weights.openings * self._openings(gathered, hypothesis), cost.argmin(axis=0)
 
     def _walls(
         self,
-        views: _Views,
+        gathered: _Gathered,
         hypothesis: Int[np.ndarray, "#m"],
         offset: Float[np.ndarray, "j #m"],
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
         precision, offset = self._first.precision[hypothesis], offset.astype(np.float32)
         # Residuals at δ = 0 for the opening or the pose's own wall; the offset is subtracted for each δ.
-        residual = views.log_profile - self._first.centre[hypothesis]
+        residual = gathered.log_profile - self._first.centre[hypothesis]
         residual *= precision
         # Residuals of the walls behind openings, by flat indices, which numpy takes fastest.
         count, columns = residual.shape
-        place = views.pose * columns + views.column
-        predicted = np.broadcast_to(hypothesis * columns, count)[views.pose] + views.column
+        place = gathered.pose * columns + gathered.column
+        predicted = np.broadcast_to(hypothesis * columns, count)[gathered.pose] + gathered.column
         precision_behind = self._first.precision.take(predicted)
-        residual_behind = (views.log_behind - self._first.centre.take(predicted)) * precision_behind
-        offset_behind = offset if offset.shape[1] == 1 else offset[:, views.pose]
+        residual_behind = (gathered.log_behind - self._first.centre.take(predicted)) * precision_behind
+        offset_behind = offset if offset.shape[1] == 1 else offset[:, gathered.pose]
         cost = np.empty((len(offset), count), np.float32)
         for j in range(len(offset)):
             # The last δ reuses the memory of the residuals.
@@ -302,26 +302,26 @@ class MatchingCost:
             np.square(factor, out=factor)
             factor += 1.0
             if self._rival is not None:
-                rival = self._rival.likelihood(views.log_profile - offset[j, :, None], hypothesis)
+                rival = self._rival.likelihood(gathered.log_profile - offset[j, :, None], hypothesis)
                 factor = np.maximum(1.0 / (1.0 / factor + rival), 1.0)
             if len(place):
                 behind = np.square(residual_behind - offset_behind[j] * precision_behind) + 1.0
                 if self._rival is not None:
                     behind = 1.0 / (
-                        1.0 / behind + self._rival.likelihood_at(views.log_behind - offset_behind[j], predicted)
+                        1.0 / behind + self._rival.likelihood_at(gathered.log_behind - offset_behind[j], predicted)
                     )
                 # At least 1: an opening costs nothing where its own wall fits, as networks learn to see that wall.
-                either = np.maximum(1.0 / (1.0 / factor.take(place) + views.odds / behind), 1.0)
+                either = np.maximum(1.0 / (1.0 / factor.take(place) + gathered.odds / behind), 1.0)
                 factor.put(place, either)
             cost[j] = mean_log(factor)
         return cost
 
-    def _openings(self, views: _Views, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
+    def _openings(self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
         """Return the openings' term."""
         loss = self._opening_losses
-        if loss is None or views.opening is None:
-            return np.zeros(len(views.room_index), np.float32)
-        return loss.take(hypothesis[:, None] * loss[0].size + views.opening).mean(axis=1)
+        if loss is None or gathered.opening is None:
+            return np.zeros(len(gathered.room_index), np.float32)
+        return loss.take(hypothesis[:, None] * loss[0].size + gathered.opening).mean(axis=1)
 
     @cached_property
     def _opening_losses(self) -> Float[np.ndarray, "k w c"] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +24,7 @@ class PoseGrid:
         latents: (n, d) latents of the layouts; None for models that compare wall profiles.
         profile_m: (n, w) wall profiles (m), which serve queries of any camera height.
         camera_height_m: camera height (m) of the latents.
+        rendered: layouts of the poses; None renders them at first use.
     """
 
     poses: PoseSet
@@ -31,23 +32,12 @@ class PoseGrid:
     profile_m: Float[np.ndarray, "n w"]
     step_m: float
     camera_height_m: float
+    rendered: InitVar[Layouts | None] = None
     _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
     _binned: dict[int, BinnedLayouts] = field(default_factory=dict, init=False, repr=False)
 
-    @classmethod
-    def with_layouts(
-        cls,
-        poses: PoseSet,
-        latents: Float[np.ndarray, "n d"] | None,
-        profile_m: Float[np.ndarray, "n w"],
-        step_m: float,
-        camera_height_m: float,
-        layouts: Layouts,
-    ) -> PoseGrid:
-        """Return a grid with layouts that are rendered already."""
-        grid = cls(poses, latents, profile_m, step_m, camera_height_m)
-        grid._layouts.append(layouts)
-        return grid
+    def __post_init__(self, rendered: Layouts | None) -> None:
+        self._layouts.extend([] if rendered is None else [rendered])
 
     @classmethod
     def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> PoseGrid:
@@ -55,7 +45,7 @@ class PoseGrid:
         profile_m = np.exp(layouts.log_profile).astype(np.float16)
         # Logs of the rounded profile, so that a grid read from storage gives the same answers.
         kept = replace(layouts, log_profile=np.log(profile_m.astype(np.float32)).astype(np.float16))
-        return cls.with_layouts(poses, None, profile_m, step_m, camera_height_m, kept)
+        return cls(poses, None, profile_m, step_m, camera_height_m, kept)
 
     @property
     def is_rendered(self) -> bool:

@@ -1,11 +1,9 @@
 """Query: an encoded photograph, and what is stated about its camera.
 
-Begin with `query.py`. `predictions.py` has what the networks predict of a photograph; `camera_height.py` and
-`stated_pose.py` have the height and heading that the caller, the metadata or the plan state; `hints.py` has priors of
-the place.
+Begin with `query.py`. `predictions.py` has what the networks predict of a photograph; `stated_pose.py` has the height
+and heading that the caller, the metadata or the plan state; `hints.py` has priors of the place.
 """
 
-from lalaloc_core.localise.query.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M, CameraHeight
 from lalaloc_core.localise.query.hints import (
     NO_HINTS,
     RADIUS_RANGE_M,
@@ -25,7 +23,14 @@ from lalaloc_core.localise.query.predictions import (
     rolled,
 )
 from lalaloc_core.localise.query.query import Candidate, Query
-from lalaloc_core.localise.query.stated_pose import KnownHeading, known_heading, stated_height
+from lalaloc_core.localise.query.stated_pose import (
+    DEFAULT_STD_M,
+    UNKNOWN_RANGE_M,
+    CameraHeight,
+    KnownHeading,
+    known_heading,
+    stated_height,
+)
 
 __all__ = [
     "DEFAULT_STD_M",

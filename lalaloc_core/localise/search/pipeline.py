@@ -207,7 +207,7 @@ def localise(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Localisation:
-    """Localise an encoded panorama in a plan.
+    """Localise an encoded photograph in a plan.
 
     The grid is the plan's, made for the query's camera height. `refine` is the last stage: "lpo" without a `refiner`,
     or with one that returns None, ends at "vdr". `clock` times the stages. With strict hints, a known heading is not

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,12 +12,11 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
-from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PairLimits, PoseGrid, grid_candidate, likeliest
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, grid_candidate, likeliest
 from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query
-from lalaloc_core.render.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sampling import PoseSet
 
 # Limits of the number of pairs of a pose and a hypothesis that are compared in full.
 _MIN_COMPARED, _MAX_COMPARED = 1024, 4096
@@ -31,17 +30,6 @@ _MARGIN = 0.35
 _CALIBRATING = 256
 # Best pairs that are searched for distinct candidates at first.
 _FIRST_RANKED = 1024
-
-
-def build_grid(
-    plan: FloorPlan, encoder: LayoutEncoder, *, step_m: float, camera_height_m: float, latents: bool = True
-) -> PoseGrid:
-    """Return the plan's pose grid with every layout rendered and, with `latents`, encoded, which is slow."""
-    poses = pose_grid(plan, step_m)
-    if not latents:
-        return PoseGrid.without_latents(poses, encoder.rendered(plan, poses), step_m, camera_height_m)
-    embedded, profile_m = encoder.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
-    return PoseGrid(poses, embedded, profile_m, step_m, camera_height_m)
 
 
 def grid_costs(
@@ -66,13 +54,15 @@ def grid_costs(
         return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), hint_cost)
     matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
     relaxed = _hint_cost(plan, grid, weights, hints.relaxed) if hints.strict else None
-    chosen = _choose(plan, grid, matching_cost, weights.temperature, hint_cost, relaxed)
-    pose, hypothesis = np.divmod(chosen.pair, len(query.roll))
-    cost, offset = matching_cost.pairs(grid.layouts(plan), pose[: chosen.compared], hypothesis[: chosen.compared])
+    temperature = weights.temperature
+    pair, compared, coarse, estimate = _choose(plan, grid, matching_cost, temperature, hint_cost, relaxed)
+    pose, hypothesis = np.divmod(pair, len(query.roll))
+    cost, offset = matching_cost.pairs(grid.layouts(plan), pose[:compared], hypothesis[:compared])
     if config.latent_weight:
         latents, targets = grid.known_latents[pose[: len(cost)]], query.latents[hypothesis[: len(cost)]]
         cost += config.latent_weight * np.linalg.norm(latents - targets, axis=1)
-    estimate = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
+    error = _coarse_error(cost[: len(coarse)], coarse, temperature) if len(estimate) else 0.0
+    estimate = np.maximum(estimate + error, cost.min())
     return GridCosts(
         poses=grid.poses,
         pose=pose,
@@ -80,35 +70,8 @@ def grid_costs(
         cost=np.append(cost, estimate),
         offset=np.append(offset, np.zeros(len(estimate))),
         hint_cost=None if hint_cost is None else hint_cost[pose],
-        compared=chosen.compared,
+        compared=compared,
     )
-
-
-class _Chosen(NamedTuple):
-    """Pairs that the coarse pass leaves.
-
-    Attributes:
-        pair: pose times the number of hypotheses, plus hypothesis: the pairs to compare in full, then the others.
-        compared: number of pairs to compare in full.
-        coarse: coarse costs of the first of these.
-        estimate: coarse costs of the others.
-    """
-
-    pair: Int[np.ndarray, "m"]
-    compared: int
-    coarse: Float[np.ndarray, "c"]
-    estimate: Float[np.ndarray, "e"]
-
-    def error(self, cost: Float[np.ndarray, "c"], temperature: float) -> float:
-        """Return the correction of the estimates that makes their total probability right.
-
-        The last pairs compared in full are the most similar to the estimated ones.
-        """
-        if not len(self.estimate):
-            return 0.0
-        last = slice(max(len(self.coarse) - _CALIBRATING, 0), len(self.coarse))
-        weight = -temperature * (cost[: len(self.coarse)][last] - self.coarse[last]).astype(np.float64)
-        return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
 
 
 def _choose(
@@ -118,29 +81,41 @@ def _choose(
     temperature: float,
     hint_cost: Float[np.ndarray, "n"] | None,
     relaxed: Float[np.ndarray, "n"] | None,
-) -> _Chosen:
+) -> tuple[Int[np.ndarray, "m"], int, Float[np.ndarray, "c"], Float[np.ndarray, "e"]]:
     """Choose the pairs to compare in full and to estimate.
 
     `hint_cost` is the cost of the hints at every pose, and `relaxed` the same if strict hints were not; the best pairs
     by that are compared as well.
+
+    Returns:
+        The pairs to compare in full, then the others: pose times the number of hypotheses, plus hypothesis; the number
+        of pairs to compare in full; coarse costs of the first of these, and of the others.
     """
     pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:
-        return _Chosen(np.arange(pairs), pairs, nothing, nothing)
+        return np.arange(pairs), pairs, nothing, nothing
     window = _MARGIN + NEGLIGIBLE / temperature
-    azimuths = VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS
-    binned, room_index = grid.binned(plan, azimuths), grid.poses.room_index
-    limits = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
-    total, pair = likeliest(binned, matching_cost, room_index, limits, hint_cost)
+    binned = grid.binned(plan, VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS)
+    compare = partial(likeliest, binned, matching_cost, grid.poses.room_index, at_least=_MIN_COMPARED)
+    total, pair = compare(hint_cost, at_most=_ESTIMATED, window=window)
     probable = int(np.searchsorted(total, total[0] + window))
     compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
     cost = total if hint_cost is None else total - hint_cost[pair // matching_cost.hypotheses]
     first, others = pair[:compared], pair[compared:probable]
     if relaxed is not None:
-        limits = PairLimits(at_most=_MIN_COMPARED, at_least=_MIN_COMPARED)
-        excluded = likeliest(binned, matching_cost, room_index, limits, relaxed)[1]
+        excluded = compare(relaxed, at_most=_MIN_COMPARED)[1]
         first = np.append(first, np.setdiff1d(excluded, pair[:probable]))
-    return _Chosen(np.append(first, others), len(first), cost[:compared], cost[compared:probable])
+    return np.append(first, others), len(first), cost[:compared], cost[compared:probable]
+
+
+def _coarse_error(cost: Float[np.ndarray, "c"], coarse: Float[np.ndarray, "c"], temperature: float) -> float:
+    """Return the correction of estimates that makes their total probability right, by pairs that were compared.
+
+    The last pairs compared in full are the most similar to the estimated ones.
+    """
+    last = slice(max(len(coarse) - _CALIBRATING, 0), len(coarse))
+    weight = -temperature * (cost[last] - coarse[last]).astype(np.float64)
+    return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
 
 
 def missed_hints(plan: FloorPlan, costs: GridCosts, weights: MatchingWeights, hints: Hints) -> tuple[HintName, ...]:
@@ -202,19 +177,18 @@ def retrieve(
             break
         # On a fine grid the best pairs can all be of a few places.
         ranks *= 4
-    return [_candidate(costs, query, grid, int(pair[index])) for index in kept]
-
-
-def _candidate(costs: GridCosts, query: Query, grid: PoseGrid, pair: int) -> Candidate:
-    return grid_candidate(
-        grid,
-        int(costs.pose[pair]),
-        query,
-        int(costs.hypothesis[pair]),
-        cost=float(costs.cost[pair]),
-        height_offset=float(costs.offset[pair]),
-        hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[pair]),
-    )
+    return [
+        grid_candidate(
+            grid,
+            int(costs.pose[index]),
+            query,
+            int(costs.hypothesis[index]),
+            cost=float(costs.cost[index]),
+            height_offset=float(costs.offset[index]),
+            hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[index]),
+        )
+        for index in pair[kept].tolist()
+    ]
 
 
 def contradicted(

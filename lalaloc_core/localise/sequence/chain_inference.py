@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -76,38 +77,41 @@ def _scaled(values: Float[np.ndarray, "j n k"]) -> tuple[Float[np.ndarray, "j n 
 
 def _onwards(transition: Transition, message: Float[np.ndarray, "j n k"]) -> Float[np.ndarray, "j m l"]:
     """Sum over the states of the first picture of a transition."""
-    heights, (_, k, m, after) = len(message), transition.sizes
-    total = message.sum(axis=(1, 2), keepdims=True)
-    if transition.places is None:
-        placed = np.broadcast_to(message.sum(axis=1, keepdims=True), (heights, m, k))
-    elif transition.is_directed:
-        placed = (transition.places @ message.reshape(heights, -1).T).T.reshape(heights, m, k)
-    else:
-        columns = message.transpose(1, 0, 2).reshape(message.shape[1], -1)
-        placed = (transition.places @ columns).reshape(m, heights, k).transpose(1, 0, 2)
-    if transition.turns is None:
-        turned = np.broadcast_to(placed.sum(axis=2, keepdims=True), (heights, m, after))
-    else:
-        turned = placed @ transition.turns
-    return turned + transition.floor * total
+    _, _, m, after = transition.sizes
+    places, turns = transition.places, transition.turns
+    turned = _sum_over_turns(_sum_over_places(message, places, m, transition.is_directed), turns, after)
+    return turned + transition.floor * message.sum(axis=(1, 2), keepdims=True)
 
 
 def _back(transition: Transition, message: Float[np.ndarray, "j m l"]) -> Float[np.ndarray, "j n k"]:
     """Sum over the states of the second picture of a transition."""
-    heights, (n, k, m, _) = len(message), transition.sizes
-    total = message.sum(axis=(1, 2), keepdims=True)
-    if transition.turns is None:
-        turned = np.broadcast_to(message.sum(axis=2, keepdims=True), (heights, m, k))
-    else:
-        turned = message @ transition.turns.T
-    if transition.places is None:
-        placed = np.broadcast_to(turned.sum(axis=1, keepdims=True), (heights, n, k))
-    elif transition.is_directed:
-        placed = (transition.places.T @ turned.reshape(heights, -1).T).T.reshape(heights, n, k)
-    else:
-        columns = turned.transpose(1, 0, 2).reshape(m, -1)
-        placed = (transition.places.T @ columns).reshape(n, heights, k).transpose(1, 0, 2)
-    return placed + transition.floor * total
+    n, k, _, _ = transition.sizes
+    turned = _sum_over_turns(message, None if transition.turns is None else transition.turns.T, k)
+    places = None if transition.places is None else transition.places.T
+    placed = _sum_over_places(turned, places, n, transition.is_directed)
+    return placed + transition.floor * message.sum(axis=(1, 2), keepdims=True)
+
+
+def _sum_over_places(
+    message: Float[np.ndarray, "j n k"], places: Any, count: int, is_directed: bool
+) -> Float[np.ndarray, "j m k"]:
+    """Sum over places, for `count` other ones; `places` are the likelihoods of pairs."""
+    heights, _, k = message.shape
+    if places is None:
+        return np.broadcast_to(message.sum(axis=1, keepdims=True), (heights, count, k))
+    if is_directed:
+        return (places @ message.reshape(heights, -1).T).T.reshape(heights, count, k)
+    columns = message.transpose(1, 0, 2).reshape(message.shape[1], -1)
+    return (places @ columns).reshape(count, heights, k).transpose(1, 0, 2)
+
+
+def _sum_over_turns(
+    message: Float[np.ndarray, "j n k"], turns: Float[np.ndarray, "k l"] | None, count: int
+) -> Float[np.ndarray, "j n l"]:
+    """Sum over headings, for `count` other ones; `turns` are the likelihoods of pairs."""
+    if turns is None:
+        return np.broadcast_to(message.sum(axis=2, keepdims=True), (*message.shape[:2], count))
+    return message @ turns
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,15 +35,15 @@ class SequenceJob:
     """`m` paths to be refined, through `t` pictures.
 
     Attributes:
-        heading: (m, t) headings (radians) in the frames, as in `poses.Query`.
-        roll: (m, t) angles (radians) to add for the panoramas' headings.
+        heading: (m, t) headings (radians) in the frames, as in `query.Query`.
+        roll: (m, t) angles (radians) to add for the photographs' headings.
         turnable: (t,) pictures whose heading is searched.
-        walls_m, log_profile, precision: as in `poses.RefinementJob`.
+        walls_m, log_profile, precision: as in `refine.RefinementJob`.
         trusted: (m, t - 1) motions that each path follows.
         motion_scale: factor that scales the motions' residuals to those of azimuth columns.
         height_offset: (m,) start of δ.
         height_free: whether δ is solved for.
-        height_stiffness, height_bounds: as in `poses.RefinementJob`.
+        height_stiffness, height_bounds: as in `refine.RefinementJob`.
         height_apart: standard deviation of ε; 0 if all pictures have the same relative error.
     """
 
@@ -272,7 +272,7 @@ def _information(job: SequenceJob, curvature: Float[np.ndarray, "m u u"]) -> lis
 def motion_costs(
     motions: Sequence[Motion], position_m: Float[np.ndarray, "m t 2"], heading: Float[np.ndarray, "m t"]
 ) -> Float[np.ndarray, "m s"]:
-    """Return half the sum of the squared residuals of every motion and path, by the panoramas' headings."""
+    """Return half the sum of the squared residuals of every motion and path, by the photographs' headings."""
     costs = [
         0.5 * np.square(motion_residuals(motion, position_m[:, s : s + 2], heading[:, s : s + 2])[0]).sum(axis=1)
         for s, motion in enumerate(motions)

@@ -91,7 +91,7 @@ def _check(name: str, value: float | None, least: float, most: float) -> None:
 class States:
     """States of a picture: every pose under every hypothesis of the heading.
 
-    `heading` is that of the panorama (radians); each stands for an angle of `sector`, 0 if the heading is known.
+    `heading` is that of the photograph (radians); each stands for an angle of `sector`, 0 if the heading is known.
     """
 
     position_m: Float[np.ndarray, "n 2"]

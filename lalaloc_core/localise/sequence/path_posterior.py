@@ -104,7 +104,7 @@ class PictureChain:
         pairs = zip(path, other, strict=True)
         apart_m = [np.linalg.norm(first.position_m - second.position_m) for first, second in pairs]
         turned = np.abs(wrap_angle(self.headings(path) - self.headings(other)))
-        return max(apart_m) < within_m and turned.max() <= within_angle
+        return bool(max(apart_m) < within_m and turned.max() <= within_angle)
 
     def basin(self, path: Path, separation_m: float) -> tuple[list[np.ndarray], Marginals]:
         """Return the states around a path at about its headings: their numbers by picture, and their marginals."""

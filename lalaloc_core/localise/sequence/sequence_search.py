@@ -87,7 +87,7 @@ def localise_sequence(
     top_k: int = 5,
     config: LocaliseConfig | None = None,
 ) -> SequenceLocalisation:
-    """Localise several encoded panoramas of one visit in a plan.
+    """Localise several encoded photographs of one visit in a plan.
 
     The queries are in the order in which they were taken, their stated camera heights have the same relative error, and
     `motions` are between neighbours. `refiner` refines paths; None ends at the grid. `top_k` limits the candidates of

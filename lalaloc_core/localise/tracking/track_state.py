@@ -40,7 +40,7 @@ class TrackedPose:
         mode: mode of the session after the photograph.
         number: number of the photograph, from 1.
         sure: whether the photograph by itself tells this pose.
-        plan: number of the plan in `TrackState.plans`, or in the ground while it is tracked.
+        plan: number of the plan in `TrackState.plans`, or in `TrackedPlans` while it is tracked.
     """
 
     x_m: float

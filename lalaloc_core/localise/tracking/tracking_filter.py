@@ -67,8 +67,9 @@ class Tracked:
 
     Attributes:
         state: state for the next photograph.
-        pose: the answer, in the frame of its plan; `pose.plan` is its number in the ground.
-        query, candidates: the best poses in the ground, the answer first as LPO has it; `probability` of each.
+        pose: the answer, in the frame of its plan; `pose.plan` is its number among the tracked ones.
+        query, candidates: the best poses in the frame of all plans, the answer first as LPO has it, each with its
+            `probability`.
         fit: probability that this photograph, by itself, is of the plan; None without a model.
         contradicted: components of the motion that this photograph contradicts.
         stage: last stage that ran.
@@ -88,7 +89,7 @@ TrackSteps = Generator[RefinementJob, RefinementResult | None, Tracked]
 
 
 def track_steps(
-    ground: TrackedPlans,
+    plans: TrackedPlans,
     encoder: LayoutEncoder,
     state: TrackState,
     query: Query,
@@ -103,13 +104,13 @@ def track_steps(
     """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
 
     Args:
-        ground: the plans that the camera can be in.
+        plans: the plans that the camera can be in.
         encoder: the networks.
         state: state after the photographs before.
         query: the photograph, encoded with an unknown heading.
         odometry: motion since the photograph before; None if it is unknown.
         known_heading: heading of the photograph with its largest error; None if it is unknown.
-        hints: the prior of the first photograph, in the frame of the ground.
+        hints: the prior of the first photograph, in the frame of all plans.
         top_k: number of candidates.
         config: settings of the search.
         clock: times the stages.
@@ -120,12 +121,12 @@ def track_steps(
     """
     config, clock = config or LocaliseConfig(), clock or StageClock()
     weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
-    plan, grid = ground.plan, ground.grid
-    state = ground.entered(state).with_sectors(len(query.roll))
+    plan, grid = plans.plan, plans.grid
+    state = plans.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):
-        prediction = _predict(ground, state, odometry, known_heading, hints)
+        prediction = _predict(plans, state, odometry, known_heading, hints)
     with clock.stage("retrieve"):
-        everything, grid_cost = _compare(ground, encoder, query, prediction, config)
+        everything, grid_cost = _compare(plans, encoder, query, prediction, config)
         compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
     starts = compared.modes()
     refined = ends = starts
@@ -154,7 +155,7 @@ def track_steps(
     probability = in_plan * posterior.position
     mode = _mode(in_plan, probability)
     measured = measured_pose(plan, encoder, query, candidates[0])
-    own_plan = ground.plan_of_room(candidates[0].room_index)
+    own_plan = plans.plan_of_room(candidates[0].room_index)
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
     predicted = None if before is None or odometry is None else carried_on(before, odometry)
@@ -183,7 +184,7 @@ def track_steps(
     )
     shares = tuple(in_plan * share for share in posterior.candidate)
     after = _state_after(state, compared, in_plan, pose, missed, judged=judged and odometry is not None)
-    after = ground.left(after)
+    after = plans.left(after)
     assert after.pose is not None
     return Tracked(after, replace(after.pose, plan=own_plan), query, candidates, shares, fit, missed, stage)
 
@@ -194,7 +195,7 @@ class _Prediction:
 
     Attributes:
         belief: (n, k) probability of each pose and sector.
-        prior: (n, k) the same for a camera that can be anywhere in the ground; the sum is about one.
+        prior: (n, k) the same for a camera that can be anywhere in the plans; the sum is about one.
         anywhere: probability of a camera that was carried, or of which nothing is known.
     """
 
@@ -204,19 +205,19 @@ class _Prediction:
 
 
 def _predict(
-    ground: TrackedPlans, state: TrackState, odometry: Odometry | None, known: KnownHeading | None, hints: Hints
+    plans: TrackedPlans, state: TrackState, odometry: Odometry | None, known: KnownHeading | None, hints: Hints
 ) -> _Prediction:
-    sectors, share = state.sectors, area_shares(ground.grid.poses, ground.plan.areas_m2)
+    sectors, share = state.sectors, area_shares(plans.grid.poses, plans.plan.areas_m2)
     if state.number == 0:
-        hints.check(ground.plan)
-        share = share - hints.penalty(ground.plan, ground.grid.poses.position_m, ground.grid.poses.room_index)
+        hints.check(plans.plan)
+        share = share - hints.penalty(plans.plan, plans.grid.poses.position_m, plans.grid.poses.room_index)
     prior = np.exp(share - share.max())
     prior = np.broadcast_to((prior / (prior.sum() * sectors))[:, None], (len(prior), sectors))
     anywhere = max(1.0 - float(state.belief.weight.sum()), _CARRIED)
-    covered = 1.0 if ground.left_out is None else ground.left_out.area_share
+    covered = 1.0 if plans.left_out is None else plans.left_out.area_share
     belief = anywhere * covered * prior
     if len(state.belief.pose):
-        belief = belief + (1.0 - anywhere) * ground.moved(state.belief, sectors, odometry)
+        belief = belief + (1.0 - anywhere) * plans.moved(state.belief, sectors, odometry)
     if known is None or known.heading is None:
         return _Prediction(belief, prior, anywhere)
     off = np.abs(wrap_angle(np.arange(sectors) * (TWO_PI / sectors) - known.heading))
@@ -227,11 +228,11 @@ def _predict(
 
 
 def _compare(
-    ground: TrackedPlans, encoder: LayoutEncoder, query: Query, prediction: _Prediction, config: LocaliseConfig
+    plans: TrackedPlans, encoder: LayoutEncoder, query: Query, prediction: _Prediction, config: LocaliseConfig
 ) -> tuple[ComparedStates, float]:
     """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
     weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
-    plan, grid, sectors = ground.plan, ground.grid, len(query.roll)
+    plan, grid, sectors = plans.plan, plans.grid, len(query.roll)
     costs = grid_costs(plan, grid, query, weights, matching)
     number = costs.pose * sectors + sector_of(query, costs.hypothesis)
     cost, offset = costs.cost.astype(np.float64), costs.offset
@@ -247,7 +248,7 @@ def _compare(
         cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
     pose, sector = np.divmod(number, sectors)
     value = np.exp(-weights.temperature * (cost - cost.min()))
-    outlier, elsewhere = _elsewhere(ground, prediction, pose, prediction.prior.ravel()[number] * value)
+    outlier, elsewhere = _elsewhere(plans, prediction, pose, prediction.prior.ravel()[number] * value)
     weight = flat[number] * (value + outlier)
     rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
     total = float(weight.sum()) + rest
@@ -268,14 +269,14 @@ def _compare(
 
 
 def _elsewhere(
-    ground: TrackedPlans, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
+    plans: TrackedPlans, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
 ) -> tuple[float, float]:
-    """Return the likelihood of an outlier, and the weight of the plans that the ground leaves out.
+    """Return the likelihood of an outlier, and the weight of the plans that are left out.
 
     `evidence` is prior times likelihood of some states.
     """
-    by_pose = np.bincount(pose, evidence, minlength=len(ground.grid.poses))
-    share, covered = ground.share(by_pose), 1.0 if ground.left_out is None else ground.left_out.area_share
+    by_pose = np.bincount(pose, evidence, minlength=len(plans.grid.poses))
+    share, covered = plans.share(by_pose), 1.0 if plans.left_out is None else plans.left_out.area_share
     mean = covered * float(by_pose.sum()) / share
     outlier = _OUTLIER * mean
     return outlier, prediction.anywhere * ((1.0 - share) * mean + (1.0 - covered) * outlier)

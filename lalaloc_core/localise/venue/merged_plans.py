@@ -139,7 +139,7 @@ def _grid(
         np.concatenate([grid.poses.position_m + shift for grid, shift in zip(grids, shift_m, strict=True)]),
         np.concatenate([grid.poses.room_index + first for grid, first in zip(grids, rooms, strict=True)]),
     )
-    return PoseGrid.with_layouts(
+    return PoseGrid(
         poses,
         None if any(grid.latents is None for grid in grids) else np.concatenate([grid.known_latents for grid in grids]),
         np.concatenate([grid.profile_m for grid in grids]),

@@ -1,4 +1,4 @@
-"""Index of the prototypes of many plans; gives every plan a probability for a panorama.
+"""Index of the prototypes of many plans; gives every plan a probability for a photograph.
 
 It works like an inverted file with product codes and re-ranking (IVF-PQ in faiss). A query compares *pairs* of a
 prototype and a hypothesis of the heading and the camera height. Four stages, each on fewer pairs than the one before:

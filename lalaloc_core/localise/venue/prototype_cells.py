@@ -79,8 +79,7 @@ class Cells:
         """
         (k, j), v = query_costs.shape, len(self.log_profile)
         position = _LOWEST + _BIN * np.arange(_BINS)
-        centre = query_costs.centre[:, None] + query_costs.offsets[None, :, None].astype(np.float32)
-        residual = (position - centre[..., None]) * query_costs.precision[:, None, :, None]
+        residual = (position - query_costs.shifted[..., None]) * query_costs.precision[:, None, :, None]
         by_bin = (np.log1p(np.square(residual)) / AZIMUTHS).astype(np.float32).reshape(k * j, -1)
         walls = (self._bins @ by_bin.T).reshape(v, k, j) + query_costs.penalty.astype(np.float32)
         if query_costs.opening_loss is None:

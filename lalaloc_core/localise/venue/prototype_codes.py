@@ -130,8 +130,7 @@ def lookup_tables(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j 
     (k, j), azimuth = costs.shape, np.arange(AZIMUTHS)
     tables = np.zeros((k, j, _PARTS, _VALUES), np.float32)
     distance = _samples(np.log((_MIN_DISTANCE_M, *_EDGES_M, _MAX_DISTANCE_M)))
-    centre = costs.centre[:, None] + costs.offsets[None, :, None].astype(np.float32)
-    residual = (distance - centre[..., None, None]) * costs.precision[:, None, :, None, None]
+    residual = (distance - costs.shifted[..., None, None]) * costs.precision[:, None, :, None, None]
     tables[:, :, azimuth] = np.log1p(np.square(residual)).mean(axis=-1) / AZIMUTHS
     if costs.opening_loss is not None:
         # A value combines the classes of two azimuths, the first in the lower bits.
