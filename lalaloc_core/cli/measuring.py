@@ -93,11 +93,11 @@ def add_commands(commands: Any) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     if arguments.profile:
         from lalaloc_core.bundle import Bundle
-        from lalaloc_core.evaluate.bench.profile import profile_table
+        from lalaloc_core.evaluate.bench.query_profile import profile_table
 
         print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
         return
-    from lalaloc_core.evaluate.bench.report import run_bench
+    from lalaloc_core.evaluate.bench.benchmarks import run_bench
 
     groups = arguments.only or _GROUPS
     report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
@@ -109,7 +109,7 @@ def _bench(arguments: argparse.Namespace) -> None:
 
 
 def _photographs(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluate.report.photographs import SHEET_FILE, evaluate_photographs
+    from lalaloc_core.evaluate.report.photograph_report import SHEET_FILE, evaluate_photographs
 
     results = evaluate_photographs(
         arguments.data,
@@ -125,7 +125,7 @@ def _photographs(arguments: argparse.Namespace) -> None:
 
 
 def _reproduce(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluate.reproduce.tables import TABLES
+    from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 
     if arguments.only_list:
         for table in TABLES:
@@ -142,7 +142,7 @@ def _reproduce(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--data is missing; give the folder of Structured3D or the output of `lalaloc synth`")
 
     from lalaloc_core.evaluate.reproduce.result import markdown
-    from lalaloc_core.evaluate.reproduce.run import TableMaker
+    from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
 
     table_maker = TableMaker(
         data=arguments.data,

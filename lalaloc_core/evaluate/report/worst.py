@@ -35,7 +35,7 @@ from lalaloc_core.evaluate.report.pictures import (
     layout_lines,
 )
 from lalaloc_core.evaluate.report.reopening import ReopenedRun
-from lalaloc_core.evaluate.report.tables import distance, percent
+from lalaloc_core.evaluate.report.report_tables import distance, percent
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluate.runs.predictions import (
     Prediction,

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.heldout.furnish import lamp_place
-from lalaloc_core.learn.heldout.openings import Opening
+from lalaloc_core.learn.heldout.furnishing import lamp_place
+from lalaloc_core.learn.heldout.procedural_materials import Materials
 from lalaloc_core.learn.heldout.sky import Sky
-from lalaloc_core.learn.heldout.surfaces import Materials
 from lalaloc_core.learn.heldout.tracing import OFFSET_M, Tracer
+from lalaloc_core.learn.heldout.wall_holes import Opening
 
 _LAMP_DROP_M = 0.75
 _LAMP_RADIUS_M = 0.22

@@ -12,10 +12,10 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.learn.heldout import fixtures, seats
 from lalaloc_core.learn.heldout.geometry import Part
-from lalaloc_core.learn.heldout.openings import Opening, Wall, span_behind, walls_of
+from lalaloc_core.learn.heldout.grown_plans import HeldoutPlan
 from lalaloc_core.learn.heldout.outlines import RoomKind
-from lalaloc_core.learn.heldout.plans import HeldoutPlan
 from lalaloc_core.learn.heldout.seats import Piece
+from lalaloc_core.learn.heldout.wall_holes import Opening, Wall, span_behind, walls_of
 
 Level = Literal["empty", "simple", "full"]
 LEVELS: tuple[Level, ...] = get_args(Level)

@@ -16,8 +16,8 @@ from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, 
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.training.checkpoint import Validate
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, SceneSource, Source
+from lalaloc_core.learn.training.unlabelled_photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.validate import ImageValidation
 
 _LOG = logging.getLogger(__name__)
