@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
@@ -86,7 +87,10 @@ def add_commands(commands: Any) -> None:
         help="folder of models, runs and tables (default: %(default)s)",
     )
     reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row (default: by --budget)")
-    add_options(reproduce, "--bundle", "--skip-bad", "--workers")
+    add_options(reproduce, "--skip-bad", "--workers")
+    reproduce.add_argument(
+        "--bundle", type=Path, default=default_bundle(), help="model bundle of the shipped model's rows"
+    )
     reproduce.set_defaults(run=_reproduce)
 
 

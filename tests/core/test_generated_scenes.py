@@ -12,11 +12,17 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic import disturbed
+from lalaloc_core.learn.data.synthetic.altered_photographs import (
+    Cropped,
+    DisturbedPhotograph,
+    DisturbedScenes,
+    MismatchedScenes,
+    OutdoorPhotograph,
+    UpsideDown,
+)
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
-from lalaloc_core.learn.data.synthetic.disturbed import DisturbedPhotograph, DisturbedScenes
 from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.synthetic.mismatched import Cropped, MismatchedScenes, OutdoorPhotograph, UpsideDown
 from lalaloc_core.render.layout import render_layout
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)

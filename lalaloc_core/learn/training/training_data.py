@@ -36,7 +36,7 @@ class TrainingData:
         heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
             on it.
         photographs: folder of unlabelled panoramas for the image stage.
-        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.segmenter`.
+        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.unlabelled_photographs`.
     """
 
     dataset: Dataset | None = None

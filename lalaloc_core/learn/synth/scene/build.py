@@ -16,8 +16,7 @@ from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
 from lalaloc_core.learn.synth.scene.shells import Shells
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
-from lalaloc_core.learn.synth.scene.style import sample_style
-from lalaloc_core.learn.synth.scene.surfaces import SurfaceTable
+from lalaloc_core.learn.synth.scene.surfaces import SurfaceTable, sample_style
 from lalaloc_core.learn.synth.scene.windows import add_curtains, add_radiator, add_window
 
 
