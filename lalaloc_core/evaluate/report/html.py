@@ -100,7 +100,7 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
     environment.filters["distance"] = report_tables.distance
     source, _, _ = PackageLoader("lalaloc_core.evaluate.report", "template").get_source(environment, "style.css")
     return environment.get_template("page.html").render(
-        title=_title(runs),
+        title="Localisation: " + (runs[0].info.label if len(runs) == 1 else f"{len(runs)} runs"),
         style=source,
         parts=[Part(run=run, facts=_facts(run), gallery=galleries.get(run.number)) for run in runs],
         charts=charts,
@@ -115,10 +115,6 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
             f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in report_tables.CURVE_POINTS_M
         ],
     )
-
-
-def _title(runs: Sequence[Run]) -> str:
-    return f"Localisation: {runs[0].info.label}" if len(runs) == 1 else f"Localisation: {len(runs)} runs"
 
 
 def _facts(run: Run) -> dict[str, str]:
