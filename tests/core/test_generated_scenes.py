@@ -11,7 +11,7 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.learn.data.synthetic import disturbed
+from lalaloc_core.learn.data.synthetic import altered_photographs
 from lalaloc_core.learn.data.synthetic.altered_photographs import (
     Cropped,
     DisturbedPhotograph,
@@ -171,7 +171,7 @@ def test_disturbance_depends_on_the_photograph_only() -> None:
 
 def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
     """The direction at 45 degrees gives the ratio of the factors of width and depth."""
-    monkeypatch.setattr(disturbed, "_STRENGTH", 0.0)
+    monkeypatch.setattr(altered_photographs, "_STRENGTH", 0.0)
     width, ratios = 256, []
     plain = _Shaded().image(1, width)[0, :, 0].astype(float)
     right = slice(width // 2, width)
