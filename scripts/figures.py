@@ -9,8 +9,8 @@ from typing import Any
 
 from benchmarks.neighbours import markdown as markdown_of_neighbours
 from lalaloc_core.conditions import CONDITIONS, parts_of
+from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 from lalaloc_core.evaluate.reproduce.result import TableResult, markdown
-from lalaloc_core.evaluate.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"

@@ -37,10 +37,10 @@ def tiny_bundle(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Pat
 
 
 def _tiny_bundle(folder: Path) -> Path:
-    from lalaloc_core.learn.export.run import export_run
-    from lalaloc_core.learn.training.data import TrainingData
+    from lalaloc_core.learn.export.run_export import export_run
     from lalaloc_core.learn.training.presets import PRESETS
     from lalaloc_core.learn.training.run import train_stage
+    from lalaloc_core.learn.training.training_data import TrainingData
 
     torch.set_num_threads(1)
     device = torch.device("cpu")

@@ -143,9 +143,9 @@ def _generator_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluate.runs.evaluation import run_evaluation
     from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, describe_model
     from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
-    from lalaloc_core.evaluate.runs.run import run_evaluation
     from lalaloc_core.evaluate.runs.score import score_run
 
     method, panorama = arguments.method, arguments.kind == "panorama"

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
@@ -86,18 +87,21 @@ def add_commands(commands: Any) -> None:
         help="folder of models, runs and tables (default: %(default)s)",
     )
     reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row (default: by --budget)")
-    add_options(reproduce, "--bundle", "--skip-bad", "--workers")
+    add_options(reproduce, "--skip-bad", "--workers")
+    reproduce.add_argument(
+        "--bundle", type=Path, default=default_bundle(), help="model bundle of the shipped model's rows"
+    )
     reproduce.set_defaults(run=_reproduce)
 
 
 def _bench(arguments: argparse.Namespace) -> None:
     if arguments.profile:
         from lalaloc_core.bundle import Bundle
-        from lalaloc_core.evaluate.bench.profile import profile_table
+        from lalaloc_core.evaluate.bench.query_profile import profile_table
 
         print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
         return
-    from lalaloc_core.evaluate.bench.report import run_bench
+    from lalaloc_core.evaluate.bench.benchmarks import run_bench
 
     groups = arguments.only or _GROUPS
     report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
@@ -109,7 +113,7 @@ def _bench(arguments: argparse.Namespace) -> None:
 
 
 def _photographs(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluate.report.photographs import SHEET_FILE, evaluate_photographs
+    from lalaloc_core.evaluate.report.photograph_report import SHEET_FILE, evaluate_photographs
 
     results = evaluate_photographs(
         arguments.data,
@@ -125,7 +129,7 @@ def _photographs(arguments: argparse.Namespace) -> None:
 
 
 def _reproduce(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluate.reproduce.tables import TABLES
+    from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 
     if arguments.only_list:
         for table in TABLES:
@@ -142,7 +146,7 @@ def _reproduce(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--data is missing; give the folder of Structured3D or the output of `lalaloc synth`")
 
     from lalaloc_core.evaluate.reproduce.result import markdown
-    from lalaloc_core.evaluate.reproduce.run import TableMaker
+    from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
 
     table_maker = TableMaker(
         data=arguments.data,

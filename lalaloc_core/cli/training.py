@@ -120,9 +120,9 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from lalaloc_core.learn.data.dataset_detection import open_dataset
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
-    from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
     from lalaloc_core.learn.training.run import train_stage
+    from lalaloc_core.learn.training.training_data import TrainingData
 
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -206,7 +206,7 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.learn.export.run import export_into, export_run
+    from lalaloc_core.learn.export.run_export import export_into, export_run
 
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
@@ -222,7 +222,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _export_again(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.learn.export.run import reexport_bundle
+    from lalaloc_core.learn.export.run_export import reexport_bundle
 
     before = Bundle.open(arguments.bundle)
     after = reexport_bundle(arguments.bundle)

@@ -157,8 +157,7 @@ def measure_azimuths(
     confusion = None
     if class_scores is not None:
         assert true_classes is not None
-        confusion = np.zeros((class_scores.shape[1],) * 2, dtype=int)
-        np.add.at(confusion, (true_classes, class_scores.argmax(axis=1)), 1)
+        confusion = count_classes(true_classes, class_scores.argmax(axis=1), class_scores.shape[1])
     return AzimuthMeasures(outline=outline, log_error=errors[outline], log_scale=log_scale, confusion=confusion)
 
 
@@ -177,6 +176,15 @@ def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[st
         within={f"{quantile:g}": float(share) for quantile, share in zip(QUANTILES, within, strict=True)},
         classes=score_classes(np.sum(confusions, axis=0), classes) if confusions else None,
     )
+
+
+def count_classes(
+    true: Int[np.ndarray, "*n"], predicted: Int[np.ndarray, "*n"], classes: int
+) -> Int[np.ndarray, "c c"]:
+    """Count azimuths by true (row) and predicted class; negative true classes are unknown and left out."""
+    confusion, known = np.zeros((classes, classes), dtype=int), true >= 0
+    np.add.at(confusion, (true[known], predicted[known]), 1)
+    return confusion
 
 
 def score_classes(confusion: Int[np.ndarray, "c c"], classes: Sequence[str]) -> ClassScores:

@@ -15,7 +15,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.evaluate.report.photographs import (
+from lalaloc_core.evaluate.report.photograph_report import (
     CLASS_COLOURS,
     FIGURES_FILE,
     SHEET_FILE,
@@ -23,7 +23,7 @@ from lalaloc_core.evaluate.report.photographs import (
     draw_photographs,
     evaluate_photographs,
 )
-from lalaloc_core.evaluate.report.tables import percent
+from lalaloc_core.evaluate.report.report_tables import percent
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, foreign_plans, score_galleries
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
 from lalaloc_core.evaluate.runs.predictions import Prediction

@@ -34,7 +34,7 @@ from lalaloc_core.bundle import (
 from lalaloc_core.errors import BundleError, ExportError
 from lalaloc_core.learn.export import bundle_export as export
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run import reexport_bundle
+from lalaloc_core.learn.export.run_export import reexport_bundle
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.presets import PRESETS

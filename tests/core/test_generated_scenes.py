@@ -11,12 +11,18 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.learn.data.synthetic import disturbed
+from lalaloc_core.learn.data.synthetic import altered_photographs
+from lalaloc_core.learn.data.synthetic.altered_photographs import (
+    Cropped,
+    DisturbedPhotograph,
+    DisturbedScenes,
+    MismatchedScenes,
+    OutdoorPhotograph,
+    UpsideDown,
+)
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
-from lalaloc_core.learn.data.synthetic.disturbed import DisturbedPhotograph, DisturbedScenes
 from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.synthetic.mismatched import Cropped, MismatchedScenes, OutdoorPhotograph, UpsideDown
 from lalaloc_core.render.layout import render_layout
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)
@@ -165,7 +171,7 @@ def test_disturbance_depends_on_the_photograph_only() -> None:
 
 def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
     """The direction at 45 degrees gives the ratio of the factors of width and depth."""
-    monkeypatch.setattr(disturbed, "_STRENGTH", 0.0)
+    monkeypatch.setattr(altered_photographs, "_STRENGTH", 0.0)
     width, ratios = 256, []
     plain = _Shaded().image(1, width)[0, :, 0].astype(float)
     right = slice(width // 2, width)

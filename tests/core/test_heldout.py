@@ -18,10 +18,10 @@ from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.synthetic.heldout import HeldoutPhotograph, HeldoutScenes
-from lalaloc_core.learn.heldout.furnish import LEVELS, Furnishing
+from lalaloc_core.learn.heldout.furnishing import LEVELS, Furnishing
+from lalaloc_core.learn.heldout.grown_plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HomeKey, home_of, traced_home
 from lalaloc_core.learn.heldout.outlines import AREAS_M2, sample_outline
-from lalaloc_core.learn.heldout.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.tracing import Tracer
 from lalaloc_core.render.profile import layout_depth, wall_profile

@@ -13,10 +13,14 @@ from PIL import Image
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.synth.augmentation.photometric import _blurred, _lenses, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched
-from lalaloc_core.learn.training.data import TrainingData
-from lalaloc_core.learn.training.photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.segmenter import _class_map, read_walls_and_openings
+from lalaloc_core.learn.training.training_data import TrainingData
+from lalaloc_core.learn.training.unlabelled_photographs import (
+    Photographs,
+    _class_map,
+    load_photographs,
+    read_walls_and_openings,
+)
 from tests.painted import painted_surfaces, wall_distance_m
 
 ROWS, COLUMNS, WIDTH = 512, 1024, 128

@@ -26,7 +26,7 @@ from lalaloc_core.evaluate.report import write_report
 from lalaloc_core.evaluate.report.gallery import PER_GROUP, choose_queries
 from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_panorama, layout_lines
 from lalaloc_core.evaluate.report.reading import TOTAL, stage_times
-from lalaloc_core.evaluate.report.tables import distance, number
+from lalaloc_core.evaluate.report.report_tables import distance, number
 from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import position_errors_m, score

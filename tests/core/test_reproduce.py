@@ -15,16 +15,16 @@ from lalaloc_core.cli import main
 from lalaloc_core.errors import CheckpointError, ConfigError, RunError
 from lalaloc_core.evaluate.reproduce import ablations
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
+from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, markdown
 from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
-from lalaloc_core.evaluate.reproduce.tables import TABLES
 from lalaloc_core.evaluate.runs.factories import build_method
 from lalaloc_core.evaluate.runs.score import Scores, StageScores
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.run import train_stage
+from lalaloc_core.learn.training.training_data import TrainingData
 from tests.core.questions import question_at, run_info
 from tests.strategies import plan_document, rectangle
 

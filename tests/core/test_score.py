@@ -18,9 +18,9 @@ from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.report.pictures import PER_SHEET, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, choose_worst, predicted_profile_m, summarise, write_worst
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, SCORES_FILE, Prediction, RunFolder
-from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import (
     expected_calibration_error,
     heading_errors_deg,

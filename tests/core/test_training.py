@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
-from lalaloc_core.learn.export.run import export_run
+from lalaloc_core.learn.export.run_export import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, sources

@@ -23,10 +23,10 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import SceneSource
+from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.validate import ImageValidation, LayoutValidation
 from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.render.sweep import profiles_at

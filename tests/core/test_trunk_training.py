@@ -19,20 +19,20 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.export.run import export_into, export_run
+from lalaloc_core.learn.export.run_export import export_into, export_run
 from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
-from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
+from lalaloc_core.learn.training.training_data import TrainingData
+from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder

@@ -16,16 +16,16 @@ from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
-from lalaloc_core.learn.export.run import export_into
+from lalaloc_core.learn.export.run_export import export_into
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
+from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.view_stage import middle
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at

@@ -1,8 +1,8 @@
 """Benchmarks behind the figures of docs/results.md: `lalaloc bench`.
 
-Begin with `report.py`, which runs the groups of benchmarks.
+Begin with `benchmarks.py`, which runs the groups of benchmarks.
 """
 
-from lalaloc_core.evaluate.bench.report import run_bench
+from lalaloc_core.evaluate.bench.benchmarks import run_bench
 
 __all__ = ["run_bench"]

@@ -13,8 +13,8 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import StageScores, score
 from lalaloc_core.learn.data.views import Stated
 

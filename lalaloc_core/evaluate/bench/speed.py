@@ -20,8 +20,8 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.evaluate.methods.method import Method, Question
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache

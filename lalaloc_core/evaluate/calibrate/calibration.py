@@ -28,9 +28,9 @@ from lalaloc_core.evaluate.calibrate.parameter_fits import (
     fit_matching_weights,
     with_heading_doubt,
 )
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import build_dataset, describe_model
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.synthetic import training_plans

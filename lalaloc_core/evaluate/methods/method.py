@@ -73,7 +73,11 @@ class Pose:
 
     @classmethod
     def at(
-        cls, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, distance: float | None = None
+        cls,
+        position_m: Float[np.ndarray, "2"],
+        room_index: int | np.integer,
+        heading: float,
+        distance: float | None = None,
     ) -> Pose:
         """Return the pose at a position, with a heading in radians."""
         x_m, y_m = map(float, position_m)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from lalaloc_core.evaluate.report import tables
+from lalaloc_core.evaluate.report import report_tables
 from lalaloc_core.evaluate.report.charts import draw_charts
 from lalaloc_core.evaluate.report.figures import Chart
 from lalaloc_core.evaluate.report.gallery import Gallery, build_gallery
@@ -95,16 +95,16 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = tables.number
-    environment.filters["percent"] = tables.percent
-    environment.filters["distance"] = tables.distance
+    environment.filters["number"] = report_tables.number
+    environment.filters["percent"] = report_tables.percent
+    environment.filters["distance"] = report_tables.distance
     source, _, _ = PackageLoader("lalaloc_core.evaluate.report", "template").get_source(environment, "style.css")
     return environment.get_template("page.html").render(
-        title=_title(runs),
+        title="Localisation: " + (runs[0].info.label if len(runs) == 1 else f"{len(runs)} runs"),
         style=source,
         parts=[Part(run=run, facts=_facts(run), gallery=galleries.get(run.number)) for run in runs],
         charts=charts,
-        tables=tables,
+        tables=report_tables,
         runs=runs,
         several=len(runs) > 1,
         outcomes=[outcome.value for outcome in Outcome],
@@ -112,13 +112,9 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
         group_names=_GROUPS,
         calibrated=[run for run in runs if run.scores is not None and run.scores.calibration_error is not None],
         curve_points=[
-            f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in tables.CURVE_POINTS_M
+            f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in report_tables.CURVE_POINTS_M
         ],
     )
-
-
-def _title(runs: Sequence[Run]) -> str:
-    return f"Localisation: {runs[0].info.label}" if len(runs) == 1 else f"Localisation: {len(runs)} runs"
 
 
 def _facts(run: Run) -> dict[str, str]:

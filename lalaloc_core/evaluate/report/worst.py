@@ -35,7 +35,7 @@ from lalaloc_core.evaluate.report.pictures import (
     layout_lines,
 )
 from lalaloc_core.evaluate.report.reopening import ReopenedRun
-from lalaloc_core.evaluate.report.tables import distance, percent
+from lalaloc_core.evaluate.report.report_tables import distance, percent
 from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import position_errors_m
@@ -270,11 +270,7 @@ def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
     """Return the median over azimuths of the relative error of the predicted distance."""
     assert query.profile is not None
     log_m = query.profile.log_m[0]
-    return float(np.expm1(np.median(log_m - _log_profile(query, scene, truth, len(log_m))[0])))
-
-
-def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
-    """Return the log wall profile (m) of a pose, in the frame of the query's first hypothesis."""
-    heading = np.array([pose.heading - query.roll[0]])
-    position_m, room = pose.position_m[None], np.array([pose.room_index])
-    return np.log(profiles_at(scene.plan, position_m, room, heading, columns))
+    # In the frame of the query's first hypothesis.
+    position_m, room, heading = truth.position_m[None], np.array([truth.room_index]), truth.heading - query.roll[0]
+    (true_m,) = profiles_at(scene.plan, position_m, room, np.array([heading]), len(log_m))
+    return float(np.expm1(np.median(log_m - np.log(true_m))))

@@ -1,9 +1,9 @@
 """Reproduction of every table of the paper: `lalaloc reproduce`.
 
-Begin with `tables.py`, the rows of each table and the paper's figures. `run.py` trains, evaluates and scores a table,
-`ablations.py` has the trained variants, `result.py` writes tables as JSON and Markdown.
+Begin with `paper_tables.py`, the rows of each table and the paper's figures. `table_maker.py` trains, evaluates and
+scores a table, `ablations.py` has the trained variants, `result.py` writes tables as JSON and Markdown.
 """
 
-from lalaloc_core.evaluate.reproduce.tables import TABLES
+from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 
 __all__ = ["TABLES"]

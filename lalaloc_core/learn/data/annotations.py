@@ -24,7 +24,7 @@ from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import is_number, path_below, read_json
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom, plan_of_rooms
-from lalaloc_core.learn.data.photographs import FilePhotograph
+from lalaloc_core.learn.data.photograph_files import FilePhotograph
 from lalaloc_core.render.profile import nearest_walls, wall_profile
 
 CAMERA_HEIGHT_M = 1.5

@@ -26,7 +26,7 @@ from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.assembly import path_below, pose_fault
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split, collect_error
-from lalaloc_core.learn.data.photographs import FilePhotograph
+from lalaloc_core.learn.data.photograph_files import FilePhotograph
 
 PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"

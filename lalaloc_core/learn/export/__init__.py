@@ -1,10 +1,10 @@
 """Export of trained weights to a model bundle.
 
-Begin with `run.py`, which exports a training run; `bundle_export.py` writes ONNX and safetensors files and compares
-them with torch.
+Begin with `run_export.py`, which exports a training run; `bundle_export.py` writes ONNX and safetensors files and
+compares them with torch.
 """
 
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run import export_run
+from lalaloc_core.learn.export.run_export import export_run
 
 __all__ = ["PARITY_TOLERANCE", "export_bundle", "export_run"]

@@ -3,6 +3,6 @@
 The homes have other room shapes, furniture, materials and light, as triangle meshes traced by embree. Scores on
 them show how well a model generalises. Never train or tune on them, and share no code with `synth`.
 
-Begin with `photograph.py`, which renders; `homes.py` draws the home, `tracing.py` traces its rays. Needs the extra
+Begin with `renderer.py`, which renders; `homes.py` draws the home, `tracing.py` traces its rays. Needs the extra
 `oracle`, so nothing is re-exported.
 """

@@ -10,14 +10,14 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.learn.heldout.furnish import Furnishing, Level
+from lalaloc_core.learn.heldout.furnishing import Furnishing, Level
 from lalaloc_core.learn.heldout.geometry import Part
-from lalaloc_core.learn.heldout.openings import Opening, sample_openings, with_openings
+from lalaloc_core.learn.heldout.grown_plans import HeldoutPlan, sample_plan
 from lalaloc_core.learn.heldout.palette import room_surfaces, thing_surfaces
-from lalaloc_core.learn.heldout.plans import HeldoutPlan, sample_plan
+from lalaloc_core.learn.heldout.procedural_materials import Materials, Noise
 from lalaloc_core.learn.heldout.shell import shell_parts
-from lalaloc_core.learn.heldout.surfaces import Materials, Noise
 from lalaloc_core.learn.heldout.tracing import Tracer
+from lalaloc_core.learn.heldout.wall_holes import Opening, sample_openings, with_openings
 
 # Separates these seeds from those of other generators.
 _FAMILY = 0x0DD

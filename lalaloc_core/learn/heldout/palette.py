@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.learn.heldout.outlines import RoomKind
-from lalaloc_core.learn.heldout.surfaces import Surface
+from lalaloc_core.learn.heldout.procedural_materials import Surface
 
 _FLOORS = ("planks", "planks", "planks", "checker", "tiles", "hexagons", "marble", "cloth")
 _WALLS = ("plain", "plain", "plaster", "plaster", "stripes", "dots", "brick")

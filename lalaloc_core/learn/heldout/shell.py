@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.heldout.geometry import Part, slab, triangles_of, tube
-from lalaloc_core.learn.heldout.openings import Opening, Wall, span_behind, walls_of
+from lalaloc_core.learn.heldout.wall_holes import Opening, Wall, span_behind, walls_of
 
 _LEAF_M = 0.04
 _ARCH_SEGMENTS = 10

@@ -8,8 +8,8 @@ by the workers or on the training device (`deferred.py`). `config.py` has the se
 
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
+from lalaloc_core.learn.training.training_data import TrainingData
 
 __all__ = ["PRESETS", "Checkpoint", "TrainConfig", "TrainingData", "train_stage"]

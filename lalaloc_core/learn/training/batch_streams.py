@@ -70,7 +70,6 @@ class ReplayBuffer(Generic[T]):
 # Code of an unknown class; losses ignore it.
 UNKNOWN = -1
 
-_Item = TypeVar("_Item")
 _Packed = TypeVar("_Packed")
 
 
@@ -244,14 +243,14 @@ def opening_kinds(
 
 
 def _batches(
-    visit: Callable[[int], list[_Item] | None],
-    pack: Callable[[list[_Item]], _Packed],
+    visit: Callable[[int], list[T] | None],
+    pack: Callable[[list[T]], _Packed],
     source: Source,
     size: int,
     first: int,
 ) -> Iterator[_Packed | LoadFailure]:
     """Yield batches of `size` rows from the visits from number `first` on, and load failures in between."""
-    rows: list[_Item] = []
+    rows: list[T] = []
     try:
         for drawn in draw_visits(visit, first, source.patience):
             rows += drawn

@@ -7,7 +7,8 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,20 +58,20 @@ def run_stage(
     best = BestCheckpoint(best_path(path), stage, validate, resume=resume)
     batches = stage.batches(trainer.step, workers)
     last_saved = time.monotonic()
-    with _CsvLog(folder / f"{stage.name}.csv", append=resume) as log, _progress_bar(trainer) as bar:
+    with _csv_log(folder / f"{stage.name}.csv", append=resume) as log, _progress_bar(trainer) as bar:
         while trainer.progress < 1.0:
             begin = time.monotonic()
             terms = trainer.train_step(next(batches))
             trainer.seconds += time.monotonic() - begin
             bar.update(min(trainer.spent, trainer.budget) - bar.n)
             if trainer.step % _LOG_EVERY == 0:
-                log.write(trainer.step, trainer.seconds, terms)
+                log(trainer.step, trainer.seconds, terms)
                 bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()}, refresh=False)
             finished = trainer.progress >= 1.0
             if finished or time.monotonic() - last_saved > 60.0 * checkpoint_minutes:
                 if validate is not None:
                     trainer.metrics = validate(trainer.inference_modules)
-                    log.write(trainer.step, trainer.seconds, trainer.metrics)
+                    log(trainer.step, trainer.seconds, trainer.metrics)
                     _LOG.info("step %d: %s", trainer.step, trainer.metrics)
                 checkpoint = trainer.checkpoint()
                 checkpoint.save(path)
@@ -250,24 +251,18 @@ def _set_average_steps(average: AveragedModel, step: int) -> None:
     average.n_averaged.fill_(1 + step)
 
 
-class _CsvLog:
-    """Log in long format: one row per step and value."""
-
-    def __init__(self, path: Path, *, append: bool) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = not (append and path.exists())
-        self._file = path.open("w" if fresh else "a", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file)
+@contextmanager
+def _csv_log(path: Path, *, append: bool) -> Iterator[Callable[[int, float, dict[str, float]], None]]:
+    """Open a log in long format, and yield the function that appends a step's values, one row per value."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = not (append and path.exists())
+    with path.open("w" if fresh else "a", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
         if fresh:
-            self._writer.writerow(["step", "seconds", "name", "value"])
+            writer.writerow(["step", "seconds", "name", "value"])
 
-    def __enter__(self) -> _CsvLog:
-        return self
+        def write(step: int, seconds: float, values: dict[str, float]) -> None:
+            writer.writerows([step, f"{seconds:.1f}", name, f"{value:.6g}"] for name, value in values.items())
+            file.flush()
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def write(self, step: int, seconds: float, values: dict[str, float]) -> None:
-        """Append one row per value."""
-        self._writer.writerows([step, f"{seconds:.1f}", name, f"{value:.6g}"] for name, value in values.items())
-        self._file.flush()
+        yield write

@@ -172,10 +172,6 @@ def _picture_key(
     return scene.name, camera.name, look, height, width
 
 
-def _bytes_of(image: np.ndarray) -> int:
-    return image.nbytes
-
-
 @dataclass(eq=False)
 class SceneSource:
     """Source of a data set's training scenes in shuffled epochs; each visit draws some of a scene's cameras.
@@ -195,7 +191,7 @@ class SceneSource:
         if not self._names:
             raise DatasetError(f"{self.dataset.description}: the data set has no training scenes")
         self._scenes: LRUCache[str, Scene | None] = LRUCache(_SCENES_CACHED)
-        self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, _bytes_of)
+        self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, attrgetter("nbytes"))
         self._orders: LRUCache[int, np.ndarray] = LRUCache(1)
 
     @property

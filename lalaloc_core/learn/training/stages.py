@@ -16,8 +16,8 @@ from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
-from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
+from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_features import WallModes

@@ -21,9 +21,9 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.files import replacing
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
-from lalaloc_core.learn.metrics import Accuracy, score_classes
+from lalaloc_core.learn.metrics import Accuracy, count_classes, score_classes
 from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
+from lalaloc_core.learn.training.batch_streams import opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.rotation import Rotation, sample_rotation
 from lalaloc_core.nets.image_features import ImageFeatures
@@ -208,10 +208,7 @@ class ImageValidation:
         prior = losses.opening_prior(encoder.opening_share, self.balance)
         predicted = (torch.log_softmax(logits, dim=2) - prior.log()).argmax(dim=2).cpu().numpy()
         true = np.stack([query.opening_kinds(self.columns) for query in queries])
-        confusion = np.zeros((logits.shape[2],) * 2, dtype=int)
-        known = true != UNKNOWN
-        np.add.at(confusion, (true[known], predicted[known]), 1)
-        return confusion
+        return count_classes(true, predicted, logits.shape[2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
+from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 

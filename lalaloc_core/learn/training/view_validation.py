@@ -10,7 +10,7 @@ from torch import nn
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
-from lalaloc_core.learn.metrics import score_classes
+from lalaloc_core.learn.metrics import count_classes, score_classes
 from lalaloc_core.learn.synth.augmentation.framing import seen_by
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
@@ -105,8 +105,8 @@ class ViewValidation:
             errors += [float(row[shown].median()) for row, shown in zip(error, known, strict=True)]
             prior = losses.opening_prior(encoder.opening_share, config.image.opening_balance)
             logits = torch.log_softmax(features.structure.opening_logits, dim=2) - prior.log()
-            counted = known.numpy() & (self._kinds[part] != UNKNOWN)
-            np.add.at(confusion, (self._kinds[part][counted], logits.argmax(dim=2).cpu().numpy()[counted]), 1)
+            true = np.where(known.numpy(), self._kinds[part], UNKNOWN)
+            confusion += count_classes(true, logits.argmax(dim=2).cpu().numpy(), len(OPENING_CLASSES))
         return {
             "nll": sum(nll) / len(self._images),
             "log_error": float(np.median(errors)),

@@ -10,9 +10,9 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.learn.data.dataset import Camera, HomeScenes, Scene, Split
-from lalaloc_core.learn.heldout.furnish import LEVELS
+from lalaloc_core.learn.heldout.furnishing import LEVELS
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of, stands_of
-from lalaloc_core.learn.heldout.photograph import HeldoutShot, depth_m, render
+from lalaloc_core.learn.heldout.renderer import HeldoutShot, depth_m, render
 
 _DEPTH_HEIGHT = 256
 _LEVEL_SHARES = (0.2, 0.25, 0.55)

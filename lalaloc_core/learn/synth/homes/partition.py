@@ -68,12 +68,10 @@ def reshape_room(
     for _ in range(changes):
         kind = rng.choice(5, p=[0.3, 0.15, 0.15, 0.2, 0.2])
         edge = int(rng.integers(len(polygon_m)))
-        if kind == 0:
-            changed = _notch_corner(polygon_m, edge, rng)
-        elif kind == 1:
-            changed = _cut_corner(polygon_m, edge, rng)
-        elif kind == 2:
-            changed = _slant_wall(polygon_m, edge, rng)
+        changed = None
+        if kind < len(_AT_CORNERS):
+            if _is_convex_corner(polygon_m, edge):
+                changed = _AT_CORNERS[kind](polygon_m, edge, rng)
         elif kind == 3:
             changed = _bump(polygon_m, edge, rng, width_m=(0.15, 0.6), depth_m=(0.1, 0.45))
         else:
@@ -201,8 +199,6 @@ def _replace(polygon_m: np.ndarray, index: int, vertices: list[np.ndarray]) -> n
 
 
 def _notch_corner(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -> np.ndarray | None:
-    if not _is_convex_corner(polygon_m, index):
-        return None
     corner, after, length_after = _edge(polygon_m, index)
     _, before, length_before = _edge(polygon_m, (index - 1) % len(polygon_m))
     a, b = rng.uniform(0.1, 0.7), rng.uniform(0.1, 0.7)
@@ -212,8 +208,6 @@ def _notch_corner(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -
 
 
 def _cut_corner(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -> np.ndarray | None:
-    if not _is_convex_corner(polygon_m, index):
-        return None
     corner, after, length_after = _edge(polygon_m, index)
     _, before, length_before = _edge(polygon_m, (index - 1) % len(polygon_m))
     a = rng.uniform(0.3, 1.5)
@@ -224,10 +218,11 @@ def _cut_corner(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -> 
 
 
 def _slant_wall(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -> np.ndarray | None:
-    if not _is_convex_corner(polygon_m, index):
-        return None
     corner, after, length = _edge(polygon_m, index)
     return _replace(polygon_m, index, [corner + after * length * rng.uniform(0.05, 0.25)])
+
+
+_AT_CORNERS = (_notch_corner, _cut_corner, _slant_wall)
 
 
 def _bump(

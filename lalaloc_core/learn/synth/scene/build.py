@@ -12,12 +12,11 @@ from lalaloc_core.learn.synth.scene.lighting import Lighting, light_room, relit,
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.mirrors import add_mirror, sample_mirror
 from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, VisibleRooms
+from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
 from lalaloc_core.learn.synth.scene.shells import Shells
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
-from lalaloc_core.learn.synth.scene.style import sample_style
-from lalaloc_core.learn.synth.scene.surfaces import SurfaceTable
-from lalaloc_core.learn.synth.scene.tables import SceneTables
+from lalaloc_core.learn.synth.scene.surfaces import SurfaceTable, sample_style
 from lalaloc_core.learn.synth.scene.windows import add_curtains, add_radiator, add_window
 
 

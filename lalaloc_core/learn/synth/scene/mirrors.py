@@ -12,8 +12,8 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.records import Row
 from lalaloc_core.learn.synth.scene.render_scene import Lights, Prisms, VisibleRooms
-from lalaloc_core.learn.synth.scene.style import HouseStyle
-from lalaloc_core.learn.synth.scene.tables import SceneTables
+from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
+from lalaloc_core.learn.synth.scene.surfaces import HouseStyle
 
 # Probability of a large mirror by kind of room.
 _CHANCE = {"bathroom": 0.4, "corridor": 0.22, "bedroom": 0.25, "living": 0.15, "dining": 0.12, "closet": 0.12}

@@ -10,10 +10,9 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.learn.synth.furniture.furnish import wall_frame
 from lalaloc_core.learn.synth.scene.lighting import Lighting
 from lalaloc_core.learn.synth.scene.render_scene import VisibleRooms
+from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
 from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
-from lalaloc_core.learn.synth.scene.style import HouseStyle
-from lalaloc_core.learn.synth.scene.surfaces import Colour, bright, paint, pale, vivid
-from lalaloc_core.learn.synth.scene.tables import SceneTables
+from lalaloc_core.learn.synth.scene.surfaces import Colour, HouseStyle, bright, paint, pale, vivid
 
 # Trims reach this far beyond the ends of their wall, the floor and the ceiling: no crack is seen.
 _BEYOND_M = 1.0

@@ -8,9 +8,8 @@ import shapely
 from lalaloc_core.floorplan import Room
 from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, rectangle, wall_frame
 from lalaloc_core.learn.synth.homes.openings import Opening
-from lalaloc_core.learn.synth.scene.style import HouseStyle
-from lalaloc_core.learn.synth.scene.surfaces import bright, paint
-from lalaloc_core.learn.synth.scene.tables import SceneTables
+from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
+from lalaloc_core.learn.synth.scene.surfaces import HouseStyle, bright, paint
 
 _HALF_DEPTH_M = 0.05
 _CURTAIN_FROM_WALL_M, _RADIATOR_FROM_WALL_M = 0.07, 0.06

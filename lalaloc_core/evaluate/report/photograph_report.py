@@ -23,7 +23,8 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Thumbnail, draw_sheet
-from lalaloc_core.evaluate.report.tables import percent
+from lalaloc_core.evaluate.report.report_tables import percent
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import describe_model
 from lalaloc_core.evaluate.runs.galleries import (
     ACCEPTED,
@@ -37,7 +38,6 @@ from lalaloc_core.evaluate.runs.galleries import (
 )
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
-from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M

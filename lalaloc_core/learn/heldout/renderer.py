@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
-from lalaloc_core.learn.heldout.furnish import Level
+from lalaloc_core.learn.heldout.furnishing import Level
 from lalaloc_core.learn.heldout.homes import HomeKey, Stand, TracedHome, traced_home
-from lalaloc_core.learn.heldout.light import Lights
-from lalaloc_core.learn.heldout.sky import Sky
+from lalaloc_core.learn.heldout.light import Lights, Sky
 from lalaloc_core.learn.heldout.tracing import OFFSET_M
 
 _GLOW = 4.0

@@ -16,8 +16,8 @@ from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, 
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.training.checkpoint import Validate
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, SceneSource, Source
+from lalaloc_core.learn.training.unlabelled_photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.validate import ImageValidation
 
 _LOG = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class TrainingData:
         heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
             on it.
         photographs: folder of unlabelled panoramas for the image stage.
-        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.segmenter`.
+        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.unlabelled_photographs`.
     """
 
     dataset: Dataset | None = None

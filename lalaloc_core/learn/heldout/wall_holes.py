@@ -11,7 +11,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.learn.heldout.plans import HeldoutPlan
+from lalaloc_core.learn.heldout.grown_plans import HeldoutPlan
 
 OpeningKind = Literal["open door", "shut door", "arch", "passage", "front door", "window"]
 _CORNER_M = 0.1

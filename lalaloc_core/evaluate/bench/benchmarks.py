@@ -17,8 +17,8 @@ from lalaloc_core.evaluate.bench.accuracy import (
     bench_views,
 )
 from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
-from lalaloc_core.evaluate.bench.localisability import bench_localisability
-from lalaloc_core.evaluate.bench.service import bench_service
+from lalaloc_core.evaluate.bench.localisability_accuracy import bench_localisability
+from lalaloc_core.evaluate.bench.service_latency import bench_service
 from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
 from lalaloc_core.evaluate.bench.turns import bench_turns
 from lalaloc_core.evaluate.bench.uninformative import bench_uninformative

@@ -12,10 +12,10 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.learn.heldout import fixtures, seats
 from lalaloc_core.learn.heldout.geometry import Part
-from lalaloc_core.learn.heldout.openings import Opening, Wall, span_behind, walls_of
+from lalaloc_core.learn.heldout.grown_plans import HeldoutPlan
 from lalaloc_core.learn.heldout.outlines import RoomKind
-from lalaloc_core.learn.heldout.plans import HeldoutPlan
 from lalaloc_core.learn.heldout.seats import Piece
+from lalaloc_core.learn.heldout.wall_holes import Opening, Wall, span_behind, walls_of
 
 Level = Literal["empty", "simple", "full"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -32,50 +32,23 @@ _NEEDED: Mapping[RoomKind, Sequence[_Maker]] = {
 }
 _MORE: Mapping[RoomKind, Sequence[_Maker]] = {
     "living": (
-        seats.curved_sofa,
-        seats.armchair,
-        seats.armchair,
-        fixtures.bookcase,
-        fixtures.plant,
-        fixtures.plant,
-        fixtures.floor_lamp,
-        seats.ottoman,
-        seats.bean_bag,
-        fixtures.sideboard,
-        fixtures.kitchen_run,
-        fixtures.island,
-        fixtures.desk,
-        fixtures.radiator,
+        *(seats.curved_sofa, seats.armchair, seats.armchair, fixtures.bookcase, fixtures.plant, fixtures.plant),
+        *(fixtures.floor_lamp, seats.ottoman, seats.bean_bag, fixtures.sideboard, fixtures.kitchen_run),
+        *(fixtures.island, fixtures.desk, fixtures.radiator),
     ),
     "bedroom": (
-        seats.ottoman,
-        seats.ottoman,
-        fixtures.plant,
-        fixtures.floor_lamp,
-        seats.armchair,
-        fixtures.bookcase,
-        fixtures.desk,
-        seats.bean_bag,
-        fixtures.radiator,
+        *(seats.ottoman, seats.ottoman, fixtures.plant, fixtures.floor_lamp, seats.armchair, fixtures.bookcase),
+        *(fixtures.desk, seats.bean_bag, fixtures.radiator),
     ),
     "kitchen": (
-        fixtures.kitchen_run,
-        fixtures.island,
-        seats.dining_set,
-        fixtures.plant,
-        fixtures.washer,
-        fixtures.bookcase,
+        *(fixtures.kitchen_run, fixtures.island, seats.dining_set, fixtures.plant),
+        *(fixtures.washer, fixtures.bookcase),
     ),
     "bathroom": (fixtures.washer, fixtures.radiator, fixtures.plant, seats.ottoman),
     "corridor": (fixtures.bookcase, fixtures.plant, fixtures.wardrobe, seats.ottoman, fixtures.radiator),
     "closet": (fixtures.bookcase, fixtures.wardrobe, fixtures.washer),
     "study": (
-        seats.armchair,
-        fixtures.plant,
-        fixtures.bookcase,
-        fixtures.floor_lamp,
-        seats.bean_bag,
-        fixtures.sideboard,
+        *(seats.armchair, fixtures.plant, fixtures.bookcase, fixtures.floor_lamp, seats.bean_bag, fixtures.sideboard),
     ),
 }
 _FREE = (seats.dining_set, fixtures.island, seats.ottoman, seats.bean_bag, seats.armchair, seats.curved_sofa)
