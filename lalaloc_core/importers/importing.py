@@ -83,7 +83,7 @@ def import_plans(
         several = len(plans) > 1
         plans = [
             plan if "name" in plan.document and (format.name == "native" or not several)
-            else _named(plan, building, by_level=several)
+            else _rename(plan, building, by_level=several)
             for plan in plans
         ]  # fmt: skip
     return tuple(_with_option_warnings(plan, format, options) for plan in plans)
@@ -132,7 +132,7 @@ def import_if_native(
         return None
     (plan,) = format.read(document, options, Budget(limits))
     if building is not None and "name" not in plan.document:
-        plan = _named(plan, building)
+        plan = _rename(plan, building)
     return _with_option_warnings(plan, format, options)
 
 
@@ -246,7 +246,7 @@ def _format_by_magic(content: bytes) -> Format:
     raise InvalidFloorPlanError(f"the file is {found}; supported formats are {titles}")
 
 
-def _named(plan: ImportedPlan, name: str, *, by_level: bool = False) -> ImportedPlan:
+def _rename(plan: ImportedPlan, name: str, *, by_level: bool = False) -> ImportedPlan:
     """Return a plan with a name; one of several storeys is named "Duplex – Level 1"."""
     level = f" – {plan.level.title}" if by_level and plan.level is not None else ""
     longest = DEFAULT_LIMITS.max_name_length

@@ -22,7 +22,7 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document
-from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, chosen_levels
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
@@ -87,7 +87,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
             + "; check layers, level and the scale"
         )
     rooms, shift = _near_origin(rooms, builder)
-    openings = [_shifted(opening, shift) for opening in sketch.openings]
+    openings = [_shift_opening(opening, shift) for opening in sketch.openings]
     placed = place_openings(openings, [room.shape for room in rooms])
     if placed.off_wall:
         places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in placed.off_wall[:_MAX_NAMED])
@@ -100,7 +100,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     document: dict[str, Any] = {} if name is None else {"name": name}
     if sketch.north_deg is not None:
         document["north_deg"] = round(sketch.north_deg % 360.0, 6)
-    anchor = _shifted_anchor(sketch.anchor, shift, builder)
+    anchor = _shift_anchor(sketch.anchor, shift, builder)
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
@@ -134,7 +134,7 @@ def assemble_levels(
     Raises:
         InvalidFloorPlanError: no level is chosen, none has a room, or the plan of one is invalid; names the level.
     """
-    chosen = chosen_levels(levels, options)
+    chosen = choose_levels(levels, options)
     if len(chosen) > limits.max_levels:
         raise InvalidFloorPlanError(
             f"the file has {len(chosen)} levels; the limit is {limits.max_levels} (max_levels); choose one with level"
@@ -175,7 +175,7 @@ def _clean(
     floors = [
         simple
         for floor in polygons_from_geometry(shape)
-        for simple in _simple(_simplified(floor, label, limits, builder))
+        for simple in _simple(_simplify(floor, label, limits, builder))
     ]
     floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
     if not floors and room.shape.area < _SLIVER_M2:
@@ -197,7 +197,7 @@ def _clean(
     return cleaned
 
 
-def _simplified(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: ReportBuilder) -> BaseGeometry:
+def _simplify(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: ReportBuilder) -> BaseGeometry:
     """Return a floor without vertices on straight walls, and within the limit of vertices if 2 cm suffice for that."""
     shape = floor.simplify(_STRAIGHT_M)
     drawn, limit = _vertices(shape), limits.max_vertices_per_room
@@ -241,7 +241,7 @@ def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[lis
     return [replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in rooms], (float(dx), float(dy))
 
 
-def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
+def _shift_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
     """Return the anchor of the moved plan, None if it was moved too far for an accurate place."""
     if anchor is None or shift == (0.0, 0.0):
         return anchor
@@ -255,7 +255,7 @@ def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: 
     return anchor.moved((-shift[0], -shift[1]))
 
 
-def _shifted(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
+def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
     (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
     return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
 

@@ -89,9 +89,9 @@ class ReportBuilder:
             scale_source=self.scale_source,
             is_draft=self.is_draft,
             layers=tuple(layers[:_MAX_LINES]),
-            notes=_bounded(self.notes),
-            warnings=_bounded(self.warnings),
-            unsure=_bounded(self.unsure),
+            notes=_limit_lines(self.notes),
+            warnings=_limit_lines(self.warnings),
+            unsure=_limit_lines(self.unsure),
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
         )
 
@@ -109,7 +109,7 @@ class Trace:
                 self.shapes.append((part, shape))
 
 
-def _bounded(lines: list[str]) -> tuple[str, ...]:
+def _limit_lines(lines: list[str]) -> tuple[str, ...]:
     distinct = list(dict.fromkeys(lines))
     if len(distinct) <= _MAX_LINES:
         return tuple(distinct)

@@ -34,12 +34,12 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
         return _scaling(factor, options), None, factor, "option units"
     if crs is not None:
         try:
-            convert = _checked(lambda points: to_wgs84(crs, points))
+            convert = _refuse_infinite(lambda points: to_wgs84(crs, points))
             low, high = (convert(np.array([corner]))[0] for corner in (low, high))
         except ProjError as error:
             raise InvalidFloorPlanError(f"the crs '{crs}' cannot be used: {error}; export the file in WGS84") from error
     else:
-        convert = _checked(lambda points: points)
+        convert = _refuse_infinite(lambda points: points)
     if not (np.abs([low, high]) <= [180.0, 90.0]).all():
         raise InvalidFloorPlanError(
             f"coordinates reach ({high[0]:g}, {high[1]:g}), outside longitude ±180 and latitude ±90; "
@@ -70,8 +70,8 @@ def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
     return math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
 
 
-def _checked(convert: Any) -> Any:
-    def checked(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _refuse_infinite(convert: Any) -> Any:
+    def convert_finite(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         converted = convert(points)
         if not np.isfinite(converted).all():
             raise InvalidFloorPlanError(
@@ -79,7 +79,7 @@ def _checked(convert: Any) -> Any:
             )
         return converted
 
-    return checked
+    return convert_finite
 
 
 def _scaling(factor: float, options: ImportOptions) -> Any:

@@ -36,7 +36,7 @@ def check_document(document: Mapping[str, Any], *, is_scale_certain: bool = Fals
         warnings += _door_warnings(document) + _size_warnings(rooms)
     duplicates = [name for name, count in Counter(names).items() if count > 1]
     if duplicates:
-        warnings.append(f"rooms share a name: {_listed(duplicates)}; answers distinguish them by id only")
+        warnings.append(f"rooms share a name: {_list_names(duplicates)}; answers distinguish them by id only")
     if len(rooms) <= _MAX_ROOMS_COMPARED:
         warnings += _isolated_rooms(rooms, names)
         warnings += _unreachable_rooms(rooms, names, document.get("openings", []))
@@ -107,7 +107,7 @@ def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> l
     if not isolated:
         return []
     return [
-        f"rooms farther than a wall's thickness ({_USUAL_WALL_M:g} m) from every other room: {_listed(isolated)}; "
+        f"rooms farther than a wall's thickness ({_USUAL_WALL_M:g} m) from every other room: {_list_names(isolated)}; "
         "check the scale and look for missing rooms"
     ]
 
@@ -125,7 +125,7 @@ def _unreachable_rooms(
         for name, room in zip(names, rooms, strict=True)
         if len(tree.query(room.exterior, predicate="dwithin", distance=_REACH_M)) == 0
     ]
-    return [f"no door or passage reaches {_listed(unreachable)}"] if unreachable else []
+    return [f"no door or passage reaches {_list_names(unreachable)}"] if unreachable else []
 
 
 def _length(line: Sequence[Sequence[float]]) -> float:
@@ -133,6 +133,6 @@ def _length(line: Sequence[Sequence[float]]) -> float:
     return float(np.hypot(x1 - x0, y1 - y0))
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     shown = ", ".join(f"'{name}'" for name in names[:_MAX_NAMED])
     return shown if len(names) <= _MAX_NAMED else f"{shown} and {len(names) - _MAX_NAMED} more"

@@ -93,7 +93,7 @@ class Sketch:
     drawn: BaseGeometry | None = None
 
 
-def chosen_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:
+def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:
     """Return all storeys, lowest first, or only the one named by the option `level`.
 
     Raises:

@@ -111,10 +111,10 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
         for length in lengths
         if length > 0.0 and _EXTENT_M[0] <= extent * value_m / length <= _EXTENT_M[1]
     ]
-    best = _agreeing(votes)
+    best = _agreeing_votes(votes)
     middle = float(np.median([vote[0] for vote in best])) if best else 0.0
     count = len({index for _, index, _ in best})
-    others = _agreeing([vote for vote in votes if abs(vote[0] - middle) > 3.0 * _AGREE])
+    others = _agreeing_votes([vote for vote in votes if abs(vote[0] - middle) > 3.0 * _AGREE])
     lengths = {round(value_m, 2) for _, _, value_m in best}
     if count < max(_MIN_AGREEING, _MARGIN * len({index for _, index, _ in others})) or len(lengths) < _MIN_LENGTHS:
         return None
@@ -123,7 +123,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
 
 def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
     """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
-    return scale_by_dimensions(_written(drawing, check_time), drawing.extent) if drawing.shapes else None
+    return scale_by_dimensions(_written_dimensions(drawing, check_time), drawing.extent) if drawing.shapes else None
 
 
 def check_scale(
@@ -172,7 +172,7 @@ def _areas_m2(text: str) -> tuple[float, ...]:
     return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
 
 
-def _written(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
+def _written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
     texts = [lettering for lettering in drawing.letterings if _values_m(lettering.text)][:_MAX_TEXTS]
     points = [shapely.get_coordinates(stroke.line) for stroke in drawing.strokes]
@@ -226,7 +226,7 @@ def _values_m(text: str) -> tuple[float, ...]:
     return tuple(value for value in values if _LENGTH_M[0] <= value <= _LENGTH_M[1])
 
 
-def _agreeing(votes: Sequence[tuple[float, int, float]]) -> list[tuple[float, int, float]]:
+def _agreeing_votes(votes: Sequence[tuple[float, int, float]]) -> list[tuple[float, int, float]]:
     """Return the votes in the window of ratios that has most dimensions."""
     ordered = sorted(votes)
     inside: Counter[int] = Counter()

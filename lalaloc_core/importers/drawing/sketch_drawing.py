@@ -80,7 +80,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         leaves = walls.swings
         areas = without_leaves(drawing.areas, [*drawing.swings, *leaves])
         drawing = replace(drawing, strokes=[*walls.strokes, *others], areas=areas)
-        enclosed, source = _enclosed(drawing, budget)
+        enclosed, source = _enclose_drawing(drawing, budget)
         gaps = enclosed.gaps
         sketch.drawn = enclosed.walls.envelope
         if leaves:
@@ -92,7 +92,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         builder.notes.append(
             f"rooms are the areas enclosed by {source}; gaps up to {DEFAULT_WALLS.widest_gap:g} m were closed"
         )
-    sketch.rooms = named_rooms(shapes, drawing.letterings, builder, sketch.drawn)
+    sketch.rooms = name_rooms(shapes, drawing.letterings, builder, sketch.drawn)
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
@@ -151,7 +151,7 @@ def _covers(outer: shapely.Polygon, inner: shapely.Polygon) -> bool:
     return outer.area >= 0.98 * inner.area and shapely.intersection(outer, inner).area > 0.95 * inner.area
 
 
-def _enclosed(drawing: Drawing, budget: Budget) -> tuple[Enclosed, str]:
+def _enclose_drawing(drawing: Drawing, budget: Budget) -> tuple[Enclosed, str]:
     """Return the enclosed areas, and a description of what was taken for walls."""
     named_bodies = [area.shape for area in drawing.areas if area.role == "wall"]
     named_lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
@@ -202,7 +202,7 @@ def _closers(drawing: Drawing) -> list[BaseGeometry]:
     return [shape for shape in (*areas, *windows) if side_lengths(shape)[0] < 0.7]
 
 
-def named_rooms(
+def name_rooms(
     shapes: Sequence[Area],
     letterings: Sequence[Lettering],
     builder: ReportBuilder,

@@ -264,7 +264,7 @@ def _add(
     if isinstance(entity, Insert):
         _add_block(entity, context, drawing, builder, sag, budget)
     elif kind in _FILLED:
-        shapes = _filled(entity, sag)
+        shapes = _filled_areas(entity, sag)
         is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
         drawing.areas += [Area(shape, context.layer, role, is_dark=is_solid) for shape in shapes]
         builder.use(context.layer, f"hatches: {role or 'possible walls'}", max(len(shapes), 1))
@@ -325,7 +325,7 @@ def _ends_meet(points: np.ndarray) -> bool:
 def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
     """Return the points along a line, in world coordinates seen from above."""
     try:
-        points = _flattened(dxf_path.make_path(entity), sag)
+        points = _flatten(dxf_path.make_path(entity), sag)
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
     if not len(points) or not np.isfinite(points).all():
@@ -333,7 +333,7 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
     return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
 
 
-def _flattened(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
+def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
     """Return the points along a path; a curve larger than the drawing's stated size has no more than others."""
     corners = np.array([(vertex.x, vertex.y) for vertex in path.control_vertices()])
     size = float(np.ptp(corners, axis=0).max(initial=0.0)) if len(corners) else 0.0
@@ -342,12 +342,12 @@ def _flattened(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
     return np.array([(vertex.x, vertex.y) for vertex in path.flattening(max(sag, _SAG * size), segments=8)])
 
 
-def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
+def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
     """Return the filled area of a hatch, between its outlines."""
     try:
         is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
         paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [_flattened(path, sag) for path in paths]
+        rings = [_flatten(path, sag) for path in paths]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
     usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]

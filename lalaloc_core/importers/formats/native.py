@@ -97,7 +97,7 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
     builder = ReportBuilder("native", factor, source)
     y_factor = -factor if y_axis == "down" else factor
     if factor != 1.0 or y_factor != factor:
-        plan = _converted(plan, factor, y_factor)
+        plan = _convert(plan, factor, y_factor)
         builder.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was flipped")
     _check_ceiling_units(plan)
     limits = budget.limits.plan
@@ -116,7 +116,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     return json.dumps(document, ensure_ascii=False, indent=1).encode()
 
 
-def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
+def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
     """Convert a plan to metres; the validation refuses values of wrong types later."""
     plan = _lengths(document, factor)
     rooms = plan.get("rooms")
@@ -125,7 +125,7 @@ def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict
     openings = plan.get("openings")
     if isinstance(openings, list):
         plan["openings"] = [
-            _lengths(opening, factor) | _scaled_keys(opening, ("line",), factor, y_factor)
+            _lengths(opening, factor) | _scale_keys(opening, ("line",), factor, y_factor)
             if isinstance(opening, Mapping)
             else opening
             for opening in openings
@@ -140,7 +140,7 @@ def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict
 
 
 def _room(room: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
-    return _lengths(room, factor) | _scaled_keys(room, ("polygon", "holes", "walls"), factor, y_factor)
+    return _lengths(room, factor) | _scale_keys(room, ("polygon", "holes", "walls"), factor, y_factor)
 
 
 def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[s
     if isinstance(points, list):
         scales = {"x": factor, "y": y_factor}
         converted["control_points"] = [
-            {key: _times(value, scales.get(key, 1.0)) for key, value in point.items()}
+            {key: _to_metres(value, scales.get(key, 1.0)) for key, value in point.items()}
             if isinstance(point, Mapping)
             else point
             for point in points
@@ -169,23 +169,23 @@ def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
         if key in plan:
             raise InvalidFloorPlanError(f"'{short}' and '{key}' are both set; give only one of them")
         value = plan.pop(short)
-        plan[key] = _times(value, factor)
+        plan[key] = _to_metres(value, factor)
     return plan
 
 
-def _scaled_keys(document: Mapping[str, Any], keys: tuple[str, ...], factor: float, y_factor: float) -> dict[str, Any]:
-    return {key: _scaled(document[key], factor, y_factor) for key in keys if key in document}
+def _scale_keys(document: Mapping[str, Any], keys: tuple[str, ...], factor: float, y_factor: float) -> dict[str, Any]:
+    return {key: _scale(document[key], factor, y_factor) for key in keys if key in document}
 
 
-def _scaled(value: Any, factor: float, y_factor: float) -> Any:
+def _scale(value: Any, factor: float, y_factor: float) -> Any:
     if not isinstance(value, list | tuple):
         return value
     if len(value) == 2 and all(is_number(number) for number in value):
-        return [_times(value[0], factor), _times(value[1], y_factor)]
-    return [_scaled(item, factor, y_factor) for item in value]
+        return [_to_metres(value[0], factor), _to_metres(value[1], y_factor)]
+    return [_scale(item, factor, y_factor) for item in value]
 
 
-def _times(value: Any, factor: float) -> Any:
+def _to_metres(value: Any, factor: float) -> Any:
     """Return a length in metres; other values stay as they are for the validation to refuse."""
     return value * factor if is_number(value) and abs(value) < _MAX_NUMBER else value
 

@@ -21,7 +21,7 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
-from lalaloc_core.importers.drawing.sketch_drawing import named_rooms, sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
@@ -64,7 +64,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             # Searchable scans contain text over the picture.
             own = found.drawing.scaled(factor, flip_y=False).letterings
             rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-            sketch.rooms = named_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
+            sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
     finally:
         document.close()
     builder.metres_per_unit, builder.scale_source = factor, source

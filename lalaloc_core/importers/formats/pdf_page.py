@@ -85,7 +85,7 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
             _add_path(item, matrix, found.drawing, budget)
         elif kind == pdfium.FPDF_PAGEOBJ_IMAGE:
-            corners = _applied(matrix, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+            corners = _apply(matrix, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
             area = shapely.Polygon(corners).area if np.isfinite(corners).all() else 0.0
             found.picture_share += min(area / max(width * height, 1.0), 1.0)
     found.drawing.letterings = _letterings(page)
@@ -122,12 +122,10 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
     shells: list[shapely.Polygon] = []
     for subpath in _subpaths(item, budget):
-        points = _applied(matrix, subpath.points)
+        points = _apply(matrix, subpath.points)
         if not np.isfinite(points).all():
             continue
-        swings = (
-            [fit_swing(_applied(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
-        )
+        swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
         leaves = [swing for swing in swings if swing is not None]
         if leaves and not is_filled:
             drawing.swings += leaves
@@ -180,7 +178,7 @@ def _add_curve(path: _Subpath, control: list[tuple[float, float]]) -> None:
     path.was_curved = True
 
 
-def _applied(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarray, "n 2"]:
+def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarray, "n 2"]:
     array = np.array(points, dtype=float).reshape(-1, 2)
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 

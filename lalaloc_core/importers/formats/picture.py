@@ -16,7 +16,7 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import check_scale, drawing_scale, drawn_scale
-from lalaloc_core.importers.drawing.sketch_drawing import named_rooms
+from lalaloc_core.importers.drawing.sketch_drawing import name_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.lettering import read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
@@ -55,7 +55,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "scale), and that walls are dark or drawn with two lines"
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-    sketch.rooms = named_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
+    sketch.rooms = name_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

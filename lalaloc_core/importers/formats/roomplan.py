@@ -114,7 +114,7 @@ def _story(raw: Mapping[str, Any]) -> int:
 
 def _surface(raw: Mapping[str, Any], where: str) -> _Surface:
     width_m, height_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}").tolist()
-    ends = _placed(np.array([[-0.5 * width_m, 0.0, 0.0], [0.5 * width_m, 0.0, 0.0]]), raw, where)
+    ends = _place(np.array([[-0.5 * width_m, 0.0, 0.0], [0.5 * width_m, 0.0, 0.0]]), raw, where)
     middle_m = float(ends[:, 1].mean())
     start, end = _from_above(ends)
     return _Surface(point_xy(start), point_xy(end), middle_m - 0.5 * height_m, middle_m + 0.5 * height_m)
@@ -128,10 +128,10 @@ def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
         width_m, depth_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}")
         local = 0.5 * np.array([[-width_m, -depth_m, 0], [width_m, -depth_m, 0], [width_m, depth_m, 0],
                                 [-width_m, depth_m, 0]])  # fmt: skip
-    return polygons_from_geometry(shapely.Polygon(_from_above(_placed(local, raw, where))))
+    return polygons_from_geometry(shapely.Polygon(_from_above(_place(local, raw, where))))
 
 
-def _placed(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> Float[np.ndarray, "n 3"]:
+def _place(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> Float[np.ndarray, "n 3"]:
     """Return points of a surface in the frame of the scan."""
     transform = _numbers(raw.get("transform"), 16, f"transform of {where}").reshape(4, 4).T
     return local @ transform[:3, :3].T + transform[:3, 3]

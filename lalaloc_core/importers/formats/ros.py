@@ -103,7 +103,7 @@ def write(document: Mapping[str, Any], _anchor: Anchor | None, frame: MapFrame |
     """
     rooms = [shapely.Polygon(room["polygon"], room.get("holes", ())) for room in document["rooms"]]
     frame = frame or _frame_of(rooms)
-    picture = _drawn(document, rooms, frame)
+    picture = _draw(document, rooms, frame)
     x, y, yaw = frame.origin
     settings = (
         f"image: map.pgm\nmode: trinary\nresolution: {frame.resolution_m:.10g}\n"
@@ -122,7 +122,7 @@ def _picture_alone(content: bytes, options: ImportOptions, budget: Budget) -> Oc
             "picture with metres_per_pixel"
         )
     settings = {"resolution": options.metres_per_pixel, "origin": [0.0, 0.0, 0.0]}
-    return _classified(_gray(content, budget), settings)
+    return _classify(_gray(content, budget), settings)
 
 
 def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
@@ -134,7 +134,7 @@ def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
     found = next((content for name, content in files.items() if name.rpartition("/")[2] == image), None)
     if found is None:
         raise InvalidFloorPlanError(f"the archive has no picture '{image[:100]}', which the ROS map names; add it")
-    return _classified(_gray(found, budget), settings)
+    return _classify(_gray(found, budget), settings)
 
 
 def _settings(content: bytes) -> Mapping[str, Any]:
@@ -151,7 +151,7 @@ def _settings(content: bytes) -> Mapping[str, Any]:
     return settings
 
 
-def _classified(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> OccupancyGrid:
+def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> OccupancyGrid:
     from lalaloc_core.importers.picture.occupancy import OccupancyGrid
 
     resolution_m = _number(settings, "resolution", None, _RESOLUTION_M)
@@ -205,7 +205,7 @@ def _frame_of(rooms: list[shapely.Polygon]) -> MapFrame:
     return MapFrame(cell_m, (left * cell_m, bottom * cell_m, 0.0), (top - bottom, right - left))
 
 
-def _drawn(document: Mapping[str, Any], rooms: list[shapely.Polygon], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
+def _draw(document: Mapping[str, Any], rooms: list[shapely.Polygon], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
     half_m = 0.5 * frame.resolution_m
     # Gaps between rooms up to twice a wall's thickness are walls.
     around = shapely.union_all(rooms).buffer(2.0 * _WALL_M, join_style="mitre")

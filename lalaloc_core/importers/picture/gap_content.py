@@ -88,10 +88,10 @@ class GapReader:
             centre = hinge + offset * across
             for radius in width * np.array([1.0, 0.96, 0.92, 1.04]):
                 arc = centre + radius * (np.cos(angles)[:, None] * along + np.sin(angles)[:, None] * across)
-                share = self._inked(arc)
+                share = self._inked_share(arc)
                 if _ARC_WITH_LEAF <= share < _ARC:
                     reach = np.linspace(0.15, 0.95, _ARC_POINTS)[:, None]
-                    leaf = self._inked(centre + radius * reach * across)
+                    leaf = self._inked_share(centre + radius * reach * across)
                     share = max(share, _ARC if leaf >= _LEAF else 0.0)
                 best = max(best, share)
         return best
@@ -122,7 +122,7 @@ class GapReader:
             warmth = float(colours[found].mean()) - COLOURLESS
         return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
 
-    def _inked(self, points_m: Float[np.ndarray, "n 2"]) -> float:
+    def _inked_share(self, points_m: Float[np.ndarray, "n 2"]) -> float:
         """Return the share of points near ink; there is none outside the picture."""
         columns, rows = np.floor(self._ink.to_pixels(points_m)).astype(int).T
         height, width = self._near.shape

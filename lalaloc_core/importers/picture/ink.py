@@ -81,8 +81,8 @@ def read_ink(
     threshold = float(np.clip(threshold, *_THRESHOLD))
     skew_deg = find_skew(even < threshold) if straighten else 0.0
     if skew_deg:
-        even = turned(even, skew_deg)
-        warmth = None if warmth is None else turned(warmth, skew_deg, fill=COLOURLESS)
+        even = rotate_picture(even, skew_deg)
+        warmth = None if warmth is None else rotate_picture(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
     size = (int(gray.shape[0]), int(gray.shape[1]))
     return Ink(
@@ -126,7 +126,7 @@ def find_skew(ink: Bool[np.ndarray, "h w"], reach_deg: float = _MAX_SKEW_DEG) ->
     small = cv2.resize(ink.astype(np.float32), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
     def energy(degrees: float) -> float:
-        rotated = turned(small, degrees, fill=0.0)
+        rotated = rotate_picture(small, degrees, fill=0.0)
         return sum(float(np.sum(np.diff(rotated.sum(axis=axis)) ** 2)) for axis in (0, 1))
 
     best = 0.0
@@ -137,7 +137,7 @@ def find_skew(ink: Bool[np.ndarray, "h w"], reach_deg: float = _MAX_SKEW_DEG) ->
     return best if abs(best) >= 0.15 and energy(best) > 1.02 * energy(0.0) else 0.0
 
 
-def turned(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
+def rotate_picture(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
     """Rotate the picture about its centre, on a canvas that holds all of it."""
     rows, columns = picture.shape
     angle = math.radians(abs(degrees))

@@ -88,11 +88,11 @@ def read_texts(
         builder.notes.append("texts were not read, as the extra 'ocr' is not installed: name the rooms")
         return found
     try:
-        factor, ink = _resized(gray, _TILE_PX, straighten=straighten)
+        factor, ink = _resized_ink(gray, _TILE_PX, straighten=straighten)
         boxes = _boxes(ink, builder, budget)
         is_small = min((_height(box) for _, box in boxes), default=0.0) < _LEGIBLE_PX
         if max(rows, columns) > _TILE_PX and is_small and _share_of_time(budget) < _SHARE_OF_TIME / 3.0:
-            finer_factor, finer = _resized(gray, READ_PX, straighten=straighten)
+            finer_factor, finer = _resized_ink(gray, READ_PX, straighten=straighten)
             if len(found_finer := _boxes(finer, builder, budget)) >= len(boxes):
                 factor, ink, boxes = finer_factor, finer, found_finer
     except MemoryError:
@@ -117,7 +117,7 @@ def read_texts(
     return found
 
 
-def _resized(gray: UInt8[np.ndarray, "h w"], longest_px: int, *, straighten: bool) -> tuple[float, Ink]:
+def _resized_ink(gray: UInt8[np.ndarray, "h w"], longest_px: int, *, straighten: bool) -> tuple[float, Ink]:
     """Return the factor between a picture and its ink, whose longer side is at most `longest_px`."""
     rows, columns = gray.shape
     factor = float(np.clip(max(rows, columns), _SMALLEST_PX, longest_px)) / max(rows, columns)
@@ -187,7 +187,7 @@ _reader = cache(_Reader)
 def _boxes(ink: Ink, builder: ReportBuilder, budget: Budget) -> list[tuple[str, Corners]]:
     """Return the texts with their corners in pixels; of texts in two tiles the larger one."""
     reader = _reader()
-    parts = _whole(_detected(ink, reader, builder, budget))[:_MAX_TEXTS]
+    parts = _whole_texts(_detect_texts(ink, reader, builder, budget))[:_MAX_TEXTS]
     found: list[tuple[str, Corners]] = []
     for begin in range(0, len(parts), _BATCH):
         if begin and _share_of_time(budget) > _SHARE_OF_TIME:
@@ -202,7 +202,7 @@ def _boxes(ink: Ink, builder: ReportBuilder, budget: Budget) -> list[tuple[str, 
     return found
 
 
-def _detected(ink: Ink, reader: _Reader, builder: ReportBuilder, budget: Budget) -> list[_Part]:
+def _detect_texts(ink: Ink, reader: _Reader, builder: ReportBuilder, budget: Budget) -> list[_Part]:
     """Return the texts of all tiles; one that a tile cuts is also in the next, as a whole."""
     rows, columns = ink.gray.shape
     parts: list[_Part] = []
@@ -231,7 +231,7 @@ def _starts(length: int) -> list[int]:
     return [round(k * (length - _TILE_PX) / (count - 1)) for k in range(count)]
 
 
-def _whole(parts: Sequence[_Part]) -> list[_Part]:
+def _whole_texts(parts: Sequence[_Part]) -> list[_Part]:
     """Return the largest of parts that overlap, in the order of the picture."""
     kept: list[int] = []
     tree = shapely.STRtree([part[0] for part in parts])
@@ -263,7 +263,7 @@ def _thin_lines(ink: Ink, texts: Sequence[Corners]) -> list[shapely.LineString]:
         turned_mask = np.ascontiguousarray(mask.T if is_vertical else mask)
         bounds = [np.concatenate([box.min(axis=0), box.max(axis=0)]) for box in texts]
         spans = [box[[1, 0, 3, 2]] if is_vertical else box for box in bounds]
-        for x0, x1, y, height in _joined(_runs(turned_mask), spans):
+        for x0, x1, y, height in _join_runs(_runs(turned_mask), spans):
             found = [shapely.LineString([(x0, y), (x1, y)])]
             found += [
                 shapely.LineString([(x, y - 2 * _MARK_PX), (x, y + 2 * _MARK_PX)])
@@ -295,7 +295,7 @@ def _runs(mask: UInt8[np.ndarray, "h w"]) -> list[_Run]:
     return [(float(x), float(x + width), y + 0.5 * height, int(height)) for x, y, width, height in longest]
 
 
-def _joined(runs: Sequence[_Run], texts: Sequence[Float[np.ndarray, "4"]]) -> list[_Run]:
+def _join_runs(runs: Sequence[_Run], texts: Sequence[Float[np.ndarray, "4"]]) -> list[_Run]:
     """Return the lines, with the two beside a text (x0, y0, x1, y1) that interrupts them as one."""
     runs = list(runs)
     for x0, y0, x1, y1 in texts:

@@ -14,7 +14,7 @@ from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.picture.ink import find_skew, turned
+from lalaloc_core.importers.picture.ink import find_skew, rotate_picture
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 # Cells are divided until they are this fine (m), because the picture importer expects walls of several pixels.
@@ -50,7 +50,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     gray = cv2.resize(cells, (columns * parts, rows * parts), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
     skew_deg = find_skew(gray > _HALF, _MAX_TURN_DEG)
     if skew_deg:
-        gray = turned(gray, skew_deg, fill=0.0)
+        gray = rotate_picture(gray, skew_deg, fill=0.0)
     # Walls of scanned maps are one cell thick, too thin for a drawing; they are grown here and the rooms below.
     grown = round(0.5 * parts)
     walls = cv2.dilate((gray > _HALF).astype(np.uint8), np.ones((2 * grown + 1, 2 * grown + 1), np.uint8))

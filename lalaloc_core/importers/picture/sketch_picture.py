@@ -18,7 +18,7 @@ from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOp
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import Ink, read_ink
-from lalaloc_core.importers.picture.wall_mask import WallMask, dark_walls, outlined_walls, straightened, wall_polygons
+from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
 from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
@@ -98,7 +98,7 @@ def sketch_picture(
         budget.trace.add("gap", [gap.shape for gap in best.enclosed.gaps])
         budget.trace.add("room", best.enclosed.rooms)
         budget.trace.add("no room", builder.no_room)
-    rooms = [SketchedRoom(straightened(_without_islands(room, builder))) for room in best.enclosed.rooms]
+    rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
     openings = _openings(best, ink, builder)
     if openings:
         builder.unsure.append(

@@ -145,7 +145,7 @@ def wall_polygons(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
         shell = shapely.Polygon(_ring(contours[index], ink), inner)
         # Contours run through pixel centres, so the wall reaches half a pixel farther.
         grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_from_geometry(shell)]
-        found += [straightened(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
+        found += [align_edges(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
     return found
 
 
@@ -153,7 +153,7 @@ def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
     return ink.to_plan(contour.reshape(-1, 2) + 0.5)
 
 
-def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
+def align_edges(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
     """Align nearly axis-parallel edges with the axes; return the same polygon if that changes it too much."""
     rings = [
         _straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1]), tolerance_deg, reach_m)
