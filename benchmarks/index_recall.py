@@ -13,10 +13,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
-from lalaloc_core.learn.synth.homes.splits import home_of
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
+from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig

@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
-from lalaloc_core.learn.synth.homes.splits import VALIDATION
 
 from benchmarks.harness import argument_parser, print_table_head
 from lalaloc_core.bundle import Bundle, default_bundle
@@ -24,6 +23,7 @@ from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
+from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from lalaloc_core.photograph.sphere_levelling import level
 from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
@@ -22,6 +21,7 @@ from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.spheres import level
 
 HEIGHT, WIDTH = 512, 1024
 # Rays per pixel and axis, for smooth edges.

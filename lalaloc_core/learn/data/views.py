@@ -19,10 +19,9 @@ from PIL import Image
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, WithoutDepth
-from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.cameras import Perspective, camera_axes
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph, open_photograph
-from lalaloc_core.photograph.sphere_levelling import camera_axes
 from lalaloc_core.photograph.stated_camera import StatedCamera
 
 # What is stated about photographs: nothing, the field of view, or the tilt as well.
