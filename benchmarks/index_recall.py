@@ -94,9 +94,9 @@ def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, 
         shot = sample_shots(home, 1, rng, "full")[0]
         image = RenderedPhotograph(shot, renderers).image(*size)
         known, unknown = CameraHeight(shot.camera_height_m), CameraHeight(1.5, float("inf"))
-        yield number, "heading known", encoders.query(image, shot.heading, known)
-        yield number, "heading unknown", encoders.query(image, None, known)
-        yield number, "heading and height unknown", encoders.query(image, None, unknown)
+        yield number, "heading known", encoders.spheres.query(image, shot.heading, known)
+        yield number, "heading unknown", encoders.spheres.query(image, None, known)
+        yield number, "heading and height unknown", encoders.spheres.query(image, None, unknown)
 
 
 def recall(bundle: Bundle, plans: int, photographs: int, seed: int = 0) -> dict[str, dict[str, float]]:

@@ -143,7 +143,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
     model = LocalModel(bundle)
     height = stated_height(plan, arguments.camera_height)
     # Models that compare only latents need a pose grid per camera height.
-    grid = model.grid(plan, plan.camera_height_m if model.networks.predicts_profile else height.height_m)
+    grid = model.grid(plan, plan.camera_height_m if model.encoder.predicts_profile else height.height_m)
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
     for path in paths:
         content = b""
@@ -167,7 +167,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         query = model.encoder.query(view, known.heading, height, heading_tolerance=known.tolerance)
         found = model.localise(plan, grid, query)
         confidence_model = bundle.manifest.confidence_for(view=query.is_view)
-        drawn = drawn_answer(plan, grid, found, confidence_model, _SOURCES[known.source], view=view)
+        drawn = drawn_answer(plan, grid, found, confidence_model, _SOURCES[known.source], photograph=view)
         confidence = found.confidence(confidence_model)
         sure = found.posterior.position if confidence is None else confidence.position
         advice = advice_for([view.azimuths], sure)
@@ -236,12 +236,12 @@ def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
     from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
     from lalaloc_core.photograph.photograph import open_photograph, open_picture
 
-    if drawn.view is not None:
+    if drawn.photograph is not None:
         return open_picture(content, max_size=PHOTOGRAPH_SIZE)
     width, height = PHOTOGRAPH_SIZE
     view = open_photograph(content, sphere_size=(height, width), stated=stated)
     assert view.sphere is not None
-    return view.sphere.pixels
+    return view.sphere
 
 
 def _check_height(height_m: float | None, plan: FloorPlan) -> None:

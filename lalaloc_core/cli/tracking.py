@@ -132,13 +132,17 @@ def _followed(
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
     from lalaloc_core.localise.tracking import TrackState
-    from lalaloc_core.localise.tracking.tracked_plans import Ground
+    from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
     from lalaloc_core.localise.tracking.tracking_filter import track_steps
     from lalaloc_core.localise.tracking.trajectories import OdometryErrors
 
     model = LocalModel(Bundle.open(arguments.bundle))
     height = stated_height(plan, arguments.camera_height)
-    ground, errors, mount = Ground.of_plan(plan, model.grid(plan, height.height_m)), OdometryErrors(), arguments.mount
+    ground, errors, mount = (
+        TrackedPlans.of_plan(plan, model.grid(plan, height.height_m)),
+        OdometryErrors(),
+        arguments.mount,
+    )
     state, before_s = None, None
     found: list[_Found] = []
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
@@ -151,7 +155,7 @@ def _followed(
         if trajectory is not None and before_s is not None:
             motion = trajectory.motion(before_s, time_s, errors, math.radians(mount))
         known = known_heading(plan.north, None, 0.0, view.compass_heading)
-        steps = track_steps(ground, model.networks, state, query, motion, known_heading=known)
+        steps = track_steps(ground, model.encoder, state, query, motion, known_heading=known)
         answer = run_steps(steps, model.refiner)
         contradictions = [f"the photographs contradict {name} of the odometry" for name in answer.contradicted]
         for warning in (*view.warnings, *contradictions):

@@ -379,7 +379,7 @@ class TestEvaluating:
         photographs = AnnotatedPhotographs(root).photographs
         for read, photograph in zip(read_photographs(encoders, photographs), photographs, strict=True):
             image = photograph.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
-            profile_m, left_over = encoders.profile(image, 0.0, CAMERA_HEIGHT_M)
+            profile_m, left_over = encoders.spheres.profile(image, 0.0, CAMERA_HEIGHT_M)
             assert left_over == 0.0
             azimuth = column_azimuths(len(profile_m))
             polygon = photograph.outlines[read.measures.outline].polygon_m

@@ -39,8 +39,8 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
         clock, shot = StageClock(), shots[index]
         with clock.stage("encode"):
             heading = shot.heading if known else None
-            query = model.networks.query(images[index], heading, CameraHeight(shot.camera_height_m))
-        localise(home.plan, grid, model.networks, query, refiner=model.refiner, clock=clock)
+            query = model.encoder.spheres.query(images[index], heading, CameraHeight(shot.camera_height_m))
+        localise(home.plan, grid, model.encoder, query, refiner=model.refiner, clock=clock)
         return clock.timings_ms
 
     lines = [f"| stage, median of {queries} queries | known heading | unknown heading |", "|---|---|---|"]

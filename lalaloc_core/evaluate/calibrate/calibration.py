@@ -93,7 +93,7 @@ def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
     if not config.keep_evidence:
         appearance = bundle.manifest.evidence.appearance
         encoders = PhotographEncoder(bundle, threads=1)
-        if encoders.predicts_structure and not views:
+        if encoders.spheres.predicts_structure and not views:
             appearance = queries.appearance(encoders)
         bundle = store_matching_weights(bundle, replace(weights, appearance=appearance), views=views)
         unweighed = [query for known in (True, False) for query in queries.localise("unweighed", known)]

@@ -73,7 +73,7 @@ def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:
     others = list(zip(opened[1:], spot.turns[1:], strict=True))
     queries: dict[str, Query] = {}
     for name, heading in (("known_heading", views[0].heading), ("unknown_heading", None)):
-        queries[f"sphere_{name}"] = encoder.query(pixels, heading, height)
+        queries[f"sphere_{name}"] = encoder.spheres.query(pixels, heading, height)
         queries[f"phone_{name}"] = encoder.query(opened[0], heading, height)
         queries[f"three_phone_{name}"] = encoder.query(opened[0], heading, height, others=others)
     return queries

@@ -93,7 +93,7 @@ class ExplicitLayout:
         """Return the query's wall profile (m) and the heading of the layouts to compare with it."""
         if image is None:
             return question.true_profile(self._columns), 0.0
-        return self._encoders.profile(image, question.camera.heading, question.camera.camera_height_m)
+        return self._encoders.spheres.profile(image, question.camera.heading, question.camera.camera_height_m)
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def _grid(self, question: Question) -> _RenderedPoses:

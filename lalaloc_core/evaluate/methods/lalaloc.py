@@ -161,13 +161,12 @@ class LocalModel:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.encoder = PhotographEncoder(bundle, threads=1)
-        self.networks = self.encoder
         self.refiner = local_refiner(bundle)
 
     def grid(self, plan: FloorPlan, camera_height_m: float) -> PoseGrid:
         """Compute the pose grid of a plan, with latents if the model compares only these."""
-        latents = not self.networks.predicts_profile
-        return build_grid(plan, self.networks, step_m=GRID_STEP_M, camera_height_m=camera_height_m, latents=latents)
+        latents = not self.encoder.predicts_profile
+        return build_grid(plan, self.encoder, step_m=GRID_STEP_M, camera_height_m=camera_height_m, latents=latents)
 
     def open(self, content: bytes, stated: StatedCamera | None = None) -> Photograph:
         """Read a photograph in the sizes that the model needs.
@@ -182,7 +181,7 @@ class LocalModel:
 
     def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
         """Search a plan."""
-        return localise(plan, grid, self.networks, query, refiner=self.refiner)
+        return localise(plan, grid, self.encoder, query, refiner=self.refiner)
 
 
 def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
@@ -205,7 +204,7 @@ def encode(
     """Return the query of a question: the encoded photograph, or the true layout for layout queries."""
     camera = question.camera
     if image is not None:
-        return encoders.query(image, camera.heading if question.heading_known else None, stated.of(question))
+        return encoders.spheres.query(image, camera.heading if question.heading_known else None, stated.of(question))
     rolls = np.array([camera.heading])
     if not question.heading_known:
         sectors = encoders.manifest.ring_sectors or _HEADINGS

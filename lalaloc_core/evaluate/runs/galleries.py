@@ -178,7 +178,7 @@ def foreign_confidences(
         grid = model.grid(plan, CAMERA_HEIGHT_M)
         for photograph, image in zip(photographs, images, strict=True):
             heading = photograph.outlines[0].main_direction if heading_known else None
-            answer = model.localise(plan, grid, model.networks.query(image, heading, height))
+            answer = model.localise(plan, grid, model.encoder.spheres.query(image, heading, height))
             confidence = answer.confidence(bundle.manifest.confidence)
             if confidence is not None:
                 found.append(confidence.position)

@@ -64,7 +64,7 @@ def read_azimuths(
     Raises:
         BundleError: the model predicts no wall profile.
     """
-    query = encoders.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
+    query = encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
     if query.profile is None:
         raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile; use another bundle")
     # Relative to the shares of the classes, as in the matching cost, so that every class counts alike.

@@ -247,7 +247,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     name = _name_of(element, context)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_wall = is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
+    is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):

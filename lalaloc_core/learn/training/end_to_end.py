@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import LayoutObjective, anchors_with_neighbours
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
@@ -21,7 +21,7 @@ from lalaloc_core.learn.training.stages import (
 )
 
 
-class EndToEndStage(TrainingStage):
+class EndToEndStage(TrainingStage[ImageStageConfig]):
     """Both branches at once: layouts as in stage 1, images against the layout latents, which get no image gradient.
 
     Raises:

@@ -13,7 +13,7 @@ from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
@@ -35,7 +35,7 @@ _SEEN_TURNS = (0.15, 0.6)
 _HIDDEN_GREY = 127
 
 
-class ImageStage(TrainingStage):
+class ImageStage(TrainingStage[ImageStageConfig]):
     """Stage 2: train the image encoder to map a panorama to the latent of its bare layout; the teacher is frozen."""
 
     name = "image"

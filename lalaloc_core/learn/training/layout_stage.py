@@ -20,7 +20,7 @@ from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecod
 from lalaloc_core.render.profile import back_project, layout_depth
 
 
-class LayoutStage(TrainingStage):
+class LayoutStage(TrainingStage[LayoutStageConfig]):
     """Stage 1: the layout encoder learns latents whose distances measure structural differences."""
 
     name = "layout"

@@ -31,6 +31,7 @@ from lalaloc_core.learn.training.warm_start import (
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
+from lalaloc_core.nets.view_network import ViewNetwork
 
 StageName = Literal["layout", "image", "view", "end-to-end"]
 STAGES: tuple[StageName, ...] = get_args(StageName)
@@ -76,11 +77,10 @@ def train_stage(
     torch.manual_seed(config.seed + _SEED_OF_STAGE[name])
     layout_encoder = _load_teacher(config, folder, teacher, layout_from or init_from) if name == "image" else None
     stage = _build_stage(name, config, data, layout_encoder)
-    is_pretrained = isinstance(stage, ViewStage) or (
-        isinstance(stage, ImageStage) and isinstance(stage.encoder, TrunkImageEncoder)
-    )
-    if is_pretrained and config.image.pretrained and init_from is None and not resume:
-        load_pretrained(stage.encoder.trunk)
+    encoder = stage.encoder if isinstance(stage, ImageStage | ViewStage) else None
+    begins_anew = config.image.pretrained and init_from is None and not resume
+    if begins_anew and isinstance(encoder, TrunkImageEncoder | ViewNetwork):
+        load_pretrained(encoder.trunk)
     begun_from = None if init_from is None else _warm_start(stage, init_from)
     validate = _validation(name, config, folder, data, layout_encoder, device)
     return run_stage(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,8 +27,10 @@ from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import StyleMixing, Trunk
 
+StageConfigT = TypeVar("StageConfigT", LayoutStageConfig, ImageStageConfig)
 
-class TrainingStage(ABC):
+
+class TrainingStage(ABC, Generic[StageConfigT]):
     """Networks, data and losses of one stage, run by the training loop.
 
     Attributes:
@@ -41,7 +43,7 @@ class TrainingStage(ABC):
 
     name: ClassVar[str]
     config: TrainConfig
-    settings: LayoutStageConfig | ImageStageConfig
+    settings: StageConfigT
     source: Source
     modules: dict[str, nn.Module]
     teacher: nn.Module | None = None

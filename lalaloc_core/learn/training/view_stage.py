@@ -16,7 +16,7 @@ from lalaloc_core.learn.synth.rendering.panorama import Window
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
 from lalaloc_core.learn.training.unlabelled_photographs import Photographs
@@ -32,7 +32,7 @@ def view_window(config: TrainConfig) -> Window:
     return Window(config.view.width_rad(config.ring), float(np.radians(config.view.top_deg)))
 
 
-class ViewStage(TrainingStage):
+class ViewStage(TrainingStage[ImageStageConfig]):
     """Train the encoder of views on renderings and on parts of photographs, each seen through a random camera."""
 
     name = "view"
