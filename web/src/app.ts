@@ -38,15 +38,24 @@ class Page {
   private readonly svg = byId("plan") as unknown as SVGSVGElement;
   private readonly base = s("g");
   private readonly heat = s("g");
-  private readonly localisability = new LocalisabilityLayer(async () => this.plan ?? this.storeExample(new AbortController().signal));
+  private readonly localisability = new LocalisabilityLayer(
+    async () => this.plan ?? this.storeExample(new AbortController().signal),
+  );
   private readonly names = s("g");
   private readonly overlay = s("g");
   private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
-  private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), showPlan: (planId) => void this.plans.choose(planId) });
+  private readonly venues = new Venues({
+    chosen: (venue) => this.onVenue(venue),
+    showPlan: (planId) => void this.plans.choose(planId),
+  });
   private readonly plans = new Plans({
-    chosen: (plan) => this.onPlan(plan), started: () => this.onStarted(), picked: () => this.venues.leave(),
-    listed: (plans) => this.venues.offer(plans), imported: (venue) => void this.venues.take(venue), searched: (name) => void this.venues.load(name),
+    chosen: (plan) => this.onPlan(plan),
+    started: () => this.onStarted(),
+    picked: () => this.venues.leave(),
+    listed: (plans) => this.venues.offer(plans),
+    imported: (venue) => void this.venues.take(venue),
+    searched: (name) => void this.venues.load(name),
     example: (plan, photos) => this.onExamplePicked(plan, photos),
   });
   private readonly photos = new Photos((photo, isOther) => this.onPhoto(photo, isOther));
@@ -58,8 +67,12 @@ class Page {
     ended: (stored) => this.onEdited(stored),
   });
   private readonly session = new LiveSession({
-    place: async () => this.venues.current ?? this.plan ?? this.storeExample(), showPlan: (planId) => void this.plans.choose(planId),
-    opened: () => { this.onStarted(); this.photos.choose(null); },
+    place: async () => this.venues.current ?? this.plan ?? this.storeExample(),
+    showPlan: (planId) => void this.plans.choose(planId),
+    opened: () => {
+      this.onStarted();
+      this.photos.choose(null);
+    },
   });
   private readonly viewport = new Viewport(this.svg, this.svg.parentElement!, () => this.onViewChanged());
   private readonly find = byId<HTMLButtonElement>("find");
@@ -80,7 +93,17 @@ class Page {
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.localisability.element, this.names, this.hints.element, this.overlay, this.session.layer, ...this.editor.layers);
+    this.svg.append(
+      this.editor.underlay.element,
+      this.base,
+      this.heat,
+      this.localisability.element,
+      this.names,
+      this.hints.element,
+      this.overlay,
+      this.session.layer,
+      ...this.editor.layers,
+    );
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.localise());
@@ -139,7 +162,9 @@ class Page {
 
   private onExample(example: PlanDocument): void {
     this.document = example;
-    this.hints.setRooms(example.rooms.map(({ name }, index) => ({ id: name ?? "", name: name ?? `room ${index + 1}` })));
+    this.hints.setRooms(
+      example.rooms.map(({ name }, index) => ({ id: name ?? "", name: name ?? `room ${index + 1}` })),
+    );
     byId("plan-name").textContent = example.name ?? "";
     byId("plan-facts").textContent = "example, stored with the first query";
     this.drawBase();
@@ -171,11 +196,14 @@ class Page {
     this.plan = plan;
     this.document = plan?.plan ?? null;
     byId("plan-name").textContent = plan?.name ?? "No plan chosen";
-    byId("plan-facts").textContent = plan === null ? "" :
-      `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
+    byId("plan-facts").textContent =
+      plan === null
+        ? ""
+        : `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
     byId("preparing").hidden = plan?.status !== "preparing";
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
-    if (plan?.status === "failed") showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
+    if (plan?.status === "failed")
+      showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
     showWarnings(plan);
     this.localisability.setPlan(plan);
     if (isSame) return;
@@ -206,7 +234,8 @@ class Page {
   }
 
   private drawBase(): void {
-    const drawn: PlanDocument = this.document ?? { rooms: [] }, lost = lostAreas(this.plan);
+    const drawn: PlanDocument = this.document ?? { rooms: [] },
+      lost = lostAreas(this.plan);
     this.box = boxOf(drawn, lost);
     this.viewport.fit(this.box);
     this.drawRooms(drawn, lost);
@@ -256,9 +285,17 @@ class Page {
     if (isOther) this.hints.show(photo?.hints ?? null);
     if (isOther) {
       // A link shows an answer without its photograph; a photograph added to it is assumed to be the one.
-      if (photo !== null && photo.answer === null && this.answer !== null && this.answeredPhoto === null) photo.answer = this.answer;
-      void this.panorama.setPicture(photo?.file ?? null).then(() => { this.panorama.setView(this.photos.current?.answer?.view ?? null); this.drawAnswer(); })
-        .catch((error: unknown) => { if (this.photos.current === photo) showError(byId("photo-error"), error); });
+      if (photo !== null && photo.answer === null && this.answer !== null && this.answeredPhoto === null)
+        photo.answer = this.answer;
+      void this.panorama
+        .setPicture(photo?.file ?? null)
+        .then(() => {
+          this.panorama.setView(this.photos.current?.answer?.view ?? null);
+          this.drawAnswer();
+        })
+        .catch((error: unknown) => {
+          if (this.photos.current === photo) showError(byId("photo-error"), error);
+        });
     }
     this.offerHints();
     this.setAnswer(photo?.answer ?? null, photo);
@@ -278,8 +315,11 @@ class Page {
     this.answeredPhoto = photo;
     this.selected = 0;
     this.moved = null;
-    this.panorama.setView(photo === null ? null : answer?.view ?? null);
-    showAnswer(answer, photo, { select: (index) => this.select(index), save: (answered) => savePicture(answered, this.fields) });
+    this.panorama.setView(photo === null ? null : (answer?.view ?? null));
+    showAnswer(answer, photo, {
+      select: (index) => this.select(index),
+      save: (answered) => savePicture(answered, this.fields),
+    });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
     this.drawAnswer();
     if (answer === null) return;
@@ -304,8 +344,13 @@ class Page {
       byId("fit-state").textContent = answer === null ? "" : "The selected place lies in another plan of the venue.";
       return;
     }
-    show(this.overlay, isHere && ellipse(answer), companions(this.photos.list, this.answeredPhoto, plan.id, this.box, (photo) => this.photos.choose(photo)),
-      otherPlaces(answer, plan.id, this.box, (index) => this.select(index)), this.marker.element);
+    show(
+      this.overlay,
+      isHere && ellipse(answer),
+      companions(this.photos.list, this.answeredPhoto, plan.id, this.box, (photo) => this.photos.choose(photo)),
+      otherPlaces(answer, plan.id, this.box, (index) => this.select(index)),
+      this.marker.element,
+    );
     if (hasFocus) this.marker.element.focus({ preventScroll: true });
     if (this.moved === null) this.select(this.selected);
     else this.drawLines(this.moved);
@@ -342,8 +387,12 @@ class Page {
     const height = this.answer?.camera_height_m ?? this.plan?.plan.camera_height_m ?? DEFAULT_CAMERA_HEIGHT_M;
     this.panorama.setLines(room === null ? [] : layoutLines(pose.x_m, pose.y_m, room, height), pose.heading_deg);
     const place = `x ${pose.x_m.toFixed(2)} m, y ${pose.y_m.toFixed(2)} m, heading ${pose.heading_deg.toFixed(0)}°`;
-    state.textContent = room === null ? "The marker is in a wall or outside the plan: no layout." :
-      this.answeredPhoto === null ? "Add the photograph to see the layout over it." : `Layout as seen from ${room.name}, ${place}.`;
+    state.textContent =
+      room === null
+        ? "The marker is in a wall or outside the plan: no layout."
+        : this.answeredPhoto === null
+          ? "Add the photograph to see the layout over it."
+          : `Layout as seen from ${room.name}, ${place}.`;
   }
 
   private async localise(): Promise<void> {

@@ -38,14 +38,19 @@ export class HintForm {
   private isMarking = false;
 
   /** `changed` is called when the user changes the hints. */
-  constructor(private readonly svg: SVGSVGElement, private readonly changed: (hints: Hints) => void) {
+  constructor(
+    private readonly svg: SVGSVGElement,
+    private readonly changed: (hints: Hints) => void,
+  ) {
     this.mark.addEventListener("click", () => this.setMarking(!this.isMarking));
     byId("hint-unmark").addEventListener("click", () => this.change({ near: null }));
     this.radius.addEventListener("input", () => this.change({ radius: this.radius.valueAsNumber }));
     this.strict.addEventListener("change", () => this.change({ strict: this.strict.checked }));
     // Capture runs before the viewport's listener, which would move the drawing.
     svg.addEventListener("pointerdown", (event) => this.onDown(event), { capture: true });
-    addEventListener("keydown", (event) => { if (event.key === "Escape" && this.isMarking) this.setMarking(false); });
+    addEventListener("keydown", (event) => {
+      if (event.key === "Escape" && this.isMarking) this.setMarking(false);
+    });
   }
 
   get fields(): Record<string, HTMLElement> {
@@ -54,11 +59,14 @@ export class HintForm {
 
   /** Offer the rooms of a plan. */
   setRooms(rooms: { id: string; name: string }[]): void {
-    show(this.rooms, ...rooms.map(({ id, name }) => {
-      const box = h("input", { type: "checkbox", value: id });
-      box.addEventListener("change", () => this.change({ rooms: this.ticked() }));
-      return h("label", { class: "inline" }, box, name);
-    }));
+    show(
+      this.rooms,
+      ...rooms.map(({ id, name }) => {
+        const box = h("input", { type: "checkbox", value: id });
+        box.addEventListener("change", () => this.change({ rooms: this.ticked() }));
+        return h("label", { class: "inline" }, box, name);
+      }),
+    );
     byId("hint-rooms-box").hidden = rooms.length === 0;
     this.show(this.hints);
   }
@@ -66,7 +74,8 @@ export class HintForm {
   /** Show the hints of a photograph; null if there is none. */
   show(hints: Hints | null): void {
     this.hints = hints ?? NO_HINTS;
-    if (document.activeElement !== this.radius) this.radius.value = Number.isNaN(this.hints.radius) ? "" : String(this.hints.radius);
+    if (document.activeElement !== this.radius)
+      this.radius.value = Number.isNaN(this.hints.radius) ? "" : String(this.hints.radius);
     this.strict.checked = this.hints.strict;
     for (const box of this.rooms.querySelectorAll("input")) box.checked = this.hints.rooms.includes(box.value);
     byId("hint-unmark").hidden = this.hints.near === null;
@@ -74,7 +83,9 @@ export class HintForm {
     byId("hints-summary").textContent = [
       near === null ? "" : `within ${Number.isNaN(radius) ? "?" : radius} m of the mark`,
       rooms.length === 0 ? "" : `in ${rooms.length === 1 ? "one room" : `${rooms.length} rooms`}`,
-    ].filter(Boolean).join(", ");
+    ]
+      .filter(Boolean)
+      .join(", ");
     this.draw(this.box);
   }
 
@@ -83,15 +94,23 @@ export class HintForm {
     this.box = box;
     const { near, radius } = this.hints;
     const isFocused = this.element.contains(document.activeElement);
-    show(this.element, near !== null && s("circle", { class: "reach", cx: near[0], cy: -near[1], r: Math.max(radius || 0, 0) }),
-      near !== null && this.grip(near));
+    show(
+      this.element,
+      near !== null && s("circle", { class: "reach", cx: near[0], cy: -near[1], r: Math.max(radius || 0, 0) }),
+      near !== null && this.grip(near),
+    );
     if (isFocused) this.element.querySelector<SVGElement>(".grip")?.focus();
   }
 
   private grip([x, y]: Point): SVGElement {
     const size = unitOf(this.box);
     return s("circle", {
-      class: "grip", cx: x, cy: -y, r: 1.2 * size, tabindex: 0, role: "button",
+      class: "grip",
+      cx: x,
+      cy: -y,
+      r: 1.2 * size,
+      tabindex: 0,
+      role: "button",
       "aria-label": `Mark at x ${x.toFixed(1)} m, y ${y.toFixed(1)} m; arrow keys move it, Delete removes it`,
       onpointerdown: (event) => this.onDrag(event as PointerEvent),
       onkeydown: (event) => this.onKey(event as KeyboardEvent),
@@ -137,7 +156,8 @@ export class HintForm {
   }
 
   private onKey(event: KeyboardEvent): void {
-    const { near } = this.hints, arrow = ARROWS[event.key];
+    const { near } = this.hints,
+      arrow = ARROWS[event.key];
     if (near === null) return;
     if (event.key === "Delete") this.change({ near: null });
     else if (arrow !== undefined) {

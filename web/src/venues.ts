@@ -68,12 +68,18 @@ export class Venues {
       const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
       this.venue = venue;
       byId("venue-name").textContent = venue.name;
-      byId("venue-facts").textContent = `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}`
-        + (more === null ? "" : `; the list shows the first ${plans.length}`);
+      byId("venue-facts").textContent =
+        `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}` +
+        (more === null ? "" : `; the list shows the first ${plans.length}`);
       // Plans of a file are named after it and their level; the list would show no more than the file.
-      const prefix = `${venue.name} – `, all = plans.every(({ name }) => name.startsWith(prefix));
-      show(this.choice, ...plans.map((plan) => h("option", { value: plan.floorplan_id },
-        all ? plan.name.slice(prefix.length) : planLabel(plan))));
+      const prefix = `${venue.name} – `,
+        all = plans.every(({ name }) => name.startsWith(prefix));
+      show(
+        this.choice,
+        ...plans.map((plan) =>
+          h("option", { value: plan.floorplan_id }, all ? plan.name.slice(prefix.length) : planLabel(plan)),
+        ),
+      );
       this.bar.hidden = false;
       this.draw();
       this.actions.chosen(venue);
@@ -99,9 +105,26 @@ export class Venues {
   }
 
   private draw(): void {
-    show(this.list, ...this.found.map((venue) => h("li", {}, h("button", {
-      type: "button", class: "plan", "aria-pressed": String(venue.id === this.venue?.id), onclick: () => this.pick(venue.id),
-    }, h("span", { class: "name" }, venue.name), h("span", { class: "facts" }, `venue, ${venue.plans} plans`)))));
+    show(
+      this.list,
+      ...this.found.map((venue) =>
+        h(
+          "li",
+          {},
+          h(
+            "button",
+            {
+              type: "button",
+              class: "plan",
+              "aria-pressed": String(venue.id === this.venue?.id),
+              onclick: () => this.pick(venue.id),
+            },
+            h("span", { class: "name" }, venue.name),
+            h("span", { class: "facts" }, `venue, ${venue.plans} plans`),
+          ),
+        ),
+      ),
+    );
     byId("venues").hidden = this.found.length === 0;
   }
 }
