@@ -7,7 +7,7 @@ import { PictureScale } from "./picture_scale";
 const UNITS = ["m", "cm", "mm", "in", "ft"];
 // Fields of the upload: name, label, placeholder.
 const FIELDS: [string, string, string][] = [
-  ["level", "Storey", "name or number"],
+  ["level", "Level", "name or number"],
   ["scale", "Scale on paper", "1:100"],
   ["metres_per_pixel", "Metres per pixel", "0.01"],
   ["page", "Page of a PDF", "1"],

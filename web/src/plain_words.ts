@@ -13,7 +13,7 @@ const LABELS: Record<string, string> = {
   radius_m: "Radius",
   rooms: "Rooms",
   strict: "Search only within the hints",
-  level: "Storey",
+  level: "Level",
   units: "Unit",
   scale: "Scale on paper",
   metres_per_pixel: "Metres per pixel",
