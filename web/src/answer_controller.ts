@@ -13,14 +13,14 @@ import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
 import type { PlanScene } from "./plan_scene";
-import { askSingle, askTogether } from "./query";
-import type { Answer, Layout, Plan, Pose, Venue } from "./types";
+import { askSingle, askTogether, type Place } from "./query";
+import type { Answer, ChosenVenue, Layout, Plan, Pose } from "./types";
 
 const DEFAULT_CAMERA_HEIGHT_M = 1.5;
 
 export interface ControllerActions {
   /** Return the plan or venue to search; an example is stored first. */
-  place: (signal: AbortSignal) => Promise<Plan | Venue>;
+  place: (signal: AbortSignal) => Promise<Place>;
   /** Show a plan, by default its current revision. */
   showPlan: (id: string, revision?: string) => Promise<unknown>;
 }
@@ -32,7 +32,7 @@ export class AnswerController {
   private readonly find = byId<HTMLButtonElement>("find");
   private readonly error = byId("photo-error");
   private layout: Layout | null = null;
-  private venue: Venue | null = null;
+  private venue: ChosenVenue | null = null;
   private answer: Answer | null = null;
   private answeredPhoto: Photo | null = null;
   /** Index of the selected candidate. */
@@ -63,19 +63,17 @@ export class AnswerController {
   }
 
   /** Search the plans of a venue; null: a single plan. */
-  setVenue(venue: Venue | null): void {
+  setVenue(venue: ChosenVenue | null): void {
     this.venue = venue;
-    this.photos.offerGroups(venue === null);
-    this.offerHints();
     this.forget(true);
+    this.offerHints();
   }
 
   /** Show photographs and answer with another plan, which the scene has drawn. */
   setPlan(plan: Plan | null): void {
     this.layout = null;
     this.photos.compass.setNorth(plan?.plan.north_deg ?? null);
-    this.hints.setRooms(plan?.rooms ?? []);
-    this.hints.show(this.photos.current?.hints ?? null);
+    this.offerHints();
     this.draw();
     if (plan !== null) void this.loadLayout(plan);
   }
@@ -118,13 +116,14 @@ export class AnswerController {
           if (this.photos.current === photo) showError(this.error, error);
         });
     }
-    this.offerHints();
+    // Sequences are searched without hints.
+    byId("hints").hidden = this.photos.group !== null;
     this.show(photo?.answer ?? null, photo);
   }
 
-  /** Sequences and venues are searched without hints. */
-  private offerHints(): void {
-    byId("hints").hidden = this.venue !== null || this.photos.group !== null;
+  /** Offer hints about the plan that the scene shows, or about the venue. */
+  offerHints(): void {
+    this.hints.offer(this.scene.plan, this.scene.document, this.venue);
   }
 
   private get fields(): Record<string, HTMLElement> {
@@ -221,11 +220,11 @@ export class AnswerController {
       const place = await this.actions.place(signal);
       if (signal.aborted) return;
       if (group === null) await askSingle(place, photo, signal);
-      else await askTogether(place as Plan, group, signal);
+      else await askTogether(place, group, signal);
       // The user may have chosen another plan in the meantime.
       if (signal.aborted || photo.answer === null) return;
       const { floorplan_id, floorplan_revision } = photo.answer;
-      if (floorplan_revision !== this.scene.plan?.revision)
+      if (floorplan_revision !== undefined && floorplan_revision !== this.scene.plan?.revision)
         await this.actions.showPlan(floorplan_id, floorplan_revision);
       if (signal.aborted) return;
       const { current } = this.photos;

@@ -12,11 +12,13 @@ import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
 import { LiveSession } from "./session";
-import type { Plan, PlanDocument, Venue } from "./types";
+import type { Place } from "./query";
+import type { ChosenVenue, Plan, PlanDocument } from "./types";
 import { Venues } from "./venues";
 
 // For tests.
 export { layoutLines, layoutView } from "./layout";
+export { toEarth, toPlan } from "./earth";
 export { placesOf, remainder } from "./places";
 
 class Page {
@@ -116,9 +118,7 @@ class Page {
   private onExample(example: PlanDocument): void {
     this.scene.setPlan(null, example);
     showCaption(null, example);
-    this.answers.hints.setRooms(
-      example.rooms.map(({ name }, index) => ({ id: name ?? "", name: name ?? `room ${index + 1}` })),
-    );
+    this.answers.offerHints();
     this.draw();
   }
 
@@ -130,7 +130,7 @@ class Page {
     else photos.choose(shown);
   }
 
-  private onVenue(venue: Venue | null): void {
+  private onVenue(venue: ChosenVenue | null): void {
     if (venue === null) this.answers.cancelQuery();
     else this.onStarted();
     this.answers.setVenue(venue);
@@ -177,7 +177,7 @@ class Page {
   }
 
   /** Return the venue or plan to search. */
-  private async place(signal?: AbortSignal): Promise<Venue | Plan> {
+  private async place(signal?: AbortSignal): Promise<Place> {
     return this.venues.current ?? this.scene.plan ?? this.storeExample(signal);
   }
 

@@ -52,7 +52,6 @@ export class Photos {
   private readonly choice = byId<HTMLFieldSetElement>("together");
   private readonly all: Photo[] = [];
   private chosen: Photo | null = null;
-  private offersGroups = true;
 
   /** `changed` is called when another photograph is chosen or its settings change. */
   constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
@@ -89,12 +88,6 @@ export class Photos {
       ? ""
       : (this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "");
     return motion === "turn" || motion === "walk" ? { motion, photos: this.all } : null;
-  }
-
-  /** Offer queries with several photographs, which venues do not have. */
-  offerGroups(offered: boolean): void {
-    this.offersGroups = offered;
-    this.drawStrip();
   }
 
   /** Add pictures and choose the first of them. */
@@ -213,7 +206,7 @@ export class Photos {
   }
 
   drawStrip(): void {
-    this.choice.hidden = this.all.length < 2 || !this.offersGroups;
+    this.choice.hidden = this.all.length < 2;
     const group = this.group;
     byId("find-all").hidden = this.all.length < 2 || group !== null;
     byId("find").textContent = group?.motion === "walk" ? "Find the places" : "Find the place";

@@ -36,15 +36,13 @@ export function curlSnippet({ fields: all, files, onDevice }: Asked): string {
 /** Return the query as Python code. */
 export function pythonSnippet({ fields, files, onDevice }: Asked): string {
   const { floorplan_id: plan, venue_id: venue, ...rest } = fields;
-  const options = Object.entries(rest)
+  const isGroup = fields.motion !== undefined;
+  const options = Object.entries(isGroup && venue !== undefined ? { venue_id: venue, ...rest } : rest)
     .filter(([name]) => name !== "include")
     .map(([name, value]) => `, ${name}=${literal(name, value)}`);
   if (onDevice) options.push(", on_device=True");
-  const isGroup = fields.motion !== undefined;
-  const ask =
-    venue !== undefined
-      ? `localise_in_venue(${python(venue)}`
-      : `localise${isGroup ? "_sequence" : ""}(${python(plan ?? "")}`;
+  const method = isGroup ? "localise_sequence" : venue === undefined ? "localise" : "localise_in_venue";
+  const place = plan ?? (isGroup ? undefined : venue);
   const photos = isGroup ? `[${files.map(python).join(", ")}]` : python(files[0] ?? "");
   const secret = key.get() === null ? "" : `, api_key=os.environ["LALALOC_KEY"]`;
   return [
@@ -52,7 +50,7 @@ export function pythonSnippet({ fields, files, onDevice }: Asked): string {
     "from lalaloc_client import Client",
     "",
     `with Client(${python(location.origin)}${secret}) as service:`,
-    `    answer = service.${ask}, ${photos}${options.join("")})`,
+    `    answer = service.${method}(${place === undefined ? "None" : python(place)}, ${photos}${options.join("")})`,
     isGroup
       ? "print(answer.confidence, [(pose.room, pose.position) for pose in answer.poses])"
       : "print(answer.room, answer.position, answer.confidence)",
