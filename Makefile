@@ -40,9 +40,12 @@ ray: $(STAMP) ## run the tests of Ray, and the API's tests on Ray (about 20 minu
 	$(BIN)/python -m pytest -m "slow or not slow" tests/service/test_on_ray.py
 	for file in $(ON_RAY); do TEST_DATABASE=ray $(BIN)/python -m pytest tests/service/test_$$file.py || exit 1; done
 
-lint: $(STAMP) ## run ruff and pyright
+PRETTIER := web/node_modules/.bin/prettier
+lint: $(STAMP) ## run ruff, pyright and, after `npm ci` in web/, prettier
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	@if [ -x $(PRETTIER) ]; then npm --prefix web run --silent format:check; \
+		else echo 'lint: prettier is not installed, so TypeScript is not checked: run `npm ci` in web/' >&2; fi
 	$(BIN)/pyright
 
 openapi: $(STAMP) ## write openapi.yaml from the application

@@ -10,7 +10,15 @@ import { build } from "esbuild";
 const here = dirname(fileURLToPath(import.meta.url));
 const root = dirname(here);
 const out = join(root, "service", "web");
-const examples = ["flat.json", "living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg", "real/rooms.json", "real/lythwood_room.jpg"];
+const examples = [
+  "flat.json",
+  "living_room.jpg",
+  "kitchen.jpg",
+  "bedroom.jpg",
+  "study.jpg",
+  "real/rooms.json",
+  "real/lythwood_room.jpg",
+];
 
 function files(folder) {
   return readdirSync(folder, { recursive: true, withFileTypes: true })
@@ -24,8 +32,13 @@ function digest(path) {
 
 // Sorted by name, so that renaming a file changes the digest; with slashes on every system.
 const client = join(root, "clients", "typescript", "src");
-const sources = [...files(join(here, "src")), ...files(client), ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map(
-  (name) => join(here, name))].map((path) => relative(root, path).split(sep).join("/")).sort();
+const sources = [
+  ...files(join(here, "src")),
+  ...files(client),
+  ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map((name) => join(here, name)),
+]
+  .map((path) => relative(root, path).split(sep).join("/"))
+  .sort();
 const sum = createHash("sha256");
 for (const name of sources) sum.update(`${name}\n${digest(join(root, name))}\n`);
 
@@ -34,7 +47,10 @@ mkdirSync(out, { recursive: true });
 await build({
   absWorkingDir: here,
   entryPoints: [
-    ...["app.ts", "sphere.ts", "docs.ts", "style.css", "docs.css"].map((name) => ({ in: `src/${name}`, out: name.replace(/\..*/, "") })),
+    ...["app.ts", "sphere.ts", "docs.ts", "style.css", "docs.css"].map((name) => ({
+      in: `src/${name}`,
+      out: name.replace(/\..*/, ""),
+    })),
     { in: join(client, "index.ts"), out: "client" },
     { in: "src/device/worker.ts", out: "on_device" },
   ],

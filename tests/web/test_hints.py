@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, expect
 
+from lalaloc_core.floorplan.earth import Anchor
 from tests.service.conftest import StartApp
 from tests.web.conftest import Visit, visit
 from tests.web.test_answer import _assert_accessible, _copied
@@ -52,6 +54,26 @@ def test_hints_are_set_and_sent(desktop: Visit) -> None:
     page.get_by_role("button", name="Remove the mark").click()
     expect(mark).to_have_count(0)
     desktop.find()
+
+
+def test_mark_on_earth_agrees_with_the_service(desktop: Visit) -> None:
+    page = desktop.open()
+    for anchor, distance_m, error_m in (
+        (Anchor(51.75, -1.25, north_deg=30.0), 300.0, 0.001),
+        (Anchor(-33.9, 151.2, north_deg=0.0), 1000.0, 0.01),
+        (Anchor(64.1, -21.9, north_deg=200.0), 10_000.0, 0.2),
+    ):
+        points = distance_m * np.array([[0.6, -0.8], [-1.0, 0.0], [0.0, 1.0]])
+        given = {"latitude": anchor.latitude, "longitude": anchor.longitude, "north_deg": anchor.north_deg}
+        earth, plan = page.evaluate(
+            """async ([anchor, points]) => { const { toEarth, toPlan } = await import('/web/app.js');
+            const earth = points.map((point) => toEarth(anchor, point));
+            return [earth.map(({ latitude, longitude }) => [longitude, latitude]),
+                earth.map((place) => toPlan(anchor, place))]; }""",
+            [given, points.tolist()],
+        )
+        np.testing.assert_allclose(anchor.to_plan(np.array(earth)), points, atol=error_m)
+        np.testing.assert_allclose(plan, points, atol=error_m)
 
 
 @pytest.mark.slow

@@ -8,51 +8,96 @@ import { type Box, unitOf } from "./plan_drawing";
 import type { Answer } from "./types";
 
 // 95 % of a normal distribution in two dimensions, and in one, lie within this many standard deviations.
-const WITHIN_95 = Math.sqrt(5.991), NORMAL_95 = 1.96;
+const WITHIN_95 = Math.sqrt(5.991),
+  NORMAL_95 = 1.96;
 
 /** Return half the width of the 95 % interval of a value. */
 export const normal95 = (deviation: number): number => NORMAL_95 * deviation;
 
 /** Return the radii (m) of the ellipse that contains a position with a probability of 95 %, the longer one first. */
 export function within95([[xx, xy], [, yy]]: NonNullable<Answer["covariance_m2"]>): [number, number] {
-  const mean = 0.5 * (xx + yy), spread = Math.hypot(0.5 * (xx - yy), xy);
+  const mean = 0.5 * (xx + yy),
+    spread = Math.hypot(0.5 * (xx - yy), xy);
   return [WITHIN_95 * Math.sqrt(mean + spread), WITHIN_95 * Math.sqrt(Math.max(mean - spread, 0))];
 }
 
 /** Draw the ellipse that contains the camera with a probability of 95 %. */
 export function ellipse(answer: Pick<Answer, "covariance_m2" | "position">): SVGElement | null {
   if (answer.covariance_m2 === null) return null;
-  const [[xx, xy], [, yy]] = answer.covariance_m2, [major, minor] = within95(answer.covariance_m2);
+  const [[xx, xy], [, yy]] = answer.covariance_m2,
+    [major, minor] = within95(answer.covariance_m2);
   // Direction of the longer axis, counterclockwise from +x; negative because y points down in SVG.
   const turn = -0.5 * degrees(Math.atan2(2 * xy, xx - yy));
   const { x_m, y_m } = answer.position;
-  return s("ellipse", { class: "covariance", rx: major, ry: minor, transform: `translate(${x_m} ${-y_m}) rotate(${turn})` });
+  return s("ellipse", {
+    class: "covariance",
+    rx: major,
+    ry: minor,
+    transform: `translate(${x_m} ${-y_m}) rotate(${turn})`,
+  });
 }
 
 /** Draw the other places of a plan with their ranks; a click calls `select` with the index of the candidate. */
 export function otherPlaces(answer: Answer, planId: string, box: Box, select: (index: number) => void): SVGGElement {
   const unit = unitOf(box);
-  return s("g", { class: "rivals" }, ...placesOf(answer).map(({ index, candidate }, rank) => {
-    if (rank === 0 || candidate.floorplan_id !== planId) return null;
-    const { x_m, y_m } = candidate.position;
-    return s("g", { class: "rival", transform: `translate(${x_m} ${-y_m})`, onclick: () => select(index) },
-      s("circle", { r: 1.5 * unit }), s("text", { "font-size": 1.9 * unit, y: 0.68 * unit }, rank + 1));
-  }));
+  return s(
+    "g",
+    { class: "rivals" },
+    ...placesOf(answer).map(({ index, candidate }, rank) => {
+      if (rank === 0 || candidate.floorplan_id !== planId) return null;
+      const { x_m, y_m } = candidate.position;
+      return s(
+        "g",
+        { class: "rival", transform: `translate(${x_m} ${-y_m})`, onclick: () => select(index) },
+        s("circle", { r: 1.5 * unit }),
+        s("text", { "font-size": 1.9 * unit, y: 0.68 * unit }, rank + 1),
+      );
+    }),
+  );
 }
 
 /** Draw the places of the other photographs in a plan, and the path of a walk; a click calls `choose`. */
-export function companions(photos: readonly Photo[], current: Photo | null, planId: string, box: Box, choose: (photo: Photo) => void): SVGGElement {
+export function companions(
+  photos: readonly Photo[],
+  current: Photo | null,
+  planId: string,
+  box: Box,
+  choose: (photo: Photo) => void,
+): SVGGElement {
   const unit = unitOf(box);
   const asked = photos.flatMap((photo, index) =>
-    photo.answer === null || photo.answer.floorplan_id !== planId ? [] : [{ photo, answer: photo.answer, number: index + 1 }]);
-  const track = asked.map(({ answer: { position } }, index) => `${index === 0 ? "M" : "L"}${position.x_m} ${-position.y_m}`).join("");
-  return s("g", { class: "companions" }, current?.answer?.together?.motion === "walk" && s("path", { class: "track", d: track }),
-    ...asked.filter(({ photo }) => photo !== current).map(({ photo, answer, number }) => {
-      const { x_m, y_m } = answer.position, turn = answer.heading_deg;
-      return s("g", { class: "companion", transform: `translate(${x_m} ${-y_m})`, onclick: () => choose(photo) },
-        s("title", {}, `Photograph ${number}: ${photo.file.name}`),
-        s("path", { class: "gaze", d: `M0 0V${-5 * unit}`, transform: `rotate(${turn})` }),
-        s("circle", { r: 0.9 * unit }),
-        s("text", { "font-size": 1.9 * unit, transform: `rotate(${turn}) translate(0 ${-6.6 * unit}) rotate(${-turn})`, y: 0.68 * unit }, `photo ${number}`));
-    }));
+    photo.answer === null || photo.answer.floorplan_id !== planId
+      ? []
+      : [{ photo, answer: photo.answer, number: index + 1 }],
+  );
+  const track = asked
+    .map(({ answer: { position } }, index) => `${index === 0 ? "M" : "L"}${position.x_m} ${-position.y_m}`)
+    .join("");
+  return s(
+    "g",
+    { class: "companions" },
+    current?.answer?.together?.motion === "walk" && s("path", { class: "track", d: track }),
+    ...asked
+      .filter(({ photo }) => photo !== current)
+      .map(({ photo, answer, number }) => {
+        const { x_m, y_m } = answer.position,
+          turn = answer.heading_deg;
+        return s(
+          "g",
+          { class: "companion", transform: `translate(${x_m} ${-y_m})`, onclick: () => choose(photo) },
+          s("title", {}, `Photograph ${number}: ${photo.file.name}`),
+          s("path", { class: "gaze", d: `M0 0V${-5 * unit}`, transform: `rotate(${turn})` }),
+          s("circle", { r: 0.9 * unit }),
+          s(
+            "text",
+            {
+              "font-size": 1.9 * unit,
+              transform: `rotate(${turn}) translate(0 ${-6.6 * unit}) rotate(${-turn})`,
+              y: 0.68 * unit,
+            },
+            `photo ${number}`,
+          ),
+        );
+      }),
+  );
 }

@@ -1,7 +1,16 @@
 /** Answer as text: place, confidence, other candidates, timings, and code for the same query. */
 
 import {
-  accuracyWords, adviceWords, confidenceWords, HEADING_SOURCES, headingWords, milliseconds, percent, seenWords, STAGES, viewWords,
+  accuracyWords,
+  adviceWords,
+  confidenceWords,
+  HEADING_SOURCES,
+  headingWords,
+  milliseconds,
+  percent,
+  seenWords,
+  STAGES,
+  viewWords,
 } from "./answer_words";
 import { button, byId, h, show } from "./dom";
 import { say } from "./notices";
@@ -33,28 +42,52 @@ export function showAnswer(answer: Answer | null, photo: Photo | null, actions: 
     show(byId("answer-body"));
     return;
   }
-  show(byId("answer-body"), summary(answer), places(answer, actions), ...remarks(answer), h("div", { class: "after" }, facts(answer), sharing(answer, photo, actions)));
+  show(
+    byId("answer-body"),
+    summary(answer),
+    places(answer, actions),
+    ...remarks(answer),
+    h("div", { class: "after" }, facts(answer), sharing(answer, photo, actions)),
+  );
 }
 
 /** Mark the selected candidate. */
 export function markSelected(index: number | null): void {
-  byId("answer-body").querySelectorAll("[data-rank]").forEach((row) => {
-    row.setAttribute("aria-pressed", String(index !== null && row.getAttribute("data-rank") === String(index)));
-  });
+  byId("answer-body")
+    .querySelectorAll("[data-rank]")
+    .forEach((row) => {
+      row.setAttribute("aria-pressed", String(index !== null && row.getAttribute("data-rank") === String(index)));
+    });
 }
 
 function summary(answer: Answer): HTMLElement {
-  const { x_m, y_m } = answer.position, share = answer.confidence ?? 0;
+  const { x_m, y_m } = answer.position,
+    share = answer.confidence ?? 0;
   const accuracy = accuracyWords(answer);
-  return h("div", { class: "verdict" },
+  return h(
+    "div",
+    { class: "verdict" },
     h("p", { class: "words" }, confidenceWords(answer.confidence)),
     h("p", { class: "room" }, answer.room),
     answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
-    h("p", { class: "where" }, `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`),
-    h("p", { class: "hint" }, `Heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}. ± is a 95 % interval.`),
-    answer.confidence !== null && h("div", { class: "sure" },
-      h("meter", { min: 0, max: 1, value: share, "aria-label": "Confidence" }),
-      h("span", {}, `${percent(share)} probability of an error below 1 m`)));
+    h(
+      "p",
+      { class: "where" },
+      `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`,
+    ),
+    h(
+      "p",
+      { class: "hint" },
+      `Heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}. ± is a 95 % interval.`,
+    ),
+    answer.confidence !== null &&
+      h(
+        "div",
+        { class: "sure" },
+        h("meter", { min: 0, max: 1, value: share, "aria-label": "Confidence" }),
+        h("span", {}, `${percent(share)} probability of an error below 1 m`),
+      ),
+  );
 }
 
 /** Return name and level of a plan of a venue; the answer names only the most probable plans. */
@@ -65,14 +98,36 @@ function planOf(answer: Answer, place: { floorplan_id: string; level: number | n
 
 /** State what was assumed, and what the user can do about an uncertain answer. */
 function remarks(answer: Answer): HTMLElement[] {
-  const { view, together } = answer, advice = adviceWords(answer), elsewhere = answer.probability_elsewhere ?? 0;
-  const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) => h("p", { class: "warning" }, plainWords(warning)));
+  const { view, together } = answer,
+    advice = adviceWords(answer),
+    elsewhere = answer.probability_elsewhere ?? 0;
+  const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) =>
+    h("p", { class: "warning" }, plainWords(warning)),
+  );
   return [
     ...(advice === null ? [] : [h("p", { class: "advice" }, advice)]),
-    ...(together === undefined ? [] : [h("p", { class: "assumed" }, `From ${together.photographs} photographs together`,
-      together.confidence === null ? "." : `: ${percent(together.confidence)} probability that all of their places are right within 1 m.`)]),
-    ...(elsewhere < NOTABLE_ELSEWHERE ? [] : [h("p", { class: "assumed" }, `${percent(elsewhere)} probability that the photograph shows `,
-      "no place of this plan: another floor or building, or rooms that have changed.")]),
+    ...(together === undefined
+      ? []
+      : [
+          h(
+            "p",
+            { class: "assumed" },
+            `From ${together.photographs} photographs together`,
+            together.confidence === null
+              ? "."
+              : `: ${percent(together.confidence)} probability that all of their places are right within 1 m.`,
+          ),
+        ]),
+    ...(elsewhere < NOTABLE_ELSEWHERE
+      ? []
+      : [
+          h(
+            "p",
+            { class: "assumed" },
+            `${percent(elsewhere)} probability that the photograph shows `,
+            "no place of this plan: another floor or building, or rooms that have changed.",
+          ),
+        ]),
     ...(view == null ? [] : [h("p", { class: "assumed" }, viewWords(view))]),
     ...warnings,
   ];
@@ -80,19 +135,63 @@ function remarks(answer: Answer): HTMLElement[] {
 
 /** List the places, and the probability of all others. */
 function places(answer: Answer, { select }: AnswerActions): HTMLElement {
-  const listed = placesOf(answer), left = remainder(answer, listed), elsewhere = answer.probability_elsewhere ?? 0;
-  const row = (place: Place, rank: number): HTMLElement => h("li", {},
-    h("button", { type: "button", "data-rank": place.index, "aria-pressed": String(rank === 0), onclick: () => select(place.index) },
-      ...cells(rank + 1, h("span", { class: "name" }, place.candidate.room, answer.venue_id != null && h("small", {}, planOf(answer, place.candidate))), place.probability)),
-    place.others.length > 0 && h("div", { class: "ways" }, "or the camera faces ", ...place.others.map((index) => otherWay(answer, index, select))));
-  return h("div", { class: "places" }, h("h3", {}, "Possible places"), h("ol", {}, ...listed.map(row)),
-    h("ul", {}, left !== null && h("li", { class: "rest" }, ...cells("", "other places of the plan", left)),
-      elsewhere >= 0.005 && h("li", { class: "rest" }, ...cells("", answer.venue_id == null ? "not in this plan" : "in none of the plans", elsewhere))));
+  const listed = placesOf(answer),
+    left = remainder(answer, listed),
+    elsewhere = answer.probability_elsewhere ?? 0;
+  const row = (place: Place, rank: number): HTMLElement =>
+    h(
+      "li",
+      {},
+      h(
+        "button",
+        {
+          type: "button",
+          "data-rank": place.index,
+          "aria-pressed": String(rank === 0),
+          onclick: () => select(place.index),
+        },
+        ...cells(
+          rank + 1,
+          h(
+            "span",
+            { class: "name" },
+            place.candidate.room,
+            answer.venue_id != null && h("small", {}, planOf(answer, place.candidate)),
+          ),
+          place.probability,
+        ),
+      ),
+      place.others.length > 0 &&
+        h(
+          "div",
+          { class: "ways" },
+          "or the camera faces ",
+          ...place.others.map((index) => otherWay(answer, index, select)),
+        ),
+    );
+  return h(
+    "div",
+    { class: "places" },
+    h("h3", {}, "Possible places"),
+    h("ol", {}, ...listed.map(row)),
+    h(
+      "ul",
+      {},
+      left !== null && h("li", { class: "rest" }, ...cells("", "other places of the plan", left)),
+      elsewhere >= 0.005 &&
+        h(
+          "li",
+          { class: "rest" },
+          ...cells("", answer.venue_id == null ? "not in this plan" : "in none of the plans", elsewhere),
+        ),
+    ),
+  );
 }
 
 function cells(rank: number | string, name: HTMLElement | string, share: number | null): HTMLElement[] {
   return [
-    h("span", { class: "rank" }, rank), h("span", { class: "name" }, name),
+    h("span", { class: "rank" }, rank),
+    h("span", { class: "name" }, name),
     h("meter", { min: 0, max: 1, value: share ?? 0, "aria-hidden": "true" }),
     h("span", { class: "share" }, share === null ? "" : percent(share)),
   ];
@@ -102,40 +201,70 @@ function cells(rank: number | string, name: HTMLElement | string, share: number 
 function otherWay(answer: Answer, index: number, select: (index: number) => void): HTMLElement {
   const { heading_deg, probability } = answer.candidates[index]!;
   const share = probability === null ? "" : ` (${percent(probability)})`;
-  return h("button", { type: "button", "data-rank": index, "aria-pressed": "false", onclick: () => select(index) }, `${headingWords(heading_deg, null)}${share}`);
+  return h(
+    "button",
+    { type: "button", "data-rank": index, "aria-pressed": "false", onclick: () => select(index) },
+    `${headingWords(heading_deg, null)}${share}`,
+  );
 }
 
 function facts(answer: Answer): HTMLElement {
-  const stages = Object.entries(answer.timings_ms).filter(([name, spent]) => name !== "total" && spent > 0)
+  const stages = Object.entries(answer.timings_ms)
+    .filter(([name, spent]) => name !== "total" && spent > 0)
     .map(([name, spent]) => `${name} ${milliseconds(spent)}`);
-  const plans = (answer.plans ?? []).filter(({ probability }) => probability !== null).slice(0, MAX_PLANS)
+  const plans = (answer.plans ?? [])
+    .filter(({ probability }) => probability !== null)
+    .slice(0, MAX_PLANS)
     .map((plan) => `${planLabel(plan)}: ${percent(plan.probability!)}`);
   const earth = answer.geopose?.position;
   const pairs: [string, string][] = [
     ...(plans.length > 0 ? [["Plans", plans.join("; ")] as [string, string]] : []),
     ...(earth ? [["On Earth", `${earth.lat.toFixed(6)}, ${earth.lon.toFixed(6)}`] as [string, string]] : []),
-    ["Heading", `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source]}`],
+    [
+      "Heading",
+      `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source]}`,
+    ],
     ...(answer.view == null ? [] : [["Seen", seenWords(answer.view)] as [string, string]]),
     ["Camera height", `${answer.camera_height_m.toFixed(2)} m (best fit)`],
     ["Time", `${milliseconds(answer.timings_ms.total ?? 0)} (${stages.join(", ")})`],
     ["Method", `${STAGES[answer.stage]}, model ${answer.model.name} ${answer.model.version}`],
   ];
-  return h("details", { class: "how" }, h("summary", {}, "How it was found"),
-    h("dl", { class: "facts" }, ...pairs.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])));
+  return h(
+    "details",
+    { class: "how" },
+    h("summary", {}, "How it was found"),
+    h("dl", { class: "facts" }, ...pairs.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])),
+  );
 }
 
 function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): HTMLElement {
   const files = (photo?.asked.files ?? []).map(({ name }) => name.replace(/^example-/, "examples/"));
-  const onDevice = photo?.asked.onDevice ?? false, fields = photo?.asked.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
+  const onDevice = photo?.asked.onDevice ?? false,
+    fields =
+      photo?.asked.fields ??
+      (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
   const asked = { fields, files: files.length > 0 ? files : ["photo.jpg"], onDevice };
   const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
-  return h("div", { class: "sharing" },
+  return h(
+    "div",
+    { class: "sharing" },
     button("Copy as curl", () => void copy(curlSnippet(asked), "curl command"), { id: "copy-curl" }),
     button("Copy as Python", () => void copy(pythonSnippet(asked), "Python code"), { id: "copy-python" }),
     // The service draws answers to single photographs in single plans and does not store photographs.
-    photo !== null && answer.venue_id == null && answer.together === undefined && button("Save picture", () => void save(photo), { id: "save-picture", title: "The photograph with the layout, and the plan with the place, as PNG" }),
-    link !== null && button("Copy link", () => void copy(link, "link"), { id: "copy-link", title: "Opens this answer again while the service stores it" }),
-    h("pre", { class: "copied", id: "copied", tabindex: 0, hidden: true, "aria-label": "Copied text" }));
+    photo !== null &&
+      answer.venue_id == null &&
+      answer.together === undefined &&
+      button("Save picture", () => void save(photo), {
+        id: "save-picture",
+        title: "The photograph with the layout, and the plan with the place, as PNG",
+      }),
+    link !== null &&
+      button("Copy link", () => void copy(link, "link"), {
+        id: "copy-link",
+        title: "Opens this answer again while the service stores it",
+      }),
+    h("pre", { class: "copied", id: "copied", tabindex: 0, hidden: true, "aria-label": "Copied text" }),
+  );
 }
 
 async function copy(text: string, name: string): Promise<void> {

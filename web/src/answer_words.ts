@@ -40,8 +40,10 @@ export function viewWords(view: ViewAnswer): string {
   const width = `, ${angleWords(hfov.value_deg, hfov.std_deg)} wide (${VALUE_SOURCES[hfov.source]})`;
   if (camera === null) return `${kind}${width}.`;
   const tilt = `tilted ${directed(pitch, "up", "down")} and leaning ${directed(roll, "right", "left")}`;
-  const sources = pitch.source === roll.source ? VALUE_SOURCES[pitch.source] :
-    `${VALUE_SOURCES[pitch.source]}; ${VALUE_SOURCES[roll.source]}`;
+  const sources =
+    pitch.source === roll.source
+      ? VALUE_SOURCES[pitch.source]
+      : `${VALUE_SOURCES[pitch.source]}; ${VALUE_SOURCES[roll.source]}`;
   return `${kind}${width}, ${tilt} (${sources}).`;
 }
 
@@ -55,8 +57,9 @@ export function adviceWords(answer: Answer): string | null {
   const { view, together } = answer;
   if (view === null || view === undefined || view.advice === null) return null;
   const seen = `${seenDeg(view).toFixed(0)}° of the surroundings are too little to tell the place`;
-  return together?.motion === "turn" ? `Turn further: ${seen}. Add more photographs from the same spot.` :
-    `Turn around: ${seen}. Add photographs from the same spot, and choose “Taken from one spot, turning”.`;
+  return together?.motion === "turn"
+    ? `Turn further: ${seen}. Add more photographs from the same spot.`
+    : `Turn around: ${seen}. Add photographs from the same spot, and choose “Taken from one spot, turning”.`;
 }
 
 function seenDeg({ seen }: ViewAnswer): number {
@@ -73,12 +76,19 @@ function directed({ value_deg, std_deg }: ViewAnswer["pitch"], positive: string,
 }
 
 const PROJECTIONS: Record<ViewAnswer["projection"], string> = {
-  equirectangular: "a 360° photograph", perspective: "an ordinary photograph", cylindrical: "a panorama strip", fisheye: "a fisheye photograph",
+  equirectangular: "a 360° photograph",
+  perspective: "an ordinary photograph",
+  cylindrical: "a panorama strip",
+  fisheye: "a fisheye photograph",
 };
 
 /** Origin of a value of the camera. */
 const VALUE_SOURCES: Record<ViewAnswer["pitch"]["source"], string> = {
-  given: "as entered", gpano: "from the file", exif: "from the file", estimated: "estimated from lines in the picture", assumed: "a usual value",
+  given: "as entered",
+  gpano: "from the file",
+  exif: "from the file",
+  estimated: "estimated from lines in the picture",
+  assumed: "a usual value",
 };
 
 /** Origin of a heading. */

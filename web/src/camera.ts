@@ -19,11 +19,16 @@ const WIDEST = Math.tan(radians(80));
  * not show are cut off.
  */
 export function throughCamera(lines: Point[][], view: CameraView, size: Size): Point[][] {
-  const place = placeOf(view, size), tilt = tiltOf(view);
+  const place = placeOf(view, size),
+    tilt = tiltOf(view);
   return lines.flatMap((line) => {
     const pieces: Point[][] = [[]];
     for (const [azimuth, elevation] of dense(line)) {
-      const level: Ray = [Math.cos(elevation) * Math.sin(azimuth), Math.cos(elevation) * Math.cos(azimuth), Math.sin(elevation)];
+      const level: Ray = [
+        Math.cos(elevation) * Math.sin(azimuth),
+        Math.cos(elevation) * Math.cos(azimuth),
+        Math.sin(elevation),
+      ];
       const point = place(tilt(level));
       if (point !== null && inside(point, size)) pieces.at(-1)!.push(point);
       else if (pieces.at(-1)!.length > 0) pieces.push([]);
@@ -42,9 +47,13 @@ function dense(line: Point[]): Point[] {
   return line.flatMap((point, index) => {
     const next = line[index + 1];
     if (next === undefined) return [point];
-    const steps = Math.max(1, Math.ceil(Math.max(Math.abs(next[0] - point[0]), Math.abs(next[1] - point[1])) / LARGEST_STEP));
+    const steps = Math.max(
+      1,
+      Math.ceil(Math.max(Math.abs(next[0] - point[0]), Math.abs(next[1] - point[1])) / LARGEST_STEP),
+    );
     return Array.from({ length: steps }, (_, step): Point => [
-      point[0] + (step / steps) * (next[0] - point[0]), point[1] + (step / steps) * (next[1] - point[1]),
+      point[0] + (step / steps) * (next[0] - point[0]),
+      point[1] + (step / steps) * (next[1] - point[1]),
     ]);
   });
 }
@@ -52,10 +61,12 @@ function dense(line: Point[]): Point[] {
 /** Return the rotation of level rays (right, forward, up) into the camera's frame. */
 export function tiltOf(view: Pick<CameraView, "projection" | "pitch" | "roll">): (ray: Ray) => Ray {
   // The pitch of a strip is in its projection.
-  const pitch = view.projection === "cylindrical" ? 0 : radians(view.pitch.value_deg), roll = radians(view.roll.value_deg);
+  const pitch = view.projection === "cylindrical" ? 0 : radians(view.pitch.value_deg),
+    roll = radians(view.roll.value_deg);
   const [sp, cp, sr, cr] = [Math.sin(pitch), Math.cos(pitch), Math.sin(roll), Math.cos(roll)];
   return ([right, forward, up]) => {
-    const ahead = forward * cp + up * sp, above = up * cp - forward * sp;
+    const ahead = forward * cp + up * sp,
+      above = up * cp - forward * sp;
     return [cr * right - sr * above, ahead, sr * right + cr * above];
   };
 }
@@ -64,29 +75,39 @@ export function tiltOf(view: Pick<CameraView, "projection" | "pitch" | "roll">):
 export function placeOf(view: CameraView, size: Size): Place {
   const { camera } = view;
   if (camera === null) return around(view, size);
-  const across = size.width / camera.width, down = size.height / camera.height;
+  const across = size.width / camera.width,
+    down = size.height / camera.height;
   const bend = view.projection === "fisheye" ? fisheye(camera.distortion) : pinhole(camera.distortion);
   return (ray) => {
     const point = bend(ray);
     // OpenCV counts from the centre of the first pixel.
-    return point && [(camera.fx * point[0] + camera.cx + 0.5) * across, (camera.fy * point[1] + camera.cy + 0.5) * down];
+    return (
+      point && [(camera.fx * point[0] + camera.cx + 0.5) * across, (camera.fy * point[1] + camera.cy + 0.5) * down]
+    );
   };
 }
 
 function pinhole([k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0]: number[]): Place {
   return ([right, forward, up]) => {
-    const x = right / forward, y = -up / forward, square = x * x + y * y;
+    const x = right / forward,
+      y = -up / forward,
+      square = x * x + y * y;
     if (forward <= 0 || square > WIDEST ** 2) return null;
     // Beyond the turning point of the distortion, rays would be folded back into the picture.
     if (1 + square * (3 * k1 + square * (5 * k2 + square * 7 * k3)) <= 0) return null;
     const gain = 1 + square * (k1 + square * (k2 + square * k3));
-    return [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + 2 * p2 * x * y + p1 * (square + 2 * y * y)];
+    return [
+      x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+      y * gain + 2 * p2 * x * y + p1 * (square + 2 * y * y),
+    ];
   };
 }
 
 function fisheye([k1 = 0, k2 = 0, k3 = 0, k4 = 0]: number[]): Place {
   return ([right, forward, up]) => {
-    const across = Math.hypot(right, up), angle = Math.atan2(across, forward), square = angle * angle;
+    const across = Math.hypot(right, up),
+      angle = Math.atan2(across, forward),
+      square = angle * angle;
     const radius = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))));
     const gain = radius / Math.max(across, 1e-12);
     return [right * gain, -up * gain];
@@ -95,11 +116,13 @@ function fisheye([k1 = 0, k2 = 0, k3 = 0, k4 = 0]: number[]): Place {
 
 /** Strip around the camera, or a part of the sphere, with square pixels at the horizon. */
 function around(view: CameraView, size: Size): Place {
-  const perRadian = size.width / radians(view.hfov.value_deg), middle = radians(view.pitch.value_deg);
+  const perRadian = size.width / radians(view.hfov.value_deg),
+    middle = radians(view.pitch.value_deg);
   const isStrip = view.projection === "cylindrical";
   const horizon = 0.5 * size.height + (isStrip ? Math.tan(middle) : 0) * perRadian;
   return ([right, forward, up]) => {
-    const across = Math.hypot(right, forward), rise = isStrip ? up / Math.max(across, 1e-12) : Math.atan2(up, across);
+    const across = Math.hypot(right, forward),
+      rise = isStrip ? up / Math.max(across, 1e-12) : Math.atan2(up, across);
     return [0.5 * size.width + Math.atan2(right, forward) * perRadian, horizon - rise * perRadian];
   };
 }

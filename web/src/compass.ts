@@ -6,7 +6,12 @@ import { degrees } from "./layout";
 export class Compass {
   readonly element: HTMLElement;
   private readonly needle = s("path", { class: "needle", d: "M0 -34L7 6L0 2L-7 6Z" });
-  private readonly north = s("g", { class: "to-north" }, s("path", { d: "M0 -50L4 -43L-4 -43Z" }), s("text", { y: -24, "font-size": 11 }, "N"));
+  private readonly north = s(
+    "g",
+    { class: "to-north" },
+    s("path", { d: "M0 -50L4 -43L-4 -43Z" }),
+    s("text", { y: -24, "font-size": 11 }, "N"),
+  );
   private readonly dial: SVGSVGElement;
   private readonly text = h("span", { class: "dial-text" });
   /** Heading in the form; null if unknown. */
@@ -19,12 +24,28 @@ export class Compass {
       const angle = (quarter * Math.PI) / 2;
       return s("text", { x: 39 * Math.sin(angle), y: 4 - 39 * Math.cos(angle), "font-size": 11 }, name);
     });
-    this.dial = s("svg", {
-      viewBox: "-52 -52 104 104", class: "dial", tabindex: 0, role: "slider", id: "compass", "aria-valuemin": 0,
-      "aria-valuemax": 359, "aria-label": "Heading of the photograph: direction of its centre on the plan, degrees",
-    }, s("circle", { class: "rim", r: 50 }), ...marks, this.north, this.needle, s("circle", { class: "hub", r: 3 }));
+    this.dial = s(
+      "svg",
+      {
+        viewBox: "-52 -52 104 104",
+        class: "dial",
+        tabindex: 0,
+        role: "slider",
+        id: "compass",
+        "aria-valuemin": 0,
+        "aria-valuemax": 359,
+        "aria-label": "Heading of the photograph: direction of its centre on the plan, degrees",
+      },
+      s("circle", { class: "rim", r: 50 }),
+      ...marks,
+      this.north,
+      this.needle,
+      s("circle", { class: "hub", r: 3 }),
+    );
     this.dial.addEventListener("pointerdown", (event) => this.onPointer(event));
-    this.dial.addEventListener("pointermove", (event) => { if (event.buttons > 0) this.onPointer(event); });
+    this.dial.addEventListener("pointermove", (event) => {
+      if (event.buttons > 0) this.onPointer(event);
+    });
     this.dial.addEventListener("keydown", (event) => this.onKey(event));
     this.element = h("div", { class: "compass" }, this.dial, this.text);
     this.set(null);
@@ -44,7 +65,8 @@ export class Compass {
   }
 
   private draw(): void {
-    const shown = this.heading ?? this.found, isFound = this.heading === null && shown !== null;
+    const shown = this.heading ?? this.found,
+      isFound = this.heading === null && shown !== null;
     this.element.classList.toggle("unknown", shown === null);
     this.element.classList.toggle("found", isFound);
     this.needle.setAttribute("transform", `rotate(${shown ?? 0})`);
@@ -70,12 +92,20 @@ export class Compass {
     this.dial.focus();
     this.dial.setPointerCapture(event.pointerId);
     const box = this.dial.getBoundingClientRect();
-    const x = event.clientX - box.x - 0.5 * box.width, y = event.clientY - box.y - 0.5 * box.height;
+    const x = event.clientX - box.x - 0.5 * box.width,
+      y = event.clientY - box.y - 0.5 * box.height;
     if (Math.hypot(x, y) > 2) this.turn(Math.round(degrees(Math.atan2(x, -y))));
   }
 
   private onKey(event: KeyboardEvent): void {
-    const steps: Record<string, number> = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 };
+    const steps: Record<string, number> = {
+      ArrowRight: 1,
+      ArrowUp: 1,
+      ArrowLeft: -1,
+      ArrowDown: -1,
+      PageUp: 10,
+      PageDown: -10,
+    };
     const step = steps[event.key];
     if (step !== undefined) this.turn(Math.round(this.heading ?? this.found ?? -step) + step);
     else if (event.key === "Home") this.turn(0);

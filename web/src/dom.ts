@@ -22,7 +22,9 @@ function present(children: Child[]): (Node | string)[] {
 
 /** Create an HTML element; attributes that begin with "on" are listeners. */
 export function h<K extends keyof HTMLElementTagNameMap>(
-  tag: K, attributes: Attributes = {}, ...children: Child[]
+  tag: K,
+  attributes: Attributes = {},
+  ...children: Child[]
 ): HTMLElementTagNameMap[K] {
   const element = document.createElement(tag);
   fill(element, attributes, children);
@@ -31,7 +33,9 @@ export function h<K extends keyof HTMLElementTagNameMap>(
 
 /** Create an SVG element. */
 export function s<K extends keyof SVGElementTagNameMap>(
-  tag: K, attributes: Attributes = {}, ...children: Child[]
+  tag: K,
+  attributes: Attributes = {},
+  ...children: Child[]
 ): SVGElementTagNameMap[K] {
   const element = document.createElementNS(SVG, tag) as SVGElementTagNameMap[K];
   fill(element, attributes, children);
@@ -54,7 +58,12 @@ export function show(element: Element, ...children: Child[]): void {
 }
 
 /** Unit vectors of the arrow keys, with y up. */
-export const ARROWS: Record<string, [number, number]> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+export const ARROWS: Record<string, [number, number]> = {
+  ArrowLeft: [-1, 0],
+  ArrowRight: [1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
+};
 
 /** Call `move` for every movement of the pointer until it is released. */
 export function followPointer(move: (event: PointerEvent) => void): void {

@@ -29,7 +29,10 @@ async function* eventsOf(response: Response): AsyncGenerator<PlanEvent> {
     const blocks = text.split(/\r?\n\r?\n/);
     text = blocks.pop() ?? "";
     for (const block of blocks) {
-      const data = block.split(/\r?\n/).filter((line) => line.startsWith("data:")).map((line) => line.slice(5).trim());
+      const data = block
+        .split(/\r?\n/)
+        .filter((line) => line.startsWith("data:"))
+        .map((line) => line.slice(5).trim());
       if (data.length > 0) yield JSON.parse(data.join("\n"));
     }
   }

@@ -7,7 +7,10 @@ export interface Example {
   photos: readonly string[];
 }
 
-export const FLAT: Example = { plan: "flat.json", photos: ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"] };
+export const FLAT: Example = {
+  plan: "flat.json",
+  photos: ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"],
+};
 export const ROOMS: Example = { plan: "rooms.json", photos: ["lythwood_room.jpg"] };
 
 /** Return the plan of an example. */
@@ -17,8 +20,10 @@ export async function examplePlan({ plan }: Example): Promise<PlanDocument> {
 
 /** Return the photographs of an example. */
 export async function exampleFiles({ photos }: Example): Promise<File[]> {
-  return Promise.all(photos.map(async (name) => {
-    const response = await fetch(`/web/example-${name}`);
-    return new File([await response.blob()], name, { type: "image/jpeg" });
-  }));
+  return Promise.all(
+    photos.map(async (name) => {
+      const response = await fetch(`/web/example-${name}`);
+      return new File([await response.blob()], name, { type: "image/jpeg" });
+    }),
+  );
 }

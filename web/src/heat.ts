@@ -8,11 +8,14 @@ import type { PlanDocument, Point, Posterior, RoomDocument } from "./types";
 // Places less probable than the best one by this factor are not coloured.
 const MIN_RATIO = 1e-5;
 // Number of cells along the longer side of a plan, and minimum cell size.
-const CELLS = 300, MIN_CELL_M = 0.04;
+const CELLS = 300,
+  MIN_CELL_M = 0.04;
 // Standard deviation of the blur in steps of the pose grid, and radius of the kernel in standard deviations.
-const DEVIATION = 0.4, RADIUS = 5;
+const DEVIATION = 0.4,
+  RADIUS = 5;
 // Shade from which colours cover the plan, and opacity from there on.
-const OPAQUE_SHADE = 0.3, MAX_OPACITY = 0.92;
+const OPAQUE_SHADE = 0.3,
+  MAX_OPACITY = 0.92;
 
 /** Cells over a room, top row first; `box` is that of the drawing. */
 export interface Cells {
@@ -30,7 +33,10 @@ export function heatMap(posterior: Posterior, plan: PlanDocument): SVGGElement {
   const cell = cellSize(plan);
   const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell)).filter((field) => field !== null);
   const best = fields.reduce((most, { values }) => values.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
-  for (const { values } of fields) values.forEach((value, index) => { values[index] = shadeOf(value, best); });
+  for (const { values } of fields)
+    values.forEach((value, index) => {
+      values[index] = shadeOf(value, best);
+    });
   return roomPictures("posterior", fields, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
 }
 
@@ -42,21 +48,47 @@ export function cellSize(plan: PlanDocument): number {
 
 /** Cover a room with cells. */
 export function cellsOf(room: RoomDocument, cell: number): Cells {
-  const xs = room.polygon.map(([x]) => x), ys = room.polygon.map(([, y]) => y);
-  const left = Math.min(...xs), top = Math.max(...ys);
-  const columns = Math.ceil((Math.max(...xs) - left) / cell), rows = Math.ceil((top - Math.min(...ys)) / cell);
+  const xs = room.polygon.map(([x]) => x),
+    ys = room.polygon.map(([, y]) => y);
+  const left = Math.min(...xs),
+    top = Math.max(...ys);
+  const columns = Math.ceil((Math.max(...xs) - left) / cell),
+    rows = Math.ceil((top - Math.min(...ys)) / cell);
   return { room, box: { x: left, y: -top, width: columns * cell, height: rows * cell }, columns, rows };
 }
 
 /** Draw shades from 0 to 1 as a picture for each room, clipped to its floor; `name` is unique on the page. */
 export function roomPictures(name: string, fields: Field[], opacity: (shade: number) => number): SVGGElement {
   const ramp = rampOf(getComputedStyle(document.documentElement).getPropertyValue("--heat-ramp"));
-  return s("g", { class: `heat ${name}`, "aria-hidden": "true" }, ...fields.map((field, index) => {
-    const { room, box: { x, y, width, height } } = field, id = `${name}-${index}`;
-    return s("g", {},
-      s("clipPath", { id }, s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" })),
-      s("image", { href: pictureOf(field, ramp, opacity), x, y, width, height, preserveAspectRatio: "none", "clip-path": `url(#${id})` }));
-  }));
+  return s(
+    "g",
+    { class: `heat ${name}`, "aria-hidden": "true" },
+    ...fields.map((field, index) => {
+      const {
+          room,
+          box: { x, y, width, height },
+        } = field,
+        id = `${name}-${index}`;
+      return s(
+        "g",
+        {},
+        s(
+          "clipPath",
+          { id },
+          s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" }),
+        ),
+        s("image", {
+          href: pictureOf(field, ramp, opacity),
+          x,
+          y,
+          width,
+          height,
+          preserveAspectRatio: "none",
+          "clip-path": `url(#${id})`,
+        }),
+      );
+    }),
+  );
 }
 
 /** Return the shade of a density on a logarithmic scale: 1 for the best place, 0 for negligible ones. */
@@ -65,8 +97,10 @@ export function shadeOf(density: number, best: number): number {
 }
 
 function fieldOf(posterior: Posterior, room: RoomDocument, cell: number): Field | null {
-  const cells = cellsOf(room, cell), { columns, rows, box } = cells;
-  const left = box.x, high = -box.y;
+  const cells = cellsOf(room, cell),
+    { columns, rows, box } = cells;
+  const left = box.x,
+    high = -box.y;
   let spread: Float64Array | null = null;
   posterior.x_m.forEach((x, index) => {
     const y = posterior.y_m[index]!;
@@ -82,8 +116,16 @@ function fieldOf(posterior: Posterior, room: RoomDocument, cell: number): Field 
 
 /** Distribute a value over the four cells around a place. */
 function splat(field: Float64Array, columns: number, rows: number, [x, y]: Point, value: number): void {
-  const column = Math.floor(x), row = Math.floor(y), right = x - column, down = y - row;
-  for (const [i, j, share] of [[0, 0, (1 - right) * (1 - down)], [1, 0, right * (1 - down)], [0, 1, (1 - right) * down], [1, 1, right * down]] as const) {
+  const column = Math.floor(x),
+    row = Math.floor(y),
+    right = x - column,
+    down = y - row;
+  for (const [i, j, share] of [
+    [0, 0, (1 - right) * (1 - down)],
+    [1, 0, right * (1 - down)],
+    [0, 1, (1 - right) * down],
+    [1, 1, right * down],
+  ] as const) {
     const cell = Math.max(0, Math.min(rows - 1, row + j)) * columns + Math.max(0, Math.min(columns - 1, column + i));
     field[cell] = field[cell]! + share * value;
   }
@@ -91,7 +133,9 @@ function splat(field: Float64Array, columns: number, rows: number, [x, y]: Point
 
 /** Return half of a normal distribution's weights, from its mean. */
 function kernelOf(deviation: number): number[] {
-  const weights = Array.from({ length: Math.ceil(RADIUS * deviation) + 1 }, (_, k) => Math.exp(-0.5 * (k / deviation) ** 2));
+  const weights = Array.from({ length: Math.ceil(RADIUS * deviation) + 1 }, (_, k) =>
+    Math.exp(-0.5 * (k / deviation) ** 2),
+  );
   const sum = 2 * weights.reduce((a, b) => a + b) - 1;
   return weights.map((weight) => weight / sum);
 }
@@ -114,7 +158,9 @@ type Colour = [number, number, number];
 
 /** Parse a list of colours such as `#ffffff, #000000`. */
 function rampOf(list: string): Colour[] {
-  return list.split(",").map((colour) => [1, 3, 5].map((start) => parseInt(colour.trim().slice(start, start + 2), 16)) as Colour);
+  return list
+    .split(",")
+    .map((colour) => [1, 3, 5].map((start) => parseInt(colour.trim().slice(start, start + 2), 16)) as Colour);
 }
 
 function pictureOf({ columns, rows, values }: Field, ramp: Colour[], opacity: (shade: number) => number): string {
@@ -125,7 +171,9 @@ function pictureOf({ columns, rows, values }: Field, ramp: Colour[], opacity: (s
   const picture = context.createImageData(columns, rows);
   values.forEach((shade, index) => {
     const place = shade * (ramp.length - 1);
-    const low = ramp[Math.floor(place)]!, high = ramp[Math.ceil(place)]!, share = place % 1;
+    const low = ramp[Math.floor(place)]!,
+      high = ramp[Math.ceil(place)]!,
+      share = place % 1;
     const colour = low.map((from, k) => Math.round(from + share * (high[k]! - from)));
     picture.data.set([...colour, Math.round(255 * opacity(shade))], 4 * index);
   });

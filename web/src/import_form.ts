@@ -7,7 +7,7 @@ import { PictureScale } from "./picture_scale";
 const UNITS = ["m", "cm", "mm", "in", "ft"];
 // Fields of the upload: name, label, placeholder.
 const FIELDS: [string, string, string][] = [
-  ["level", "Storey", "name or number"],
+  ["level", "Level", "name or number"],
   ["scale", "Scale on paper", "1:100"],
   ["metres_per_pixel", "Metres per pixel", "0.01"],
   ["page", "Page of a PDF", "1"],
@@ -29,9 +29,15 @@ export class ImportForm {
     private readonly all: (file: File, fields: Record<string, string>) => void,
     private readonly cancelled: () => void,
   ) {
-    this.inputs.set("units", h("select", {}, h("option", { value: "" }, "from the file"), ...UNITS.map((unit) => h("option", {}, unit))));
-    for (const [name, , hint] of FIELDS) this.inputs.set(name, h("input", { type: "text", placeholder: hint, autocomplete: "off" }));
-    this.picture.metres.addEventListener("keydown", (event) => { if (event.key === "Enter") this.send(); });
+    this.inputs.set(
+      "units",
+      h("select", {}, h("option", { value: "" }, "from the file"), ...UNITS.map((unit) => h("option", {}, unit))),
+    );
+    for (const [name, , hint] of FIELDS)
+      this.inputs.set(name, h("input", { type: "text", placeholder: hint, autocomplete: "off" }));
+    this.picture.metres.addEventListener("keydown", (event) => {
+      if (event.key === "Enter") this.send();
+    });
   }
 
   /** Fields by name, for marking errors. */
@@ -46,22 +52,59 @@ export class ImportForm {
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
     }
     this.file = file;
-    const labels: [string, string][] = [["units", "Unit"], ...FIELDS.map(([name, label]): [string, string] => [name, label])];
-    const shown = labels.filter(([name]) => !isPicture || OF_PICTURES.includes(name)).map(([name, label]) => {
-      const input = this.inputs.get(name)!;
-      input.id = `import-${name}`;
-      return h("div", {}, h("label", { for: input.id }, label), input);
+    const labels: [string, string][] = [
+      ["units", "Unit"],
+      ...FIELDS.map(([name, label]): [string, string] => [name, label]),
+    ];
+    const shown = labels
+      .filter(([name]) => !isPicture || OF_PICTURES.includes(name))
+      .map(([name, label]) => {
+        const input = this.inputs.get(name)!;
+        input.id = `import-${name}`;
+        return h("div", {}, h("label", { for: input.id }, label), input);
+      });
+    const heading =
+      levels.length > 0
+        ? `“${file.name}” has ${levels.length} levels: choose one, or import all`
+        : !isNeeded
+          ? `Import “${file.name}” again with other options`
+          : isPicture
+            ? `Set the scale of “${file.name}”`
+            : `Import options for “${file.name}”`;
+    const again = button(isPicture && isNeeded ? "Read the picture" : "Import again", () => this.send(), {
+      id: "import-again",
+      class: isNeeded ? "primary" : null,
     });
-    const heading = levels.length > 0 ? `“${file.name}” has ${levels.length} levels: choose one, or import all` :
-      !isNeeded ? `Import “${file.name}” again with other options` : isPicture ? `Set the scale of “${file.name}”` : `Import options for “${file.name}”`;
-    const again = button(isPicture && isNeeded ? "Read the picture" : "Import again", () => this.send(), { id: "import-again", class: isNeeded ? "primary" : null });
-    const whole = button("Import all levels as a venue", () => this.sendAll(), { id: "import-levels", class: "primary" });
-    const ask = h("div", { class: "ask" }, levels.length === 0 ? again : whole, button("Cancel", () => this.cancelled()));
+    const whole = button("Import all levels as a venue", () => this.sendAll(), {
+      id: "import-levels",
+      class: "primary",
+    });
+    const ask = h(
+      "div",
+      { class: "ask" },
+      levels.length === 0 ? again : whole,
+      button("Cancel", () => this.cancelled()),
+    );
     const fields = h("div", { class: "fields" }, ...shown);
-    const level = (name: string): HTMLElement => h("li", {}, button(name, () => this.sendLevel(name)));
-    show(byId("import-form"), h("details", { open: isNeeded }, h("summary", {}, heading),
-      ...(levels.length > 0 ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask] :
-        isPicture ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)] : [fields, ask])));
+    const level = (name: string): HTMLElement =>
+      h(
+        "li",
+        {},
+        button(name, () => this.sendLevel(name)),
+      );
+    show(
+      byId("import-form"),
+      h(
+        "details",
+        { open: isNeeded },
+        h("summary", {}, heading),
+        ...(levels.length > 0
+          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask]
+          : isPicture
+            ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)]
+            : [fields, ask]),
+      ),
+    );
   }
 
   /** Close the form and forget its values. */
@@ -74,7 +117,11 @@ export class ImportForm {
 
   /** Ask for the distance if a picture was refused for want of a scale; return whether it was. */
   askForScale(error: unknown): boolean {
-    const isAsked = this.file !== null && PICTURES.test(this.file.type) && error instanceof Error && error.message.includes("gives no scale");
+    const isAsked =
+      this.file !== null &&
+      PICTURES.test(this.file.type) &&
+      error instanceof Error &&
+      error.message.includes("gives no scale");
     if (isAsked) this.picture.askForDistance();
     return isAsked;
   }
@@ -92,13 +139,19 @@ export class ImportForm {
 
   /** Filled fields of the form. */
   private get values(): Record<string, string> {
-    return Object.fromEntries([...this.inputs].map(([name, input]): [string, string] => [name, input.value.trim()]).filter(([, value]) => value !== ""));
+    return Object.fromEntries(
+      [...this.inputs]
+        .map(([name, input]): [string, string] => [name, input.value.trim()])
+        .filter(([, value]) => value !== ""),
+    );
   }
 
   private send(): void {
     if (this.file === null) return;
     const isPicture = PICTURES.test(this.file.type);
-    const values = Object.fromEntries(Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)));
+    const values = Object.fromEntries(
+      Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)),
+    );
     const distance = this.picture.knownDistance;
     if (isPicture && distance !== null) values.known_distance = distance;
     this.again(this.file, values);

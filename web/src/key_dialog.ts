@@ -7,14 +7,32 @@ import { button, byId, h } from "./dom";
 export function connectKeyDialog(): void {
   const reason = h("p", { id: "key-why" });
   const field = h("input", {
-    id: "key-field", type: "password", autocomplete: "off", spellcheck: "false", placeholder: "lalaloc_…", required: true,
+    id: "key-field",
+    type: "password",
+    autocomplete: "off",
+    spellcheck: "false",
+    placeholder: "lalaloc_…",
+    required: true,
   });
-  const form = h("form", {}, h("h2", { id: "key-title" }, "API key"), reason,
-    h("label", { for: field.id }, "Key"), field, h("p", { class: "hint" }, "The key is kept in this tab until the tab is closed."),
-    h("div", { class: "ask" }, h("button", { class: "primary" }, "Use this key"), button("Remove the key", () => {
-      key.remove();
-      location.reload();
-    }), button("Cancel", () => dialog.close("cancel"))));
+  const form = h(
+    "form",
+    {},
+    h("h2", { id: "key-title" }, "API key"),
+    reason,
+    h("label", { for: field.id }, "Key"),
+    field,
+    h("p", { class: "hint" }, "The key is kept in this tab until the tab is closed."),
+    h(
+      "div",
+      { class: "ask" },
+      h("button", { class: "primary" }, "Use this key"),
+      button("Remove the key", () => {
+        key.remove();
+        location.reload();
+      }),
+      button("Cancel", () => dialog.close("cancel")),
+    ),
+  );
   const dialog = h("dialog", { id: "key-dialog", "aria-labelledby": "key-title" }, form);
   document.body.append(dialog);
   const opener = byId<HTMLButtonElement>("key-button");

@@ -23,10 +23,14 @@ export interface Hit {
 
 /** Return the nearest wall along an azimuth; at infinity if there is none. */
 export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout["walls_m"]): Hit {
-  const dx = Math.sin(azimuth), dy = Math.cos(azimuth);
+  const dx = Math.sin(azimuth),
+    dy = Math.cos(azimuth);
   const nearest: Hit = { distance: Infinity, wall: -1, share: 0 };
   walls.forEach(([x0, y0, x1, y1], wall) => {
-    const sx = x0 - x, sy = y0 - y, ex = x1 - x0, ey = y1 - y0;
+    const sx = x0 - x,
+      sy = y0 - y,
+      ex = x1 - x0,
+      ey = y1 - y0;
     const determinant = dx * ey - dy * ex;
     if (Math.abs(determinant) < PARALLEL) return;
     const distance = (sx * ey - sy * ex) / determinant;
@@ -59,9 +63,14 @@ export function layoutView(pose: Pose, room: RoomLayout, columns: number, camera
   const heading = radians(pose.heading_deg);
   return columnAzimuths(columns).map((azimuth) => {
     const hit = castRay(pose.x_m, pose.y_m, heading + azimuth, room.walls_m);
-    const met = room.openings.find((opening) => opening.wall === hit.wall && opening.start <= hit.share &&
-      hit.share <= opening.end && (opening.sill_m ?? -Infinity) < cameraHeight &&
-      cameraHeight < (opening.head_m ?? Infinity));
+    const met = room.openings.find(
+      (opening) =>
+        opening.wall === hit.wall &&
+        opening.start <= hit.share &&
+        hit.share <= opening.end &&
+        (opening.sill_m ?? -Infinity) < cameraHeight &&
+        cameraHeight < (opening.head_m ?? Infinity),
+    );
     const [floor, ceiling] = wallElevations(hit.distance, cameraHeight, room.ceiling_height_m);
     return { distance_m: hit.distance, kind: met?.kind ?? "wall", floor, ceiling };
   });
@@ -87,13 +96,21 @@ export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight
   pieces.forEach((piece, index) => {
     const along = sampled(piece.from, piece.to);
     const ends = along.map((azimuth) =>
-      wallElevations(distanceAt(piece.wall, azimuth), cameraHeight, room.ceiling_height_m));
+      wallElevations(distanceAt(piece.wall, azimuth), cameraHeight, room.ceiling_height_m),
+    );
     lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![0]]) });
     lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![1]]) });
     const next = pieces[(index + 1) % pieces.length]!;
     const near = Math.min(distanceAt(piece.wall, piece.to), distanceAt(next.wall, piece.to));
     const [floor, ceiling] = wallElevations(near, cameraHeight, room.ceiling_height_m);
-    if (pieces.length > 1) lines.push({ kind: "edge", points: [[piece.to, floor], [piece.to, ceiling]] });
+    if (pieces.length > 1)
+      lines.push({
+        kind: "edge",
+        points: [
+          [piece.to, floor],
+          [piece.to, ceiling],
+        ],
+      });
     lines.push(...openingLines(x, y, piece, room, cameraHeight));
   });
   return lines;
@@ -101,29 +118,42 @@ export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight
 
 function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, cameraHeight: number): LayoutLine[] {
   const wall = room.walls_m[piece.wall]!;
-  return room.openings.filter((opening) => opening.wall === piece.wall).flatMap((opening) => {
-    const sides = [opening.start, opening.end].map((share) => {
-      const azimuth = Math.atan2(wall[0] + share * (wall[2] - wall[0]) - x, wall[1] + share * (wall[3] - wall[1]) - y);
-      return unwrapped(azimuth, 0.5 * (piece.from + piece.to));
-    }).sort((a, b) => a - b) as Point;
-    const from = Math.max(sides[0], piece.from), to = Math.min(sides[1], piece.to);
-    if (from >= to) return [];
-    const sill = opening.sill_m ?? 0, head = Math.min(opening.head_m ?? Infinity, room.ceiling_height_m);
-    const elevations = (azimuth: number): Point => {
-      const distance = toWall(x, y, azimuth, wall);
-      return [Math.atan2(sill - cameraHeight, distance), Math.atan2(head - cameraHeight, distance)];
-    };
-    const along = sampled(from, to);
-    const lower = along.map((azimuth): Point => [azimuth, elevations(azimuth)[0]]);
-    const upper = along.map((azimuth): Point => [azimuth, elevations(azimuth)[1]]);
-    // One line around the opening; a side that another wall hides stays open.
-    const whole = sides[0] >= piece.from - 1e-9, closed = sides[1] <= piece.to + 1e-9;
-    const points = [...upper.reverse(), ...lower];
-    if (whole && closed) return [{ kind: opening.kind, points: [...points, upper[0]!] }];
-    if (whole) return [{ kind: opening.kind, points }];
-    if (closed) return [{ kind: opening.kind, points: [...lower, ...upper] }];
-    return [{ kind: opening.kind, points: lower }, { kind: opening.kind, points: upper }];
-  });
+  return room.openings
+    .filter((opening) => opening.wall === piece.wall)
+    .flatMap((opening) => {
+      const sides = [opening.start, opening.end]
+        .map((share) => {
+          const azimuth = Math.atan2(
+            wall[0] + share * (wall[2] - wall[0]) - x,
+            wall[1] + share * (wall[3] - wall[1]) - y,
+          );
+          return unwrapped(azimuth, 0.5 * (piece.from + piece.to));
+        })
+        .sort((a, b) => a - b) as Point;
+      const from = Math.max(sides[0], piece.from),
+        to = Math.min(sides[1], piece.to);
+      if (from >= to) return [];
+      const sill = opening.sill_m ?? 0,
+        head = Math.min(opening.head_m ?? Infinity, room.ceiling_height_m);
+      const elevations = (azimuth: number): Point => {
+        const distance = toWall(x, y, azimuth, wall);
+        return [Math.atan2(sill - cameraHeight, distance), Math.atan2(head - cameraHeight, distance)];
+      };
+      const along = sampled(from, to);
+      const lower = along.map((azimuth): Point => [azimuth, elevations(azimuth)[0]]);
+      const upper = along.map((azimuth): Point => [azimuth, elevations(azimuth)[1]]);
+      // One line around the opening; a side that another wall hides stays open.
+      const whole = sides[0] >= piece.from - 1e-9,
+        closed = sides[1] <= piece.to + 1e-9;
+      const points = [...upper.reverse(), ...lower];
+      if (whole && closed) return [{ kind: opening.kind, points: [...points, upper[0]!] }];
+      if (whole) return [{ kind: opening.kind, points }];
+      if (closed) return [{ kind: opening.kind, points: [...lower, ...upper] }];
+      return [
+        { kind: opening.kind, points: lower },
+        { kind: opening.kind, points: upper },
+      ];
+    });
 }
 
 /** Return the visible pieces of walls, clockwise, once around. */
@@ -135,7 +165,8 @@ function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
   walls.forEach((wall, column) => {
     const previous = walls[(column + COLUMNS - 1) % COLUMNS]!;
     if (wall === previous || wall < 0 || previous < 0) return;
-    let low = azimuths[column]! - (2 * Math.PI) / COLUMNS, high = azimuths[column]!;
+    let low = azimuths[column]! - (2 * Math.PI) / COLUMNS,
+      high = azimuths[column]!;
     for (let halving = 0; halving < HALVINGS; halving++) {
       const middle = 0.5 * (low + high);
       if (wallAt(middle) === previous) low = middle;
@@ -151,7 +182,8 @@ function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
 }
 
 function toWall(x: number, y: number, azimuth: number, [x0, y0, x1, y1]: RoomLayout["walls_m"][number]): number {
-  const ex = x1 - x0, ey = y1 - y0;
+  const ex = x1 - x0,
+    ey = y1 - y0;
   const determinant = Math.sin(azimuth) * ey - Math.cos(azimuth) * ex;
   return Math.abs(determinant) < PARALLEL ? Infinity : ((x0 - x) * ey - (y0 - y) * ex) / determinant;
 }

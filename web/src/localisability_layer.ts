@@ -9,7 +9,11 @@ import type { Localisability, Plan } from "./types";
 
 type Condition = keyof Localisability["probability"];
 
-const PHOTOGRAPHS = { phone: "a phone photograph", three_phone: "three phone photographs from one spot, turning", sphere: "a 360° photograph" };
+const PHOTOGRAPHS = {
+  phone: "a phone photograph",
+  three_phone: "three phone photographs from one spot, turning",
+  sphere: "a 360° photograph",
+};
 // Places whose squared distance (m²) to a cell differs by less than this count about equally.
 const SOFT_M2 = 1;
 const OPACITY = 0.92;
@@ -18,10 +22,16 @@ export class LocalisabilityLayer {
   /** The layer on the map. */
   readonly element = s("g");
   private readonly panel = byId("localisability");
-  private readonly open = button("Will it work here?", () => void this.toggle(),
-    { id: "localisability-open", "aria-pressed": "false", title: "Shows where photographs will be found, predicted from the plan" });
-  private readonly photograph = h("select", { id: "localisability-photograph" },
-    ...Object.entries(PHOTOGRAPHS).map(([value, label]) => h("option", { value }, label)));
+  private readonly open = button("Will it work here?", () => void this.toggle(), {
+    id: "localisability-open",
+    "aria-pressed": "false",
+    title: "Shows where photographs will be found, predicted from the plan",
+  });
+  private readonly photograph = h(
+    "select",
+    { id: "localisability-photograph" },
+    ...Object.entries(PHOTOGRAPHS).map(([value, label]) => h("option", { value }, label)),
+  );
   private readonly known = h("input", { type: "checkbox", id: "localisability-heading" });
   private readonly share = h("p", { class: "share", role: "status" });
   private readonly advice = h("ul");
@@ -31,11 +41,20 @@ export class LocalisabilityLayer {
   /** `store` returns the plan that is shown, stored if it is an example. */
   constructor(private readonly store: () => Promise<Plan>) {
     byId("map-actions").prepend(this.open);
-    show(this.panel,
-      h("div", { class: "fields" }, h("label", { for: this.photograph.id }, "Probability of finding"), this.photograph,
-        h("label", { class: "inline" }, this.known, " heading known")),
-      this.share, h("span", { class: "ramp", "aria-hidden": "true" }),
-      h("ul", { class: "ticks" }, ...["0 %", "50 %", "100 %"].map((tick) => h("li", {}, tick))), this.advice);
+    show(
+      this.panel,
+      h(
+        "div",
+        { class: "fields" },
+        h("label", { for: this.photograph.id }, "Probability of finding"),
+        this.photograph,
+        h("label", { class: "inline" }, this.known, " heading known"),
+      ),
+      this.share,
+      h("span", { class: "ramp", "aria-hidden": "true" }),
+      h("ul", { class: "ticks" }, ...["0 %", "50 %", "100 %"].map((tick) => h("li", {}, tick))),
+      this.advice,
+    );
     for (const field of [this.photograph, this.known]) field.addEventListener("change", () => this.draw());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
   }
@@ -83,35 +102,51 @@ export class LocalisabilityLayer {
   }
 
   private draw(): void {
-    const { found, plan } = this, isShown = !this.panel.hidden && found !== null && plan !== null;
+    const { found, plan } = this,
+      isShown = !this.panel.hidden && found !== null && plan !== null;
     // The map of an answer would cover it.
     byId("plan-panel").classList.toggle("predicted", isShown);
     if (!isShown) {
       show(this.element);
       return;
     }
-    const heading = this.known.checked ? "known" : "unknown", condition = `${this.photograph.value}_${heading}_heading` as Condition;
+    const heading = this.known.checked ? "known" : "unknown",
+      condition = `${this.photograph.value}_${heading}_heading` as Condition;
     const within = Math.max(1, found.spacing_m);
-    show(this.share, "In all of the plan: ", h("strong", {}, percent(found.probability[condition])), ` within ${within} m. Predicted from the plan, without any photograph.`);
+    show(
+      this.share,
+      "In all of the plan: ",
+      h("strong", {}, percent(found.probability[condition])),
+      ` within ${within} m. Predicted from the plan, without any photograph.`,
+    );
     show(this.advice, ...found.advice.map((sentence) => h("li", {}, `${sentence}.`)));
     const cell = cellSize(plan.plan);
     const fields = plan.plan.rooms.map((room, index) => {
       const cells = cellsOf(room, cell);
       return { ...cells, values: shadesOf(cells, found, found.rooms[index]!.id, condition) };
     });
-    show(this.element, roomPictures("localisability", fields, () => OPACITY));
+    show(
+      this.element,
+      roomPictures("localisability", fields, () => OPACITY),
+    );
   }
 }
 
 /** Return the probability of every cell, as in lalaloc_core/draw/localisability.py: the mean of its room's places by distance. */
-function shadesOf({ box, columns, rows }: Cells, found: Localisability, room: string, condition: Condition): Float64Array {
+function shadesOf(
+  { box, columns, rows }: Cells,
+  found: Localisability,
+  room: string,
+  condition: Condition,
+): Float64Array {
   const shades = new Float64Array(columns * rows).fill(found.probability[condition]);
   const places = found.places.filter((place) => place.room === room);
   if (places.length === 0) return shades;
   return shades.map((_, index) => {
     const x = box.x + ((index % columns) + 0.5) * (box.width / columns);
     const y = -box.y - (Math.floor(index / columns) + 0.5) * (box.height / rows);
-    let sum = 0, total = 0;
+    let sum = 0,
+      total = 0;
     for (const { x_m, y_m, probability } of places) {
       const weight = ((x_m - x) ** 2 + (y_m - y) ** 2 + SOFT_M2) ** -2;
       sum += weight * probability[condition];

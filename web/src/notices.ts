@@ -14,11 +14,18 @@ export function showError(place: HTMLElement, error: unknown, fields: Record<str
   const text = error instanceof Error ? error.message : String(error);
   const faults = failure?.faults ?? [];
   const title = failure?.title ?? (error instanceof InputError ? null : "Something went wrong");
-  show(place,
+  show(
+    place,
     title !== null && h("strong", {}, title),
     h("p", {}, plainText(failure) ?? plainWords(failure?.detail ?? text)),
-    faults.length > 0 && h("ul", {}, ...faults.map((fault) => h("li", {}, h("strong", {}, labelOf(fault.field)), ` ${plainWords(fault.message)}`))),
-    failure?.retryAfterS ? h("p", {}, `Try again in ${failure.retryAfterS} s.`) : null);
+    faults.length > 0 &&
+      h(
+        "ul",
+        {},
+        ...faults.map((fault) => h("li", {}, h("strong", {}, labelOf(fault.field)), ` ${plainWords(fault.message)}`)),
+      ),
+    failure?.retryAfterS ? h("p", {}, `Try again in ${failure.retryAfterS} s.`) : null,
+  );
   place.hidden = false;
   place.scrollIntoView({ block: "nearest" });
   for (const fault of faults) {
@@ -31,7 +38,8 @@ export function showError(place: HTMLElement, error: unknown, fields: Record<str
 function markInvalid(field: HTMLElement, place: HTMLElement): void {
   field.setAttribute("aria-invalid", "true");
   field.setAttribute("aria-describedby", place.id);
-  for (let fold = field.closest("details"); fold !== null; fold = fold.parentElement?.closest("details") ?? null) fold.open = true;
+  for (let fold = field.closest("details"); fold !== null; fold = fold.parentElement?.closest("details") ?? null)
+    fold.open = true;
 }
 
 /** Show an error beside the one field that causes it. */
@@ -58,7 +66,8 @@ function plainText(failure: ServiceError | null): string | null {
   const words: Record<string, string> = {
     "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
     "foreign-features": "The service has another model than this page has loaded. Load the page again.",
-    "features-required": "This service takes no photographs. Load the page again: it then computes features in the browser.",
+    "features-required":
+      "This service takes no photographs. Load the page again: it then computes features in the browser.",
     overloaded: "The service is overloaded.",
     "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
   };

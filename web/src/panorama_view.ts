@@ -25,8 +25,12 @@ const METADATA_BYTES = 2 ** 18;
 export class PanoramaView {
   private readonly canvas = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly stage = h("div", {
-    class: "stage", tabindex: 0, role: "application", id: "stage",
-    "aria-label": "Photograph; arrow keys turn, plus and minus zoom", "aria-describedby": "fit-state",
+    class: "stage",
+    tabindex: 0,
+    role: "application",
+    id: "stage",
+    "aria-label": "Photograph; arrow keys turn, plus and minus zoom",
+    "aria-describedby": "fit-state",
   });
   private readonly picture = h("img", { class: "whole", alt: "" });
   private readonly holder = h("div", { class: "sphere" });
@@ -43,20 +47,37 @@ export class PanoramaView {
   private shown = true;
 
   /** `gazed` is called with the yaw from the picture's centre and the field of view, radians. */
-  constructor(root: HTMLElement, private readonly gazed: (yaw: number, fov: number) => void) {
+  constructor(
+    root: HTMLElement,
+    private readonly gazed: (yaw: number, fov: number) => void,
+  ) {
     this.shapes = {
       around: button("Look around", () => this.setShape("around"), { "aria-pressed": "true" }),
       whole: button("Whole picture", () => this.setShape("whole"), { "aria-pressed": "false" }),
     };
     const lines = h("input", { type: "checkbox", id: "lines-shown", checked: true });
-    lines.addEventListener("change", () => { this.shown = lines.checked; this.draw(); });
-    this.choices = h("div", { class: "segmented", role: "group", "aria-label": "View of the photograph" },
-      this.shapes.around, this.shapes.whole);
-    const bar = h("div", { class: "bar" },
+    lines.addEventListener("change", () => {
+      this.shown = lines.checked;
+      this.draw();
+    });
+    this.choices = h(
+      "div",
+      { class: "segmented", role: "group", "aria-label": "View of the photograph" },
+      this.shapes.around,
+      this.shapes.whole,
+    );
+    const bar = h(
+      "div",
+      { class: "bar" },
       this.choices,
       h("label", { class: "inline" }, lines, "Layout"),
-      button("Full screen", () => void (document.fullscreenElement === null ? root.requestFullscreen() : document.exitFullscreen()), { id: "full-screen" }),
-      legend());
+      button(
+        "Full screen",
+        () => void (document.fullscreenElement === null ? root.requestFullscreen() : document.exitFullscreen()),
+        { id: "full-screen" },
+      ),
+      legend(),
+    );
     this.stage.append(this.holder, this.picture, this.canvas);
     show(root, this.stage, bar);
     this.stage.addEventListener("keydown", (event) => this.onKey(event));
@@ -135,17 +156,22 @@ export class PanoramaView {
     }
     this.stage.dataset.shape = this.shape;
     this.choices.hidden = this.shape === "flat";
-    for (const [name, control] of Object.entries(this.shapes)) control.setAttribute("aria-pressed", String(name === this.shape));
+    for (const [name, control] of Object.entries(this.shapes))
+      control.setAttribute("aria-pressed", String(name === this.shape));
     this.draw();
   }
 
   private onKey(event: KeyboardEvent): void {
     if (this.sphere === null || this.shape !== "around") return;
     const turns: Record<string, Point> = {
-      ArrowLeft: [-TURN_BY, 0], ArrowRight: [TURN_BY, 0], ArrowUp: [0, TURN_BY], ArrowDown: [0, -TURN_BY],
+      ArrowLeft: [-TURN_BY, 0],
+      ArrowRight: [TURN_BY, 0],
+      ArrowUp: [0, TURN_BY],
+      ArrowDown: [0, -TURN_BY],
     };
     const zooms: Record<string, number> = { "+": 10, "=": 10, "-": -10 };
-    const turn = turns[event.key], zoom = zooms[event.key];
+    const turn = turns[event.key],
+      zoom = zooms[event.key];
     if (turn !== undefined) this.sphere.turnBy(...turn);
     else if (zoom !== undefined) this.sphere.zoomBy(zoom);
     else return;
@@ -187,7 +213,8 @@ export class PanoramaView {
 
   private projected(line: LayoutLine, gaze: Gaze, size: Size): Point[][] {
     const relative = line.points.map(([azimuth, elevation]): Point => [azimuth - this.heading, elevation]);
-    if (this.shape === "flat") return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
+    if (this.shape === "flat")
+      return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
     return this.shape === "around" ? perspective([relative], gaze, size) : equirectangular([relative], size);
   }
 
@@ -217,6 +244,9 @@ async function isSphere(file: Blob, { naturalWidth, naturalHeight }: HTMLImageEl
 }
 
 function legend(): HTMLElement {
-  return h("ul", { class: "legend", "aria-label": "Lines over the photograph" },
-    ...Object.entries(STROKES).map(([kind, { name }]) => h("li", {}, h("span", { class: `swatch ${kind}` }), name)));
+  return h(
+    "ul",
+    { class: "legend", "aria-label": "Lines over the photograph" },
+    ...Object.entries(STROKES).map(([kind, { name }]) => h("li", {}, h("span", { class: `swatch ${kind}` }), name)),
+  );
 }

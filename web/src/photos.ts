@@ -25,8 +25,13 @@ export interface Group {
 
 // Fields of the form by their names in the request.
 const SETTINGS = {
-  heading_deg: "heading", heading_tolerance_deg: "tolerance", camera_height_m: "camera-height", hfov_deg: "field-of-view",
-  projection: "projection", pitch_deg: "pitch", roll_deg: "roll",
+  heading_deg: "heading",
+  heading_tolerance_deg: "tolerance",
+  camera_height_m: "camera-height",
+  hfov_deg: "field-of-view",
+  projection: "projection",
+  pitch_deg: "pitch",
+  roll_deg: "roll",
 } as const;
 type Setting = keyof typeof SETTINGS;
 const NAMES = Object.keys(SETTINGS) as Setting[];
@@ -41,12 +46,12 @@ export class Photos {
   readonly compass: Compass;
   private readonly strip = byId("photo-strip");
   private readonly error = byId("photo-error");
-  private readonly inputs = Object.fromEntries(NAMES.map((name) =>
-    [name, byId<HTMLInputElement | HTMLSelectElement>(SETTINGS[name])])) as Record<Setting, HTMLInputElement | HTMLSelectElement>;
+  private readonly inputs = Object.fromEntries(
+    NAMES.map((name) => [name, byId<HTMLInputElement | HTMLSelectElement>(SETTINGS[name])]),
+  ) as Record<Setting, HTMLInputElement | HTMLSelectElement>;
   private readonly choice = byId<HTMLFieldSetElement>("together");
   private readonly all: Photo[] = [];
   private chosen: Photo | null = null;
-  private offersGroups = true;
 
   /** `changed` is called when another photograph is chosen or its settings change. */
   constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
@@ -79,14 +84,10 @@ export class Photos {
 
   /** All photographs, if they are to be localised together; null if each is localised by itself. */
   get group(): Group | null {
-    const motion = this.choice.hidden ? "" : this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "";
+    const motion = this.choice.hidden
+      ? ""
+      : (this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "");
     return motion === "turn" || motion === "walk" ? { motion, photos: this.all } : null;
-  }
-
-  /** Offer queries with several photographs, which venues do not have. */
-  offerGroups(offered: boolean): void {
-    this.offersGroups = offered;
-    this.drawStrip();
   }
 
   /** Add pictures and choose the first of them. */
@@ -97,9 +98,16 @@ export class Photos {
       const names = rejected.map((file) => `“${file.name}”`).join(", ");
       showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
     }
-    const added = files.filter(isPicture).map((file): Photo => ({
-      file, url: URL.createObjectURL(file), settings: { ...this.shared }, hints: NO_HINTS, answer: null, asked: { fields: {}, files: [file], onDevice: false },
-    }));
+    const added = files
+      .filter(isPicture)
+      .map((file): Photo => ({
+        file,
+        url: URL.createObjectURL(file),
+        settings: { ...this.shared },
+        hints: NO_HINTS,
+        answer: null,
+        asked: { fields: {}, files: [file], onDevice: false },
+      }));
     if (added.length > 0) this.forgetGroup();
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
@@ -160,7 +168,9 @@ export class Photos {
 
   private read(): void {
     if (this.chosen === null) return;
-    const given = NAMES.map((name) => [name, this.inputs[name].value.trim()] as const).filter(([, value]) => value !== "");
+    const given = NAMES.map((name) => [name, this.inputs[name].value.trim()] as const).filter(
+      ([, value]) => value !== "",
+    );
     this.chosen.settings = Object.fromEntries(given);
     this.share();
     this.showHeading();
@@ -196,20 +206,34 @@ export class Photos {
   }
 
   drawStrip(): void {
-    this.choice.hidden = this.all.length < 2 || !this.offersGroups;
+    this.choice.hidden = this.all.length < 2;
     const group = this.group;
     byId("find-all").hidden = this.all.length < 2 || group !== null;
     byId("find").textContent = group?.motion === "walk" ? "Find the places" : "Find the place";
-    show(this.strip, ...this.all.map((photo) => {
-      const name = photo.file.name.replace(/^example-/, "");
-      const choose = h("button", {
-        type: "button", class: "thumb", "aria-pressed": String(photo === this.chosen),
-        "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
-        onclick: () => this.choose(photo),
-      }, h("img", { src: photo.url, alt: "" }), h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`));
-      const remove = h("button", { type: "button", class: "remove", "aria-label": `Remove ${name}`, onclick: () => this.remove(photo) }, "×");
-      return h("li", {}, choose, remove);
-    }));
+    show(
+      this.strip,
+      ...this.all.map((photo) => {
+        const name = photo.file.name.replace(/^example-/, "");
+        const choose = h(
+          "button",
+          {
+            type: "button",
+            class: "thumb",
+            "aria-pressed": String(photo === this.chosen),
+            "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
+            onclick: () => this.choose(photo),
+          },
+          h("img", { src: photo.url, alt: "" }),
+          h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`),
+        );
+        const remove = h(
+          "button",
+          { type: "button", class: "remove", "aria-label": `Remove ${name}`, onclick: () => this.remove(photo) },
+          "×",
+        );
+        return h("li", {}, choose, remove);
+      }),
+    );
   }
 }
 

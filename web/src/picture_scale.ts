@@ -11,22 +11,44 @@ const FAR_STEPS = 20;
 
 export class PictureScale {
   readonly element: HTMLElement;
-  readonly metres = h("input", { type: "number", min: 0.01, step: "any", id: "picture-metres", placeholder: "4.2", inputmode: "decimal" });
+  readonly metres = h("input", {
+    type: "number",
+    min: 0.01,
+    step: "any",
+    id: "picture-metres",
+    placeholder: "4.2",
+    inputmode: "decimal",
+  });
   private readonly error = h("p", { class: "field-error", id: "picture-metres-error", role: "alert", hidden: true });
-  private readonly svg = s("svg", { class: "picture", role: "group", "aria-label": "The picture with the two ends of a known distance" });
+  private readonly svg = s("svg", {
+    class: "picture",
+    role: "group",
+    "aria-label": "The picture with the two ends of a known distance",
+  });
   private readonly picture = s("g");
   private readonly overlay = s("g", { class: "measured" });
   private readonly viewport: Viewport;
   private url: string | null = null;
   // As on a plan, y points up: points below the picture's upper edge have a negative y.
-  private ends: [Point, Point] = [[0, 0], [0, 0]];
+  private ends: [Point, Point] = [
+    [0, 0],
+    [0, 0],
+  ];
 
   constructor() {
     const drawing = h("div", { class: "drawing" }, this.svg);
-    this.element = h("div", { class: "picture-scale" },
-      h("p", { class: "hint" }, "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall. " +
-        "Without a distance, the dimensions written in the picture are used."), drawing,
-      h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres, this.error));
+    this.element = h(
+      "div",
+      { class: "picture-scale" },
+      h(
+        "p",
+        { class: "hint" },
+        "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall. " +
+          "Without a distance, the dimensions written in the picture are used.",
+      ),
+      drawing,
+      h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres, this.error),
+    );
     this.metres.addEventListener("input", () => clearError(this.error, { metres: this.metres }));
     this.svg.append(this.picture, this.overlay);
     // Capture runs before the viewport's listener, which would move the drawing.
@@ -47,9 +69,13 @@ export class PictureScale {
       throw new InputError(`The browser cannot show “${file.name}” as a picture.`);
     }
     this.url = url;
-    const width = picture.naturalWidth, height = picture.naturalHeight;
+    const width = picture.naturalWidth,
+      height = picture.naturalHeight;
     show(this.picture, s("image", { href: url, x: 0, y: 0, width, height }));
-    this.ends = [[0.25 * width, -0.5 * height], [0.75 * width, -0.5 * height]];
+    this.ends = [
+      [0.25 * width, -0.5 * height],
+      [0.75 * width, -0.5 * height],
+    ];
     this.viewport.fit({ x: 0, y: 0, width, height });
   }
 
@@ -70,23 +96,38 @@ export class PictureScale {
 
   /** Ask for the distance that is missing. */
   askForDistance(): void {
-    showFieldError(this.error, this.metres, "The picture states no scale: put the ends of the line on two points and enter their distance in metres.");
+    showFieldError(
+      this.error,
+      this.metres,
+      "The picture states no scale: put the ends of the line on two points and enter their distance in metres.",
+    );
   }
 
   private draw(): void {
     if (this.url === null) return;
-    const size = unitOf(this.viewport.current), [[ax, ay], [bx, by]] = this.ends;
+    const size = unitOf(this.viewport.current),
+      [[ax, ay], [bx, by]] = this.ends;
     const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
-    show(this.overlay, s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }), ...this.ends.map((end, index) => this.handle(end, index, size)));
+    show(
+      this.overlay,
+      s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }),
+      ...this.ends.map((end, index) => this.handle(end, index, size)),
+    );
     if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();
   }
 
   private handle([x, y]: Point, index: number, size: number): SVGElement {
     return s("circle", {
-      cx: x, cy: -y, r: 1.3 * size, class: "corner", tabindex: 0, role: "button",
+      cx: x,
+      cy: -y,
+      r: 1.3 * size,
+      class: "corner",
+      tabindex: 0,
+      role: "button",
       "aria-label": `${index === 0 ? "First" : "Second"} end of the line, at pixel ${x.toFixed(0)}, ${(-y).toFixed(0)}; arrow keys move it`,
       onkeydown: (event) => {
-        const key = event as KeyboardEvent, arrow = ARROWS[key.key];
+        const key = event as KeyboardEvent,
+          arrow = ARROWS[key.key];
         if (arrow === undefined) return;
         event.preventDefault();
         const steps = key.shiftKey ? FAR_STEPS : 1;
@@ -103,7 +144,8 @@ export class PictureScale {
   /** Drag the nearer end of the line; far from both, the viewport moves the picture. */
   private onDown(event: PointerEvent): void {
     if (event.button !== 0) return;
-    const place = placeOf(this.svg, event), reach = 4 * unitOf(this.viewport.current);
+    const place = placeOf(this.svg, event),
+      reach = 4 * unitOf(this.viewport.current);
     const distances = this.ends.map(([x, y]) => Math.hypot(x - place[0], y - place[1]));
     const index = distances[0]! <= distances[1]! ? 0 : 1;
     if (distances[index]! > reach) return;
@@ -112,4 +154,3 @@ export class PictureScale {
     followPointer((moving) => this.put(index, placeOf(this.svg, moving)));
   }
 }
-

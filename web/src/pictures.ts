@@ -9,8 +9,23 @@ import type { Photo } from "./photos";
 // Pixels of the longer side, and properties that style sheets set.
 const PIXELS = 2400;
 const STYLES = [
-  "display", "fill", "fill-opacity", "font-family", "font-size", "font-weight", "opacity", "paint-order", "stroke", "stroke-dasharray",
-  "stroke-linecap", "stroke-linejoin", "stroke-opacity", "stroke-width", "text-anchor", "vector-effect", "visibility",
+  "display",
+  "fill",
+  "fill-opacity",
+  "font-family",
+  "font-size",
+  "font-weight",
+  "opacity",
+  "paint-order",
+  "stroke",
+  "stroke-dasharray",
+  "stroke-linecap",
+  "stroke-linejoin",
+  "stroke-opacity",
+  "stroke-width",
+  "text-anchor",
+  "vector-effect",
+  "visibility",
 ];
 
 /** Save the map with a click on its button; `name` returns the name of the plan. */
@@ -34,7 +49,8 @@ export async function savePicture(photo: Photo, fields: Record<string, HTMLEleme
 
 /** Save the visible part of the map as PNG. */
 async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
-  const { width, height } = map.getBoundingClientRect(), scale = PIXELS / Math.max(width, height);
+  const { width, height } = map.getBoundingClientRect(),
+    scale = PIXELS / Math.max(width, height);
   const picture = new Image();
   picture.src = URL.createObjectURL(new Blob([standalone(map, scale)], { type: "image/svg+xml" }));
   try {
@@ -60,9 +76,11 @@ async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
 function standalone(map: SVGSVGElement, scale: number): string {
   const { width, height } = map.getBoundingClientRect();
   const copy = map.cloneNode(true) as SVGSVGElement;
-  const shown = map.querySelectorAll("*"), copied = copy.querySelectorAll<SVGElement>("*");
+  const shown = map.querySelectorAll("*"),
+    copied = copy.querySelectorAll<SVGElement>("*");
   shown.forEach((element, index) => {
-    const computed = getComputedStyle(element), style = copied[index]!.style;
+    const computed = getComputedStyle(element),
+      style = copied[index]!.style;
     for (const property of STYLES) style.setProperty(property, computed.getPropertyValue(property));
     // Strokes in pixels of the screen.
     if (computed.vectorEffect !== "non-scaling-stroke") return;

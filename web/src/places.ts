@@ -29,7 +29,8 @@ export function placesOf(answer: Answer): Place[] {
   });
   const [first] = places;
   // The candidates can leave out headings between theirs; the confidence counts all.
-  if (first !== undefined && first.probability !== null) first.probability = Math.max(first.probability, answer.confidence ?? 0);
+  if (first !== undefined && first.probability !== null)
+    first.probability = Math.max(first.probability, answer.confidence ?? 0);
   return places.filter(({ probability }, rank) => rank === 0 || isShown(probability));
 }
 

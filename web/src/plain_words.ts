@@ -2,14 +2,35 @@
 
 // Labels of this page by the names of fields.
 const LABELS: Record<string, string> = {
-  heading_deg: "Heading", headings_deg: "Heading", heading_tolerance_deg: "Heading error", camera_height_m: "Camera height",
-  hfov_deg: "Field of view", pitch_deg: "Tilted up by", roll_deg: "Leaning right by", near: "Mark", radius_m: "Radius",
-  rooms: "Rooms", strict: "Search only within the hints", level: "Storey", units: "Unit", scale: "Scale on paper",
-  metres_per_pixel: "Metres per pixel", known_distance: "Distance of the ends", page: "Page of a PDF", layers: "Only these layers",
-  ceiling_height_m: "Ceiling", opening_kinds: "Complete in this plan", projection: "Kind", motion: "These photographs are",
+  heading_deg: "Heading",
+  headings_deg: "Heading",
+  heading_tolerance_deg: "Heading error",
+  camera_height_m: "Camera height",
+  hfov_deg: "Field of view",
+  pitch_deg: "Tilted up by",
+  roll_deg: "Leaning right by",
+  near: "Mark",
+  radius_m: "Radius",
+  rooms: "Rooms",
+  strict: "Search only within the hints",
+  level: "Level",
+  units: "Unit",
+  scale: "Scale on paper",
+  metres_per_pixel: "Metres per pixel",
+  known_distance: "Distance of the ends",
+  page: "Page of a PDF",
+  layers: "Only these layers",
+  ceiling_height_m: "Ceiling",
+  opening_kinds: "Complete in this plan",
+  projection: "Kind",
+  motion: "These photographs are",
 };
 // Words of the page for values of fields.
-const VALUES: Record<string, string> = { cylindrical: "panorama mode of a phone", equirectangular: "360° photograph", turn: "taken from one spot, turning" };
+const VALUES: Record<string, string> = {
+  cylindrical: "panorama mode of a phone",
+  equirectangular: "360° photograph",
+  turn: "taken from one spot, turning",
+};
 
 /** Return the label of a field, by its name in the API. */
 export const labelOf = (field: string): string => LABELS[field] ?? field;
@@ -18,7 +39,10 @@ export const labelOf = (field: string): string => LABELS[field] ?? field;
 export function plainWords(message: string): string {
   return message
     .replace(/\b([a-z]+)=(\w+)/g, (whole, field: string, value: string) =>
-      field in LABELS ? `“${labelOf(field)}” (${VALUES[value] ?? value})` : whole)
-    .replace(/`?\b([a-z]+(?:_[a-z]+)+)\b`?/g, (whole, field: string) => (field in LABELS ? `“${labelOf(field)}”` : whole))
+      field in LABELS ? `“${labelOf(field)}” (${VALUES[value] ?? value})` : whole,
+    )
+    .replace(/`?\b([a-z]+(?:_[a-z]+)+)\b`?/g, (whole, field: string) =>
+      field in LABELS ? `“${labelOf(field)}”` : whole,
+    )
     .replace(/`([a-z]+)`/g, (whole, field: string) => (field in LABELS ? `“${labelOf(field)}”` : whole));
 }

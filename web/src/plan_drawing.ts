@@ -22,9 +22,12 @@ export const lostAreas = (plan: Plan | null): Point[][] => plan?.import_report?.
 export function boxOf(plan: PlanDocument, lost: Point[][] = []): Box {
   const points = [...plan.rooms.map((room) => room.polygon), ...lost].flat();
   if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
-  const xs = points.map(([x]) => x), ys = points.map(([, y]) => -y);
-  const x = Math.min(...xs), y = Math.min(...ys);
-  const width = Math.max(...xs) - x, height = Math.max(...ys) - y;
+  const xs = points.map(([x]) => x),
+    ys = points.map(([, y]) => -y);
+  const x = Math.min(...xs),
+    y = Math.min(...ys);
+  const width = Math.max(...xs) - x,
+    height = Math.max(...ys) - y;
   const margin = MARGIN * Math.max(width, height, 1);
   return { x: x - margin, y: y - margin, width: width + 2 * margin, height: height + 2 * margin };
 }
@@ -41,43 +44,76 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument, lost: Point[][]
     const whole = path(room.polygon) + (room.holes ?? []).map(path).join("");
     return s("path", { class: `room ${room.type ?? "unknown"}`, d: whole, "fill-rule": "evenodd" });
   });
-  const walls = plan.rooms.flatMap((room) => (room.walls ?? []).map(([a, b]) =>
-    s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })));
+  const walls = plan.rooms.flatMap((room) =>
+    (room.walls ?? []).map(([a, b]) => s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })),
+  );
   // Walls are strokes around floors; the strokes of adjacent rooms meet.
-  const solid = s("path", { class: "solid", d: plan.rooms.map((room) => path(room.polygon)).join(""), "stroke-width": 2 * WALL_M });
-  show(group, ...lost.map((area) => s("path", { class: "no-room", d: path(area) })), solid, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
+  const solid = s("path", {
+    class: "solid",
+    d: plan.rooms.map((room) => path(room.polygon)).join(""),
+    "stroke-width": 2 * WALL_M,
+  });
+  show(
+    group,
+    ...lost.map((area) => s("path", { class: "no-room", d: path(area) })),
+    solid,
+    ...rooms,
+    ...walls,
+    ...(plan.openings ?? []).map(openingShape),
+  );
 }
 
 /** Draw names, north arrow and scale bar into a group on top of the drawing. */
 export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost: Point[][]): void {
-  const unit = unitOf(box), named = plan.rooms.map((room, index): [Point[], string] => [room.polygon, room.name || `room ${index + 1}`]);
-  show(group, ...[...named, ...lost.map((area): [Point[], string] => [area, "no room"])].flatMap(([polygon, name]) => {
-    const { place: [x, y], clearance } = labelPlace(polygon);
-    const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
-    return size < 0.8 * unit ? [] : [s("text", { class: "name", x, y: -y + 0.35 * size, "font-size": size.toFixed(3) }, name)];
-  }), scaleBar(box), north(plan, box));
+  const unit = unitOf(box),
+    named = plan.rooms.map((room, index): [Point[], string] => [room.polygon, room.name || `room ${index + 1}`]);
+  show(
+    group,
+    ...[...named, ...lost.map((area): [Point[], string] => [area, "no room"])].flatMap(([polygon, name]) => {
+      const {
+        place: [x, y],
+        clearance,
+      } = labelPlace(polygon);
+      const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
+      return size < 0.8 * unit
+        ? []
+        : [s("text", { class: "name", x, y: -y + 0.35 * size, "font-size": size.toFixed(3) }, name)];
+    }),
+    scaleBar(box),
+    north(plan, box),
+  );
 }
 
 function openingShape(opening: OpeningDocument): SVGGElement {
   const [[ax, ay], [bx, by]] = opening.line;
   const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
   // A wall-wide stroke in the colour of the floor interrupts the wall.
-  return s("g", { class: `opening ${opening.kind}` }, s("line", { class: "gap", "stroke-width": 2.1 * WALL_M, ...line }), s("line", { class: "leaf", ...line }));
+  return s(
+    "g",
+    { class: `opening ${opening.kind}` },
+    s("line", { class: "gap", "stroke-width": 2.1 * WALL_M, ...line }),
+    s("line", { class: "leaf", ...line }),
+  );
 }
 
 const RASTER = 24;
 
 /** Return the raster point farthest from the walls of a room, and its distance to them. */
 export function labelPlace(polygon: Point[]): { place: Point; clearance: number } {
-  const xs = polygon.map(([x]) => x), ys = polygon.map(([, y]) => y);
-  const left = Math.min(...xs), low = Math.min(...ys);
-  const width = Math.max(...xs) - left, height = Math.max(...ys) - low;
+  const xs = polygon.map(([x]) => x),
+    ys = polygon.map(([, y]) => y);
+  const left = Math.min(...xs),
+    low = Math.min(...ys);
+  const width = Math.max(...xs) - left,
+    height = Math.max(...ys) - low;
   let best: { place: Point; clearance: number } = { place: polygon[0]!, clearance: -1 };
   for (let row = 1; row < RASTER; row++) {
     for (let column = 1; column < RASTER; column++) {
       const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
       if (!inside(polygon, ...place)) continue;
-      const clearance = Math.min(...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)));
+      const clearance = Math.min(
+        ...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)),
+      );
       // Prefer the centre among equally good points.
       const aside = Math.hypot(column / RASTER - 0.5, row / RASTER - 0.5);
       if (clearance * (1 - 0.1 * aside) > best.clearance) best = { place, clearance };
@@ -88,23 +124,36 @@ export function labelPlace(polygon: Point[]): { place: Point; clearance: number 
 
 /** Return the distance of a point to a segment. */
 export function distanceTo([x, y]: Point, [ax, ay]: Point, [bx, by]: Point): number {
-  const ex = bx - ax, ey = by - ay, square = ex * ex + ey * ey;
+  const ex = bx - ax,
+    ey = by - ay,
+    square = ex * ex + ey * ey;
   const share = square === 0 ? 0 : Math.max(0, Math.min(1, ((x - ax) * ex + (y - ay) * ey) / square));
   return Math.hypot(x - ax - share * ex, y - ay - share * ey);
 }
 
 function scaleBar(box: Box): SVGGElement {
   const length = [0.1, 0.5, 1, 2, 5, 10, 20, 50, 100].find((metres) => metres > 0.1 * box.width) ?? 100;
-  const unit = unitOf(box), x = box.x + 1.5 * unit, y = box.y + box.height - 1.5 * unit;
-  return s("g", { class: "scale", "aria-hidden": "true" },
+  const unit = unitOf(box),
+    x = box.x + 1.5 * unit,
+    y = box.y + box.height - 1.5 * unit;
+  return s(
+    "g",
+    { class: "scale", "aria-hidden": "true" },
     s("path", { d: `M${x} ${y - 0.6 * unit}v${0.6 * unit}h${length}v${-0.6 * unit}` }),
-    s("text", { x: x + length + unit, y: y + 0.4 * unit, "font-size": 1.7 * unit, class: "start" }, `${length} m`));
+    s("text", { x: x + length + unit, y: y + 0.4 * unit, "font-size": 1.7 * unit, class: "start" }, `${length} m`),
+  );
 }
 
 function north(plan: PlanDocument, box: Box): SVGGElement | null {
   if (plan.north_deg === null || plan.north_deg === undefined) return null;
   const unit = unitOf(box);
-  return s("g", { class: "north", transform: `translate(${box.x + box.width - 4 * unit} ${box.y + box.height - 4 * unit})` },
-    s("path", { d: `M0 ${-3 * unit}L${unit} ${unit}L0 ${0.4 * unit}L${-unit} ${unit}Z`, transform: `rotate(${plan.north_deg})` }),
-    s("text", { y: 3 * unit, "font-size": 1.8 * unit }, "N"));
+  return s(
+    "g",
+    { class: "north", transform: `translate(${box.x + box.width - 4 * unit} ${box.y + box.height - 4 * unit})` },
+    s("path", {
+      d: `M0 ${-3 * unit}L${unit} ${unit}L0 ${0.4 * unit}L${-unit} ${unit}Z`,
+      transform: `rotate(${plan.north_deg})`,
+    }),
+    s("text", { y: 3 * unit, "font-size": 1.8 * unit }, "N"),
+  );
 }

@@ -10,7 +10,8 @@ import { acceptDrops } from "./photos";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */
-const isCertain = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
+const isCertain = (plan: Plan): boolean =>
+  !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
 
 const SEARCH_AFTER_MS = 250;
 const PICTURES = /^image\/(png|jpeg)$/;
@@ -37,8 +38,11 @@ export class Plans {
   private readonly search = byId<HTMLInputElement>("plan-search");
   private readonly error = byId("plan-error");
   private readonly menu = byId<HTMLDetailsElement>("plan-menu");
-  private readonly importing = new ImportForm((file, fields) => void this.upload(file, fields),
-    (file, fields) => void this.uploadLevels(file, fields), () => this.cancelImport());
+  private readonly importing = new ImportForm(
+    (file, fields) => void this.upload(file, fields),
+    (file, fields) => void this.uploadLevels(file, fields),
+    () => this.cancelImport(),
+  );
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
   private found: PlanSummary[] = [];
   private cursor: string | null = null;
@@ -65,7 +69,9 @@ export class Plans {
       input.value = "";
       if (file !== undefined) this.begin(file);
     });
-    acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) this.begin(files[0]); });
+    acceptDrops(byId("plan-panel"), (files) => {
+      if (files[0] !== undefined) this.begin(files[0]);
+    });
   }
 
   /** Close the menu after a choice, with Escape, and with a click outside. */
@@ -172,7 +178,8 @@ export class Plans {
     } catch (error) {
       const levels = error instanceof ServiceError ? error.levels : [];
       this.importing.ask(file, true, levels);
-      if (levels.length === 0 && !this.importing.askForScale(error)) showError(this.error, error, this.importing.fields);
+      if (levels.length === 0 && !this.importing.askForScale(error))
+        showError(this.error, error, this.importing.fields);
     } finally {
       if (state.textContent.startsWith("Importing")) state.textContent = "";
     }
@@ -181,7 +188,8 @@ export class Plans {
   /** Upload all levels of a file as plans and their venue. */
   private async uploadLevels(file: File, fields: Record<string, string>): Promise<void> {
     clearError(this.error, this.importing.fields);
-    const request = this.discardPending(), state = byId("plan-state");
+    const request = this.discardPending(),
+      state = byId("plan-state");
     state.textContent = `Importing all levels of “${file.name}” …`;
     try {
       const venue = await api.uploadLevels(file, fields);
@@ -201,12 +209,16 @@ export class Plans {
   private async follow(plan: Plan): Promise<void> {
     const own = (this.following = new AbortController());
     try {
-      await followPlan(plan.id, (event) => {
-        if (this.current?.id !== plan.id) return;
-        if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
-        else if (event.status === "deleted") this.take(null);
-        else void this.renew(plan.id);
-      }, own.signal);
+      await followPlan(
+        plan.id,
+        (event) => {
+          if (this.current?.id !== plan.id) return;
+          if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
+          else if (event.status === "deleted") this.take(null);
+          else void this.renew(plan.id);
+        },
+        own.signal,
+      );
     } catch (error) {
       if (!own.signal.aborted) showError(this.error, error);
     }
@@ -248,24 +260,48 @@ export class Plans {
     const dialog = byId<HTMLDialogElement>("delete-dialog");
     byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
     dialog.showModal();
-    return new Promise((resolve) => dialog.addEventListener("close", () => {
-      resolve(dialog.returnValue === "delete");
-      dialog.returnValue = "";
-    }, { once: true }));
+    return new Promise((resolve) =>
+      dialog.addEventListener(
+        "close",
+        () => {
+          resolve(dialog.returnValue === "delete");
+          dialog.returnValue = "";
+        },
+        { once: true },
+      ),
+    );
   }
 
   private draw(): void {
     const entries = this.found.map((plan) => {
-      const state = plan.status === "preparing" ? `preparing, ${Math.round(100 * plan.progress)} %` : plan.status === "failed" ? "failed" : "";
+      const state =
+        plan.status === "preparing"
+          ? `preparing, ${Math.round(100 * plan.progress)} %`
+          : plan.status === "failed"
+            ? "failed"
+            : "";
       const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
-      const choose = h("button", {
-        type: "button", class: "plan", "aria-pressed": String(plan.id === this.current?.id), onclick: () => this.pick(plan.id),
-      }, h("span", { class: "name" }, plan.name), h("span", { class: "facts" }, facts.filter(Boolean).join(", ")));
-      const remove = h("button", { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) }, "×");
+      const choose = h(
+        "button",
+        {
+          type: "button",
+          class: "plan",
+          "aria-pressed": String(plan.id === this.current?.id),
+          onclick: () => this.pick(plan.id),
+        },
+        h("span", { class: "name" }, plan.name),
+        h("span", { class: "facts" }, facts.filter(Boolean).join(", ")),
+      );
+      const remove = h(
+        "button",
+        { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) },
+        "×",
+      );
       return h("li", {}, choose, remove);
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));
     byId("plan-none").hidden = this.found.length > 0;
-    byId("plan-none").textContent = byId<HTMLInputElement>("plan-search").value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
+    byId("plan-none").textContent =
+      byId<HTMLInputElement>("plan-search").value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
   }
 }

@@ -24,7 +24,9 @@ export function showCursor(svg: SVGSVGElement): void {
     const [x, y] = placeOf(svg, event);
     text.textContent = `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m`;
   });
-  svg.addEventListener("pointerleave", () => { text.textContent = ""; });
+  svg.addEventListener("pointerleave", () => {
+    text.textContent = "";
+  });
 }
 
 export class PoseMarker {
@@ -36,12 +38,26 @@ export class PoseMarker {
   private view = { yaw: 0, fov: 1.5 };
   private unit = 0.1;
 
-  constructor(private readonly svg: SVGSVGElement, private readonly moved: (pose: Pose) => void) {
+  constructor(
+    private readonly svg: SVGSVGElement,
+    private readonly moved: (pose: Pose) => void,
+  ) {
     const dot = s("circle", { class: "dot", r: 1 });
-    this.element = s("g", {
-      class: "marker", tabindex: 0, role: "application", id: "marker",
-      "aria-label": "Camera on the plan. Arrow keys move it, with Shift in large steps; comma and full stop turn it.",
-    }, this.cone, this.arrow, this.knob, s("circle", { class: "grip", r: 1 }), dot);
+    this.element = s(
+      "g",
+      {
+        class: "marker",
+        tabindex: 0,
+        role: "application",
+        id: "marker",
+        "aria-label": "Camera on the plan. Arrow keys move it, with Shift in large steps; comma and full stop turn it.",
+      },
+      this.cone,
+      this.arrow,
+      this.knob,
+      s("circle", { class: "grip", r: 1 }),
+      dot,
+    );
     this.follow(this.element.querySelector(".grip")!, ([x, y]) => ({ ...this.pose, x_m: x, y_m: y }));
     this.follow(dot, ([x, y]) => ({ ...this.pose, x_m: x, y_m: y }));
     this.follow(this.knob, ([x, y]) => {
@@ -65,17 +81,24 @@ export class PoseMarker {
   }
 
   private draw(): void {
-    const unit = this.unit, { x_m, y_m, heading_deg } = this.pose;
+    const unit = this.unit,
+      { x_m, y_m, heading_deg } = this.pose;
     this.element.setAttribute("transform", `translate(${x_m} ${-y_m})`);
     this.element.querySelector(".dot")!.setAttribute("r", String(1.1 * unit));
     this.element.querySelector(".grip")!.setAttribute("r", String(2.6 * unit));
     const tip = (azimuth: number, length: number): string =>
       `${(length * Math.sin(azimuth)).toFixed(4)} ${(-length * Math.cos(azimuth)).toFixed(4)}`;
-    const heading = radians(heading_deg), middle = heading + this.view.yaw, half = 0.5 * Math.min(this.view.fov, 6.2);
+    const heading = radians(heading_deg),
+      middle = heading + this.view.yaw,
+      half = 0.5 * Math.min(this.view.fov, 6.2);
     // A view all around has no direction.
     this.cone.classList.toggle("none", this.view.fov > Math.PI);
-    const far = 16 * unit, large = half > Math.PI / 2 ? 1 : 0;
-    this.cone.setAttribute("d", `M0 0L${tip(middle - half, far)}A${far} ${far} 0 ${large} 1 ${tip(middle + half, far)}Z`);
+    const far = 16 * unit,
+      large = half > Math.PI / 2 ? 1 : 0;
+    this.cone.setAttribute(
+      "d",
+      `M0 0L${tip(middle - half, far)}A${far} ${far} 0 ${large} 1 ${tip(middle + half, far)}Z`,
+    );
     this.arrow.setAttribute("d", `M${tip(heading, 1.1 * unit)}L${tip(heading, 6.4 * unit)}`);
     const [knobX, knobY] = tip(heading, 7.2 * unit).split(" ");
     this.knob.setAttribute("cx", knobX!);
@@ -101,13 +124,18 @@ export class PoseMarker {
   private onKey(event: KeyboardEvent): void {
     const step = event.shiftKey ? FAR_STEP_M : STEP_M;
     const steps: Record<string, Point> = {
-      ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step],
+      ArrowLeft: [-step, 0],
+      ArrowRight: [step, 0],
+      ArrowUp: [0, step],
+      ArrowDown: [0, -step],
     };
     const turns: Record<string, number> = { ",": -TURN_DEG, ".": TURN_DEG };
-    const moved = steps[event.key], turned = turns[event.key];
+    const moved = steps[event.key],
+      turned = turns[event.key];
     if (moved === undefined && turned === undefined) return;
     event.preventDefault();
-    const { x_m, y_m, heading_deg } = this.pose, [dx, dy] = moved ?? [0, 0];
+    const { x_m, y_m, heading_deg } = this.pose,
+      [dx, dy] = moved ?? [0, 0];
     this.move({ x_m: x_m + dx, y_m: y_m + dy, heading_deg: (heading_deg + (turned ?? 0) + 360) % 360 });
   }
 }

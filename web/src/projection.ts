@@ -20,15 +20,18 @@ type Vector = [number, number, number];
 /** Project lines of (yaw, elevation) as a camera sees them; parts behind it are cut off. */
 export function perspective(lines: Point[][], gaze: Gaze, size: Size): Point[][] {
   const focal = (0.5 * size.height) / Math.tan(0.5 * gaze.verticalFov);
-  const sine = Math.sin(gaze.pitch), cosine = Math.cos(gaze.pitch);
+  const sine = Math.sin(gaze.pitch),
+    cosine = Math.cos(gaze.pitch);
   const turned = ([yaw, elevation]: Point): Vector => {
     const right = Math.cos(elevation) * Math.sin(yaw - gaze.yaw);
     const forward = Math.cos(elevation) * Math.cos(yaw - gaze.yaw);
     const up = Math.sin(elevation);
     return [right, up * cosine - forward * sine, forward * cosine + up * sine];
   };
-  const onScreen = ([right, up, forward]: Vector): Point =>
-    [0.5 * size.width + (focal * right) / forward, 0.5 * size.height - (focal * up) / forward];
+  const onScreen = ([right, up, forward]: Vector): Point => [
+    0.5 * size.width + (focal * right) / forward,
+    0.5 * size.height - (focal * up) / forward,
+  ];
   return lines.flatMap((line) => inFront(line.map(turned)).map((piece) => piece.map(onScreen)));
 }
 
@@ -53,13 +56,16 @@ function inFront(line: Vector[]): Vector[][] {
 
 /** Project the same lines to the flat picture; lines that cross its edge are cut in two. */
 export function equirectangular(lines: Point[][], size: Size): Point[][] {
-  const place = ([yaw, elevation]: Point, turns: number): Point =>
-    [((yaw - turns * 2 * Math.PI) / (2 * Math.PI) + 0.5) * size.width, (0.5 - elevation / Math.PI) * size.height];
+  const place = ([yaw, elevation]: Point, turns: number): Point => [
+    ((yaw - turns * 2 * Math.PI) / (2 * Math.PI) + 0.5) * size.width,
+    (0.5 - elevation / Math.PI) * size.height,
+  ];
   const turnOf = ([yaw]: Point): number => Math.floor((yaw + Math.PI) / (2 * Math.PI));
   return lines.flatMap((line) => {
     const pieces: Point[][] = [[]];
     line.forEach((point, index) => {
-      const turn = turnOf(point), previous = line[index - 1];
+      const turn = turnOf(point),
+        previous = line[index - 1];
       if (previous !== undefined && turnOf(previous) !== turn) {
         // Both parts continue beyond their edge of the canvas.
         pieces.at(-1)!.push(place(point, turnOf(previous)));

@@ -4,42 +4,67 @@ import { api } from "./api";
 import { device } from "./device/device";
 import { hintFields } from "./hints";
 import type { Group, Photo } from "./photos";
-import type { Answer, Plan, SequenceAnswer, Venue } from "./types";
+import type { Answer, ChosenVenue, Plan, SequenceAnswer } from "./types";
+
+/** Plan or venue to search. */
+export type Place = Plan | ChosenVenue;
+
+const isVenue = (place: Place): place is ChosenVenue => "listed" in place;
+const placeFields = (place: Place): Record<string, string> =>
+  isVenue(place) ? { venue_id: place.id } : { floorplan_id: place.id };
 
 /** Ask for one photograph in a venue, or in a plan with a map of its probabilities. */
-export async function askSingle(place: Venue | Plan, photo: Photo, signal: AbortSignal): Promise<void> {
-  const isVenue = "plans" in place;
-  const fields: Record<string, string> = isVenue ? { venue_id: place.id, ...photo.settings } :
-    { floorplan_id: place.id, ...hintFields(photo.hints), ...photo.settings };
+export async function askSingle(place: Place, photo: Photo, signal: AbortSignal): Promise<void> {
+  const fields = { ...placeFields(place), ...hintFields(photo.hints), ...photo.settings };
   photo.asked = { fields, files: [photo.file], onDevice: device.isOn };
-  const answer = await device.send([photo.file], isVenue ? fields : { ...fields, include: "posterior" },
-    ([picture], own) => api.localise(own, picture!, { signal }));
+  const answer = await device.send(
+    [photo.file],
+    isVenue(place) ? fields : { ...fields, include: "posterior" },
+    ([picture], own) => api.localise(own, picture!, { signal }),
+  );
   if (!signal.aborted) photo.answer = answer;
 }
 
 /** Ask for photographs of one visit together. */
-export async function askTogether(plan: Plan, { motion, photos }: Group, signal: AbortSignal): Promise<void> {
+export async function askTogether(place: Place, { motion, photos }: Group, signal: AbortSignal): Promise<void> {
   const { heading_deg: _, heading_tolerance_deg: tolerance, ...shared } = photos[0]!.settings;
-  const headings = photos.map(({ settings }) => (settings.heading_deg === undefined ? null : Number(settings.heading_deg)));
-  const fields: Record<string, string> = { floorplan_id: plan.id, motion, ...shared };
+  const headings = photos.map(({ settings }) =>
+    settings.heading_deg === undefined ? null : Number(settings.heading_deg),
+  );
+  const fields: Record<string, string> = { ...placeFields(place), motion, ...shared };
   if (headings.some((heading) => heading !== null)) {
     fields.headings_deg = JSON.stringify(headings);
     if (tolerance !== undefined) fields.heading_tolerance_deg = tolerance;
   }
-  const files = photos.map(({ file }) => file), onDevice = device.isOn;
+  const files = photos.map(({ file }) => file),
+    onDevice = device.isOn;
   const found = await device.send(files, fields, (pictures, own) => api.localiseSequence(own, pictures, { signal }));
   if (signal.aborted) return;
   photos.forEach((photo, index) => {
     photo.asked = { fields, files, onDevice };
-    photo.answer = answerOf(found, index, motion);
+    photo.answer = answerOf(found, index, motion, place);
   });
 }
 
 /** Return the answer to one photograph of several. */
-function answerOf(found: SequenceAnswer, index: number, motion: Group["motion"]): Answer {
-  const { poses, confidence, warnings, ...common } = found, pose = poses[index]!;
+function answerOf(found: SequenceAnswer, index: number, motion: Group["motion"], place: Place): Answer {
+  const { poses, confidence, warnings, floorplan_revision, ...common } = found;
+  const pose = poses[index]!;
+  const among = new Set(pose.candidates.map(({ floorplan_id }) => floorplan_id));
   return {
-    ...common, ...pose, warnings: [...pose.warnings, ...warnings], venue_id: null, level: null, plans: null, answer_id: null,
-    posterior: null, together: { motion, photographs: poses.length, confidence },
+    ...common,
+    ...pose,
+    warnings: [...pose.warnings, ...warnings],
+    floorplan_revision: pose.floorplan_id === found.floorplan_id ? floorplan_revision : undefined,
+    level: pose.level ?? null,
+    // A sequence has no probabilities of plans.
+    plans: isVenue(place)
+      ? place.listed
+          .filter(({ floorplan_id }) => among.has(floorplan_id))
+          .map((plan) => ({ ...plan, probability: null }))
+      : null,
+    answer_id: null,
+    posterior: null,
+    together: { motion, photographs: poses.length, confidence },
   };
 }

@@ -36,7 +36,12 @@ export class LiveSession {
   readonly layer = s("g", { class: "session" });
   private readonly state = h("div", { "aria-live": "polite" });
   private readonly error = h("div", { class: "error", id: "session-error", role: "alert", hidden: true });
-  private readonly input = h("input", { type: "file", id: "session-file", accept: byId<HTMLInputElement>("photo-file").accept, multiple: true });
+  private readonly input = h("input", {
+    type: "file",
+    id: "session-file",
+    accept: byId<HTMLInputElement>("photo-file").accept,
+    multiple: true,
+  });
   private readonly begin = button("Follow a camera here", () => void this.start(), { id: "session-start" });
   private readonly next = h("label", { class: "file" }, this.input, h("span", {}, "Add the next photo"));
   private readonly stop = button("Stop", () => void this.end(), { id: "session-stop" });
@@ -52,7 +57,11 @@ export class LiveSession {
       this.input.value = "";
       void this.add(files);
     });
-    byId("session").append(h("div", { class: "session-bar" }, this.begin, this.next, this.stop), this.error, this.state);
+    byId("session").append(
+      h("div", { class: "session-bar" }, this.begin, this.next, this.stop),
+      this.error,
+      this.state,
+    );
     this.draw();
   }
 
@@ -119,8 +128,9 @@ export class LiveSession {
   private async sent(file: File): Promise<Session> {
     for (let tries = 1; ; tries++) {
       try {
-        return await device.send([file], { number: String(this.session!.photographs + 1) },
-          ([picture], fields) => api.addPhotograph(this.session!.id, fields, picture!));
+        return await device.send([file], { number: String(this.session!.photographs + 1) }, ([picture], fields) =>
+          api.addPhotograph(this.session!.id, fields, picture!),
+        );
       } catch (error) {
         const isBusy = error instanceof ServiceError && error.slug === "session-busy";
         if (!isBusy || tries === BUSY_TRIES || this.session === null) throw error;
@@ -161,21 +171,36 @@ export class LiveSession {
 
   private describe({ mode, pose, photographs, id }: Session): void {
     const others = (pose?.candidates ?? []).slice(1).filter(({ probability }) => probability >= MIN_SHARE);
-    const level = (at: { level?: number | null }): string => (at.level === null || at.level === undefined ? "" : `, level ${at.level}`);
-    show(this.state,
+    const level = (at: { level?: number | null }): string =>
+      at.level === null || at.level === undefined ? "" : `, level ${at.level}`;
+    show(
+      this.state,
       h("p", { id: "session-mode", class: `mode ${mode}` }, pose === null ? "Add the first photograph." : MODES[mode]),
-      pose !== null && h("p", { id: "session-pose" }, h("strong", {}, `${pose.room}${level(pose)}`),
-        ` ${percent(pose.probability)} probable, after ${photographs} ${photographs === 1 ? "photograph" : "photographs"}`),
-      others.length > 0 && h("p", { class: "hint" }, `Also possible: ${others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`).join(", ")}`),
+      pose !== null &&
+        h(
+          "p",
+          { id: "session-pose" },
+          h("strong", {}, `${pose.room}${level(pose)}`),
+          ` ${percent(pose.probability)} probable, after ${photographs} ${photographs === 1 ? "photograph" : "photographs"}`,
+        ),
+      others.length > 0 &&
+        h(
+          "p",
+          { class: "hint" },
+          `Also possible: ${others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`).join(", ")}`,
+        ),
       ...(pose?.warnings ?? []).map((warning) => h("p", { class: "hint" }, warning)),
-      h("p", { class: "hint" }, "Others can watch at ", h("a", { href: `#session=${id}` }, "this address"), "."));
+      h("p", { class: "hint" }, "Others can watch at ", h("a", { href: `#session=${id}` }, "this address"), "."),
+    );
   }
 
   private draw(): void {
     const { session } = this;
     this.begin.hidden = session !== null;
     this.next.hidden = this.stop.hidden = session === null;
-    const { id, box } = this.plan, unit = unitOf(box), pose = session?.pose ?? null;
+    const { id, box } = this.plan,
+      unit = unitOf(box),
+      pose = session?.pose ?? null;
     if (session === null || pose === null || id === undefined) {
       show(this.layer);
       return;
@@ -184,14 +209,43 @@ export class LiveSession {
     const path = session.path.filter(isHere).map(({ position }) => position);
     const [[xx, xy], [, yy]] = pose.covariance;
     const { x_m, y_m } = pose.position;
-    show(this.layer,
-      s("path", { class: "track", d: path.map(({ x_m: x, y_m: y }, index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join("") }),
+    show(
+      this.layer,
+      s("path", {
+        class: "track",
+        d: path.map(({ x_m: x, y_m: y }, index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join(""),
+      }),
       ...path.map(({ x_m: x, y_m: y }) => s("circle", { class: "step", cx: x, cy: -y, r: 0.5 * unit })),
-      ...pose.candidates.slice(1).filter((rival) => rival.probability >= MIN_SHARE && isHere(rival)).map((rival) =>
-        s("circle", { class: "rival-place", cx: rival.position.x_m, cy: -rival.position.y_m, r: 1.4 * unit },
-          s("title", {}, `${rival.room}, ${percent(rival.probability)} probable`))),
-      isHere(pose) && ellipse({ position: pose.position, covariance_m2: [[xx, xy], [xy, yy]] }),
-      isHere(pose) && s("g", { class: `camera ${session.mode}`, id: "session-camera", transform: `translate(${x_m} ${-y_m}) rotate(${pose.heading_deg})` },
-        s("title", {}, `Camera in ${pose.room}`), s("path", { d: `M0 ${-4.5 * unit}L${1.1 * unit} 0H${-1.1 * unit}Z` }), s("circle", { r: 1.3 * unit })));
+      ...pose.candidates
+        .slice(1)
+        .filter((rival) => rival.probability >= MIN_SHARE && isHere(rival))
+        .map((rival) =>
+          s(
+            "circle",
+            { class: "rival-place", cx: rival.position.x_m, cy: -rival.position.y_m, r: 1.4 * unit },
+            s("title", {}, `${rival.room}, ${percent(rival.probability)} probable`),
+          ),
+        ),
+      isHere(pose) &&
+        ellipse({
+          position: pose.position,
+          covariance_m2: [
+            [xx, xy],
+            [xy, yy],
+          ],
+        }),
+      isHere(pose) &&
+        s(
+          "g",
+          {
+            class: `camera ${session.mode}`,
+            id: "session-camera",
+            transform: `translate(${x_m} ${-y_m}) rotate(${pose.heading_deg})`,
+          },
+          s("title", {}, `Camera in ${pose.room}`),
+          s("path", { d: `M0 ${-4.5 * unit}L${1.1 * unit} 0H${-1.1 * unit}Z` }),
+          s("circle", { r: 1.3 * unit }),
+        ),
+    );
   }
 }

@@ -11,6 +11,8 @@ export type PlanSummary = Schemas["FloorPlanSummary"];
 export type PlanList = Schemas["FloorPlanList"];
 export type PlanEvent = Schemas["PlanEvent"];
 export type Venue = Schemas["VenueSummary"];
+/** The venue that is searched, with the first of its plans. */
+export type ChosenVenue = Venue & { listed: VenuePlanList["plans"] };
 export type VenueList = Schemas["VenueList"];
 export type VenuePlanDocument = Schemas["VenuePlanDocument"];
 export type VenuePlanList = Schemas["VenuePlanList"];
@@ -20,8 +22,14 @@ export type Localisability = Schemas["LocalisabilityAnswer"];
 export type Candidate = Schemas["CandidateAnswer"];
 export type Posterior = Schemas["PosteriorAnswer"];
 export type SequenceAnswer = Schemas["SequenceAnswer"];
-/** Answer to a photograph; `together` states that it was asked for with others. */
-export type Answer = Schemas["LocaliseAnswer"] & { together?: Together };
+/**
+ * Answer to a photograph; `together` states that it was asked for with others. The revision is unknown if the photograph
+ * lies in another plan than the first of them.
+ */
+export type Answer = Omit<Schemas["LocaliseAnswer"], "floorplan_revision"> & {
+  floorplan_revision?: string;
+  together?: Together;
+};
 export type Session = Schemas["SessionAnswer"];
 export type SessionDocument = Schemas["SessionDocument"];
 export type ViewAnswer = Schemas["ViewAnswer"];
@@ -43,10 +51,15 @@ export interface Together {
   confidence: number | null;
 }
 
-/** Hints of the place of a photograph: a circle on the plan, and rooms. */
+export type PlanPoint = Schemas["PlanPoint"];
+export type EarthPoint = Schemas["EarthPoint"];
+
+/** Hints of the place of a photograph: a circle on the plan, rooms and, in a venue, a level. */
 export interface Hints {
-  near: Point | null;
+  /** Centre of the circle: metres of the plan, or degrees, which all plans of a venue share. */
+  near: PlanPoint | EarthPoint | null;
   radius: number;
   rooms: string[];
+  level: number | null;
   strict: boolean;
 }

@@ -3,12 +3,12 @@
 import { api } from "./api";
 import { byId, h, show } from "./dom";
 import { clearError, showError } from "./notices";
-import type { PlanSummary, Venue } from "./types";
+import type { ChosenVenue, PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
 
 export interface VenueActions {
   /** A venue was chosen, or null: none any more. */
-  chosen: (venue: Venue | null) => void;
+  chosen: (venue: ChosenVenue | null) => void;
   /** One of the venue's plans is to be shown. */
   showPlan: (planId: string) => void;
 }
@@ -23,14 +23,14 @@ export class Venues {
   private readonly error = byId("plan-error");
   private readonly form = new VenueForm((venue) => void this.take(venue));
   private found: Venue[] = [];
-  private venue: Venue | null = null;
+  private venue: ChosenVenue | null = null;
 
   constructor(private readonly actions: VenueActions) {
     this.choice.addEventListener("change", () => actions.showPlan(this.choice.value));
     byId("venue-leave").addEventListener("click", () => this.leave());
   }
 
-  get current(): Venue | null {
+  get current(): ChosenVenue | null {
     return this.venue;
   }
 
@@ -66,17 +66,23 @@ export class Venues {
     clearError(this.error);
     try {
       const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
-      this.venue = venue;
+      this.venue = { ...venue, listed: plans };
       byId("venue-name").textContent = venue.name;
-      byId("venue-facts").textContent = `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}`
-        + (more === null ? "" : `; the list shows the first ${plans.length}`);
+      byId("venue-facts").textContent =
+        `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}` +
+        (more === null ? "" : `; the list shows the first ${plans.length}`);
       // Plans of a file are named after it and their level; the list would show no more than the file.
-      const prefix = `${venue.name} – `, all = plans.every(({ name }) => name.startsWith(prefix));
-      show(this.choice, ...plans.map((plan) => h("option", { value: plan.floorplan_id },
-        all ? plan.name.slice(prefix.length) : planLabel(plan))));
+      const prefix = `${venue.name} – `,
+        all = plans.every(({ name }) => name.startsWith(prefix));
+      show(
+        this.choice,
+        ...plans.map((plan) =>
+          h("option", { value: plan.floorplan_id }, all ? plan.name.slice(prefix.length) : planLabel(plan)),
+        ),
+      );
       this.bar.hidden = false;
       this.draw();
-      this.actions.chosen(venue);
+      this.actions.chosen(this.venue);
       const first = planId === undefined ? plans[0]?.floorplan_id : planId;
       if (first) this.actions.showPlan(first);
     } catch (error) {
@@ -99,9 +105,26 @@ export class Venues {
   }
 
   private draw(): void {
-    show(this.list, ...this.found.map((venue) => h("li", {}, h("button", {
-      type: "button", class: "plan", "aria-pressed": String(venue.id === this.venue?.id), onclick: () => this.pick(venue.id),
-    }, h("span", { class: "name" }, venue.name), h("span", { class: "facts" }, `venue, ${venue.plans} plans`)))));
+    show(
+      this.list,
+      ...this.found.map((venue) =>
+        h(
+          "li",
+          {},
+          h(
+            "button",
+            {
+              type: "button",
+              class: "plan",
+              "aria-pressed": String(venue.id === this.venue?.id),
+              onclick: () => this.pick(venue.id),
+            },
+            h("span", { class: "name" }, venue.name),
+            h("span", { class: "facts" }, `venue, ${venue.plans} plans`),
+          ),
+        ),
+      ),
+    );
     byId("venues").hidden = this.found.length === 0;
   }
 }

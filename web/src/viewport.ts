@@ -12,14 +12,28 @@ export class Viewport {
   private box: Box = this.whole;
 
   /** `changed` is called when another part is visible. */
-  constructor(private readonly svg: SVGSVGElement, place: HTMLElement, private readonly changed: () => void) {
-    place.append(h("div", { class: "zoom", role: "group", "aria-label": "Zoom" },
-      button("+", () => this.zoom(0.7), { "aria-label": "Zoom in" }), button("−", () => this.zoom(1 / 0.7), { "aria-label": "Zoom out" }),
-      button("▢", () => this.show(this.whole), { "aria-label": "Show the whole plan" })));
-    svg.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(event.deltaY > 0 ? 1.15 : 1 / 1.15, placeOf(svg, event));
-    }, { passive: false });
+  constructor(
+    private readonly svg: SVGSVGElement,
+    place: HTMLElement,
+    private readonly changed: () => void,
+  ) {
+    place.append(
+      h(
+        "div",
+        { class: "zoom", role: "group", "aria-label": "Zoom" },
+        button("+", () => this.zoom(0.7), { "aria-label": "Zoom in" }),
+        button("−", () => this.zoom(1 / 0.7), { "aria-label": "Zoom out" }),
+        button("▢", () => this.show(this.whole), { "aria-label": "Show the whole plan" }),
+      ),
+    );
+    svg.addEventListener(
+      "wheel",
+      (event) => {
+        event.preventDefault();
+        this.zoom(event.deltaY > 0 ? 1.15 : 1 / 1.15, placeOf(svg, event));
+      },
+      { passive: false },
+    );
     svg.addEventListener("pointerdown", (event) => this.onPointer(event));
   }
 
@@ -39,11 +53,19 @@ export class Viewport {
     this.changed();
   }
 
-  private zoom(factor: number, about: Point = [this.box.x + 0.5 * this.box.width, -this.box.y - 0.5 * this.box.height]): void {
+  private zoom(
+    factor: number,
+    about: Point = [this.box.x + 0.5 * this.box.width, -this.box.y - 0.5 * this.box.height],
+  ): void {
     const width = this.box.width * factor;
     if (width > 3 * this.whole.width || width < this.whole.width / MAX_ZOOM) return;
     const [x, y] = [about[0], -about[1]];
-    this.show({ x: x + (this.box.x - x) * factor, y: y + (this.box.y - y) * factor, width, height: this.box.height * factor });
+    this.show({
+      x: x + (this.box.x - x) * factor,
+      y: y + (this.box.y - y) * factor,
+      width,
+      height: this.box.height * factor,
+    });
   }
 
   private onPointer(event: PointerEvent): void {

@@ -20,7 +20,8 @@ export class ServiceError extends Error {
 
   /** Return the error of an answer, which a proxy may have sent without a problem document. */
   static async of(response: Response): Promise<ServiceError> {
-    const after = Number(response.headers.get("retry-after")) || null, { status } = response;
+    const after = Number(response.headers.get("retry-after")) || null,
+      { status } = response;
     try {
       return ServiceError.from(await response.json(), after);
     } catch {

@@ -10,8 +10,11 @@ export type Schemas = components["schemas"];
 /** A stored plan; `etag` is the entity tag of its revision, for `replacePlan`. */
 export type Plan = Schemas["FloorPlanAnswer"] & { etag: string };
 type Text = Readonly<Record<string, string>>;
-type Form<Name extends keyof operations> = operations[Name] extends
-  { requestBody?: { content: { "multipart/form-data": infer Body } } } ? Partial<Omit<Body, "photo" | "features" | "panorama" | "file">> : never;
+type Form<Name extends keyof operations> = operations[Name] extends {
+  requestBody?: { content: { "multipart/form-data": infer Body } };
+}
+  ? Partial<Omit<Body, "photo" | "features" | "panorama" | "file">>
+  : never;
 /** Fields of a form; lists and objects are sent as JSON, undefined and null are left out. */
 export type Fields<Name extends keyof operations> = Form<Name> | Text;
 
@@ -65,13 +68,16 @@ export class Client {
     return (await this.request(path, init)).json();
   }
 
-  plans = (name = "", cursor: string | null = null) => this.json<Schemas["FloorPlanList"]>(`/floorplans?${page(name, cursor)}`);
-  plan = async (id: string, revision?: string) => planOf(await this.request(of("floorplans", id, revisionQuery(revision))));
+  plans = (name = "", cursor: string | null = null) =>
+    this.json<Schemas["FloorPlanList"]>(`/floorplans?${page(name, cursor)}`);
+  plan = async (id: string, revision?: string) =>
+    planOf(await this.request(of("floorplans", id, revisionQuery(revision))));
   layout = (id: string, revision?: string) =>
     this.json<Schemas["LayoutAnswer"]>(of("floorplans", id, `/layout${revisionQuery(revision)}`));
   /** Predict which photographs of a plan will be found. */
   localisability = (id: string) => this.json<Schemas["LocalisabilityAnswer"]>(of("floorplans", id, "/localisability"));
-  createPlan = async (plan: Schemas["FloorPlanDocument"]) => planOf(await this.request("/floorplans", json("POST", plan)));
+  createPlan = async (plan: Schemas["FloorPlanDocument"]) =>
+    planOf(await this.request("/floorplans", json("POST", plan)));
   /** Upload a plan as a file; `fields` are import options. */
   uploadPlan = async (file: Blob, fields: Text = {}, options: CallOptions = {}) =>
     planOf(await this.request("/floorplans", { ...options, ...form(fields, "file", file) }));
@@ -87,7 +93,11 @@ export class Client {
   localiseSequence = (fields: Fields<"localiseSequence">, photos: Picture[], options: CallOptions = {}) =>
     this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...query(fields, ...photos) });
   /** Localise many photographs, each by itself; yield a line for each, in order, as they are computed. */
-  async *localiseBatch(fields: Fields<"localiseBatch">, photos: Blob[], options: CallOptions = {}): AsyncGenerator<Schemas["BatchLine"]> {
+  async *localiseBatch(
+    fields: Fields<"localiseBatch">,
+    photos: Blob[],
+    options: CallOptions = {},
+  ): AsyncGenerator<Schemas["BatchLine"]> {
     // XMLHttpRequest would return all lines at the end.
     const init = { timeoutMs: 0, ...options, onProgress: undefined, ...form(fields, "photo", ...photos) };
     for await (const line of linesOf(await this.request("/localise/batch", init))) yield JSON.parse(line);
@@ -97,17 +107,20 @@ export class Client {
     (await this.request("/localise", { ...options, ...query(fields, photo), headers: { Accept: "image/png" } })).blob();
   answer = (id: string) => this.json<Schemas["LocaliseAnswer"]>(of("answers", id));
   /** Begin a session, which follows one camera. */
-  createSession = (session: Schemas["SessionDocument"]) => this.json<Schemas["SessionAnswer"]>("/sessions", json("POST", session));
+  createSession = (session: Schemas["SessionDocument"]) =>
+    this.json<Schemas["SessionAnswer"]>("/sessions", json("POST", session));
   session = (id: string) => this.json<Schemas["SessionAnswer"]>(of("sessions", id));
   /** Send the next photograph of a session, with the motion since the one before. */
   addPhotograph = (id: string, fields: Fields<"addPhotograph">, photo: Picture, options: CallOptions = {}) =>
     this.json<Schemas["SessionAnswer"]>(of("sessions", id, "/photographs"), { ...options, ...query(fields, photo) });
   /** Return a file of the image encoder, with which devices compute features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`. */
-  modelFile = async (name: string, options: CallOptions = {}) => (await this.request(of("model", name), options)).arrayBuffer();
+  modelFile = async (name: string, options: CallOptions = {}) =>
+    (await this.request(of("model", name), options)).arrayBuffer();
   /** Return the limits of the service. */
   limits = () => this.json<Schemas["LimitsAnswer"]>("/limits");
   deleteSession = (id: string) => this.delete(of("sessions", id));
-  venues = (name = "", cursor: string | null = null) => this.json<Schemas["VenueList"]>(`/venues?${page(name, cursor)}`);
+  venues = (name = "", cursor: string | null = null) =>
+    this.json<Schemas["VenueList"]>(`/venues?${page(name, cursor)}`);
   venue = (id: string) => this.json<Schemas["VenueSummary"]>(of("venues", id));
   /** Return the first page of a venue's plans, from the lowest level up. */
   venuePlans = (id: string) => this.json<Schemas["VenuePlanList"]>(of("venues", id, "/plans?limit=500"));
@@ -119,7 +132,8 @@ export class Client {
 
   private delete = async (path: string): Promise<void> => void (await this.request(path, { method: "DELETE" }));
 
-  private key = (): string | null => (typeof this.options.apiKey === "function" ? this.options.apiKey() : this.options.apiKey ?? null);
+  private key = (): string | null =>
+    typeof this.options.apiKey === "function" ? this.options.apiKey() : (this.options.apiKey ?? null);
 
   private async hasNewKey(sent: string | null): Promise<boolean> {
     const ask = this.options.onUnauthenticated;
@@ -134,11 +148,18 @@ export class Client {
     const request = { ...rest, headers, signal: AbortSignal.any(signals) };
     const url = (this.options.baseUrl ?? "").replace(/\/$/, "") + path;
     try {
-      return await (onProgress && typeof XMLHttpRequest !== "undefined" ? upload(url, request, onProgress) : fetch(url, request));
+      return await (onProgress && typeof XMLHttpRequest !== "undefined"
+        ? upload(url, request, onProgress)
+        : fetch(url, request));
     } catch {
       signal?.throwIfAborted();
-      if (request.signal.aborted) throw new ServiceError(0, "The service took too long", `The limit is ${timeoutMs / 1000} s.`);
-      throw new ServiceError(0, "The service does not answer", "Check that it is running and that the network works, then try again.");
+      if (request.signal.aborted)
+        throw new ServiceError(0, "The service took too long", `The limit is ${timeoutMs / 1000} s.`);
+      throw new ServiceError(
+        0,
+        "The service does not answer",
+        "Check that it is running and that the network works, then try again.",
+      );
     }
   }
 
@@ -154,7 +175,8 @@ export class Client {
 
 const of = (collection: string, id: string, rest = ""): string => `/${collection}/${encodeURIComponent(id)}${rest}`;
 const revisionQuery = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
-const page = (name: string, cursor: string | null) => new URLSearchParams({ limit: "50", ...(name && { name }), ...(cursor && { cursor }) });
+const page = (name: string, cursor: string | null) =>
+  new URLSearchParams({ limit: "50", ...(name && { name }), ...(cursor && { cursor }) });
 
 async function planOf(response: Response): Promise<Plan> {
   return { ...(await response.json()), etag: response.headers.get("etag") ?? "" };
@@ -176,7 +198,8 @@ function query(fields: object, ...pictures: Picture[]): { method: string; body: 
 function form(fields: object, name: string, ...files: Blob[]): { method: string; body: FormData } {
   const body = new FormData();
   for (const [field, value] of Object.entries(fields)) {
-    if (value !== undefined && value !== null) body.set(field, typeof value === "object" ? JSON.stringify(value) : String(value));
+    if (value !== undefined && value !== null)
+      body.set(field, typeof value === "object" ? JSON.stringify(value) : String(value));
   }
   for (const file of files) body.append(name, file);
   return { method: "POST", body };

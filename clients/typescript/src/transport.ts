@@ -9,7 +9,8 @@ export function pause(ms: number, signal?: AbortSignal | null): Promise<void> {
 
 /** Send a request with XMLHttpRequest, which reports the progress of the upload, as fetch does not. */
 export function upload(
-  url: string, { method, headers, body, signal }: RequestInit & { headers: Headers; signal: AbortSignal },
+  url: string,
+  { method, headers, body, signal }: RequestInit & { headers: Headers; signal: AbortSignal },
   onProgress: (sentBytes: number, totalBytes: number) => void,
 ): Promise<Response> {
   return new Promise((resolve, reject) => {
@@ -21,9 +22,14 @@ export function upload(
     sending.upload.onprogress = ({ loaded, total }) => onProgress(loaded, total);
     sending.onerror = () => reject(new TypeError("no answer"));
     sending.onload = () => {
-      const lines = sending.getAllResponseHeaders().trim().split("\r\n").map((line) => line.split(": "));
+      const lines = sending
+        .getAllResponseHeaders()
+        .trim()
+        .split("\r\n")
+        .map((line) => line.split(": "));
       const answered = lines.map(([name, ...value]): [string, string] => [name!, value.join(": ")]);
-      const { status, statusText } = sending, body = status === 204 || status === 304 ? null : sending.response;
+      const { status, statusText } = sending,
+        body = status === 204 || status === 304 ? null : sending.response;
       resolve(new Response(body, { status, statusText, headers: answered }));
     };
     sending.onabort = () => reject(signal.reason);

@@ -8,16 +8,24 @@ import type { Stated } from "./lens";
 import type { Manifest } from "./model";
 import type { Result, Task } from "./worker";
 
-const WORKER = "/web/on_device.js", KEPT = "lalaloc-on-device";
+const WORKER = "/web/on_device.js",
+  KEPT = "lalaloc-on-device";
 // Fields that features contain; queries with features refuse them.
 const CAMERA = ["projection", "hfov_deg", "pitch_deg", "roll_deg"] as const;
-const LOADING = "Loading the image encoder (once)…", COMPUTING = "Computing the features…";
+const LOADING = "Loading the image encoder (once)…",
+  COMPUTING = "Computing the features…";
 
 /** Return the fields that a query with features has, and those about the camera. */
-export function splitFields(fields: Readonly<Record<string, string>>): { query: Record<string, string>; stated: Stated } {
+export function splitFields(fields: Readonly<Record<string, string>>): {
+  query: Record<string, string>;
+  stated: Stated;
+} {
   const isStated = ([name]: [string, string]): boolean => (CAMERA as readonly string[]).includes(name);
   const all = Object.entries(fields);
-  return { query: Object.fromEntries(all.filter((pair) => !isStated(pair))), stated: Object.fromEntries(all.filter(isStated)) };
+  return {
+    query: Object.fromEntries(all.filter((pair) => !isStated(pair))),
+    stated: Object.fromEntries(all.filter(isStated)),
+  };
 }
 
 class Device {
@@ -48,20 +56,27 @@ class Device {
 
   /** Tick and lock the box if the service takes features only; nothing is sent before that is known. */
   start(): Promise<void> {
-    return (this.started ??= api.limits().then(({ require_features: isRequired }) => {
-      if (isRequired) this.box.checked = this.box.disabled = true;
-      this.describe();
-    }, (error: unknown) => {
-      this.started = null;
-      throw error;
-    }));
+    return (this.started ??= api.limits().then(
+      ({ require_features: isRequired }) => {
+        if (isRequired) this.box.checked = this.box.disabled = true;
+        this.describe();
+      },
+      (error: unknown) => {
+        this.started = null;
+        throw error;
+      },
+    ));
   }
 
   /**
    * Send a query with photographs, or with their features; once more if the service has got another model meanwhile.
    * `send` takes pictures, and the fields of the query that belong to them.
    */
-  async send<T>(files: File[], fields: Readonly<Record<string, string>>, send: (pictures: Picture[], fields: Record<string, string>) => Promise<T>): Promise<T> {
+  async send<T>(
+    files: File[],
+    fields: Readonly<Record<string, string>>,
+    send: (pictures: Picture[], fields: Record<string, string>) => Promise<T>,
+  ): Promise<T> {
     await this.start();
     if (!this.isOn) return send(files, { ...fields });
     const { query, stated } = splitFields(fields);
@@ -81,24 +96,31 @@ class Device {
 
   /** Return the features of a photograph. */
   private features(file: File, stated: Stated): Promise<Blob> {
-    const next = this.last.catch(() => undefined).then(async () => {
-      const statements = JSON.stringify(stated), known = this.known.get(file);
-      if (known?.stated === statements) return known.features;
-      const features = new Blob([await this.encoded(file, stated)]);
-      this.known.set(file, { stated: statements, features });
-      return features;
-    });
+    const next = this.last
+      .catch(() => undefined)
+      .then(async () => {
+        const statements = JSON.stringify(stated),
+          known = this.known.get(file);
+        if (known?.stated === statements) return known.features;
+        const features = new Blob([await this.encoded(file, stated)]);
+        this.known.set(file, { stated: statements, features });
+        return features;
+      });
     this.last = next;
     return next;
   }
 
   private async encoded(file: File, stated: Stated): Promise<Uint8Array<ArrayBuffer>> {
     if (typeof OffscreenCanvas === "undefined" || typeof DecompressionStream === "undefined") {
-      throw new InputError("This browser is too old to compute features. Update it, or use the command line (lalaloc encode).");
+      throw new InputError(
+        "This browser is too old to compute features. Update it, or use the command line (lalaloc encode).",
+      );
     }
     try {
       this.describe(this.manifest === null ? LOADING : COMPUTING);
-      this.manifest ??= api.modelFile("manifest.json").then((content) => JSON.parse(new TextDecoder().decode(content)) as Manifest);
+      this.manifest ??= api
+        .modelFile("manifest.json")
+        .then((content) => JSON.parse(new TextDecoder().decode(content)) as Manifest);
       return await this.work({ kind: "encode", file, stated, manifest: await this.manifest });
     } catch (error) {
       this.manifest = null;
@@ -119,7 +141,8 @@ class Device {
         this.worker = null;
         fail(error);
       };
-      worker.onerror = (event) => stop(new Error(`the features could not be computed: ${event.message || "the worker did not start"}`));
+      worker.onerror = (event) =>
+        stop(new Error(`the features could not be computed: ${event.message || "the worker did not start"}`));
       worker.onmessage = ({ data }: MessageEvent<Result>) => {
         if (data.kind === "done") done(data.features);
         else if (data.kind === "failed" && data.isInput) fail(new InputError(data.message));
@@ -138,7 +161,10 @@ class Device {
 
   private describe(progress: string | null = null): void {
     const locked = this.box.disabled ? "This service takes no photographs. " : "";
-    this.state.textContent = !this.isOn ? "" : progress ?? `${locked}Only features are sent: the room’s shape, doors, windows and type, and the camera’s lens and tilt. The first photograph loads 13 MB.`;
+    this.state.textContent = !this.isOn
+      ? ""
+      : (progress ??
+        `${locked}Only features are sent: the room’s shape, doors, windows and type, and the camera’s lens and tilt. The first photograph loads 13 MB.`);
   }
 }
 

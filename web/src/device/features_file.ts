@@ -18,21 +18,25 @@ export interface Header {
   warnings: string[];
 }
 
-const MAGIC = "LLFT", VERSION = 1, PREFIX_BYTES = 10;
+const MAGIC = "LLFT",
+  VERSION = 1,
+  PREFIX_BYTES = 10;
 
 /** Return a file with a header and arrays, in the order of the format. */
 export function featuresFile(header: Header, arrays: Float32Array[]): Uint8Array<ArrayBuffer> {
   const text = new TextEncoder().encode(JSON.stringify(header));
   const length = PREFIX_BYTES + text.length + 4 * arrays.reduce((sum, array) => sum + array.length, 0);
-  const file = new Uint8Array(length), view = new DataView(file.buffer);
+  const file = new Uint8Array(length),
+    view = new DataView(file.buffer);
   file.set(new TextEncoder().encode(MAGIC));
   view.setUint16(4, VERSION, true);
   view.setUint32(6, text.length, true);
   file.set(text, PREFIX_BYTES);
   let at = PREFIX_BYTES + text.length;
-  for (const array of arrays) for (const value of array) {
-    view.setFloat32(at, value, true);
-    at += 4;
-  }
+  for (const array of arrays)
+    for (const value of array) {
+      view.setFloat32(at, value, true);
+      at += 4;
+    }
   return file;
 }

@@ -9,11 +9,14 @@ export interface Metadata {
 export const TAG = { width: 0xa002, height: 0xa003, customRendered: 0xa401, zoom: 0xa404, film: 0xa405 } as const;
 const EXIF_IFD = 0x8769;
 const MAX_ENTRIES = 500;
-const XMP_HEAD = "http://ns.adobe.com/xap/1.0/\0", EXIF_HEAD = "Exif\0\0", PNG_XMP = "XML:com.adobe.xmp\0";
+const XMP_HEAD = "http://ns.adobe.com/xap/1.0/\0",
+  EXIF_HEAD = "Exif\0\0",
+  PNG_XMP = "XML:com.adobe.xmp\0";
 
 /** Read the metadata of a file. */
 export function readMetadata(content: ArrayBuffer): Metadata {
-  const view = new DataView(content), found: Metadata = { exif: new Map(), sphere: new Map() };
+  const view = new DataView(content),
+    found: Metadata = { exif: new Map(), sphere: new Map() };
   try {
     if (view.getUint16(0) === 0xffd8) jpegParts(view, found);
     else if (ascii(view, 1, 3) === "PNG") pngParts(view, found);
@@ -31,9 +34,12 @@ function ascii(view: DataView, from: number, length: number): string {
 
 function jpegParts(view: DataView, found: Metadata): void {
   for (let at = 2; view.getUint8(at) === 0xff;) {
-    const marker = view.getUint8(at + 1), length = view.getUint16(at + 2), begin = at + 4;
+    const marker = view.getUint8(at + 1),
+      length = view.getUint16(at + 2),
+      begin = at + 4;
     if (marker === 0xda) return;
-    if (marker === 0xe1 && ascii(view, begin, EXIF_HEAD.length) === EXIF_HEAD) readTiff(view, begin + EXIF_HEAD.length, found);
+    if (marker === 0xe1 && ascii(view, begin, EXIF_HEAD.length) === EXIF_HEAD)
+      readTiff(view, begin + EXIF_HEAD.length, found);
     else if (marker === 0xe1 && ascii(view, begin, Math.min(XMP_HEAD.length, length - 2)) === XMP_HEAD) {
       readXmp(text(view, begin + XMP_HEAD.length, at + 2 + length), found);
     }
@@ -43,16 +49,22 @@ function jpegParts(view: DataView, found: Metadata): void {
 
 function pngParts(view: DataView, found: Metadata): void {
   for (let at = 8; at + 8 <= view.byteLength; at += 12 + view.getUint32(at)) {
-    const kind = ascii(view, at + 4, 4), begin = at + 8, end = begin + view.getUint32(at);
+    const kind = ascii(view, at + 4, 4),
+      begin = at + 8,
+      end = begin + view.getUint32(at);
     if (kind === "eXIf") readTiff(view, begin, found);
-    if (kind === "iTXt" && text(view, begin, Math.min(end, begin + PNG_XMP.length)) === PNG_XMP) readXmp(text(view, begin, end), found);
+    if (kind === "iTXt" && text(view, begin, Math.min(end, begin + PNG_XMP.length)) === PNG_XMP)
+      readXmp(text(view, begin, end), found);
   }
 }
 
 function webpParts(view: DataView, found: Metadata): void {
   for (let at = 12; at + 8 <= view.byteLength;) {
-    const kind = ascii(view, at, 4), length = view.getUint32(at + 4, true), begin = at + 8;
-    if (kind === "EXIF") readTiff(view, ascii(view, begin, EXIF_HEAD.length) === EXIF_HEAD ? begin + EXIF_HEAD.length : begin, found);
+    const kind = ascii(view, at, 4),
+      length = view.getUint32(at + 4, true),
+      begin = at + 8;
+    if (kind === "EXIF")
+      readTiff(view, ascii(view, begin, EXIF_HEAD.length) === EXIF_HEAD ? begin + EXIF_HEAD.length : begin, found);
     if (kind === "XMP ") readXmp(text(view, begin, begin + length), found);
     at = begin + length + (length % 2);
   }
@@ -64,7 +76,9 @@ function text(view: DataView, from: number, to: number): string {
 
 /** Read the GPano properties of a packet, from attributes and elements; the first of each name counts. */
 function readXmp(packet: string, { sphere }: Metadata): void {
-  for (const [, name, attribute, element] of packet.matchAll(/\bGPano:(\w+)\s*(?:=\s*["']([^"'<>]*)["']|>([^<>]*)<)/g)) {
+  for (const [, name, attribute, element] of packet.matchAll(
+    /\bGPano:(\w+)\s*(?:=\s*["']([^"'<>]*)["']|>([^<>]*)<)/g,
+  )) {
     if (!sphere.has(name!)) sphere.set(name!, (attribute ?? element ?? "").trim());
   }
 }
@@ -75,7 +89,8 @@ function readTiff(view: DataView, start: number, { exif }: Metadata): void {
   const directory = (offset: number): void => {
     const count = Math.min(view.getUint16(start + offset, little), MAX_ENTRIES);
     for (let entry = 0; entry < count; entry++) {
-      const at = start + offset + 2 + 12 * entry, tag = view.getUint16(at, little);
+      const at = start + offset + 2 + 12 * entry,
+        tag = view.getUint16(at, little);
       const value = number(view, at, start, little);
       if (value !== null && !exif.has(tag)) exif.set(tag, value);
     }

@@ -14,16 +14,20 @@ export interface PatchSize {
   step: number;
 }
 
-const UNSEEN = 127, SLACK = 1.03, OVERLAP = 0.2;
+const UNSEEN = 127,
+  SLACK = 1.03,
+  OVERLAP = 0.2;
 /** Resolution of the photograph that patches are sampled from, relative to theirs. */
 export const FINER = 1.4;
 // Seen azimuths: samples of the left and right border, and the largest elevation that counts.
-const SAMPLES = 33, MAX_ELEVATION = radians(45);
+const SAMPLES = 33,
+  MAX_ELEVATION = radians(45);
 
 /** Return the azimuths of the patches that cover a field of view, in steps from its centre. */
 export function patchSteps(hfov: number, { hfov: width, step }: PatchSize): number[] {
   if (hfov <= SLACK * width) return [0];
-  const apart = (1 - OVERLAP) * width, isFull = hfov > 2 * Math.PI - 0.5 * width;
+  const apart = (1 - OVERLAP) * width,
+    isFull = hfov > 2 * Math.PI - 0.5 * width;
   const count = isFull ? Math.ceil((2 * Math.PI) / apart) : 1 + Math.ceil((hfov - width) / apart);
   const azimuth = (index: number): number =>
     isFull ? ((index + 0.5) / count - 0.5) * 2 * Math.PI : (index / (count - 1) - 0.5) * (hfov - width);
@@ -33,12 +37,18 @@ export function patchSteps(hfov: number, { hfov: width, step }: PatchSize): numb
 /** Cut a patch: RGB, and opacity where the photograph shows it. */
 export function cutPatch(picture: Pixels, view: CameraView, azimuth: number, size: PatchSize): Uint8Array {
   const patch = new Uint8Array(4 * size.width * size.height);
-  const place = placeOf(view, picture), tilt = tiltOf(view), perPixel = size.hfov / size.width;
+  const place = placeOf(view, picture),
+    tilt = tiltOf(view),
+    perPixel = size.hfov / size.width;
   for (let row = 0, to = 0; row < size.height; row++) {
     const elevation = size.top - (row + 0.5) * perPixel;
     for (let column = 0; column < size.width; column++, to += 4) {
       const turned = azimuth + (column + 0.5) * perPixel - 0.5 * size.hfov;
-      const ray: Ray = [Math.cos(elevation) * Math.sin(turned), Math.cos(elevation) * Math.cos(turned), Math.sin(elevation)];
+      const ray: Ray = [
+        Math.cos(elevation) * Math.sin(turned),
+        Math.cos(elevation) * Math.cos(turned),
+        Math.sin(elevation),
+      ];
       const point = place(tilt(ray));
       if (point === null || !inside(point, picture)) patch.fill(UNSEEN, to, to + 3);
       else {
@@ -52,17 +62,21 @@ export function cutPatch(picture: Pixels, view: CameraView, azimuth: number, siz
 
 /** Return the azimuths (degrees) of the leftmost and rightmost ray that a patch can show. */
 export function seenDeg(view: CameraView): [number, number] {
-  const half = 0.5 * view.hfov.value_deg, { camera } = view;
+  const half = 0.5 * view.hfov.value_deg,
+    { camera } = view;
   if (camera === null || half > 90) return [-half, half];
   const [pitch, roll] = [radians(view.pitch.value_deg), radians(view.roll.value_deg)];
   const azimuths: number[] = [];
-  for (const right of [-0.5 * camera.width / camera.fx, 0.5 * camera.width / camera.fx]) {
+  for (const right of [(-0.5 * camera.width) / camera.fx, (0.5 * camera.width) / camera.fx]) {
     for (let index = 0; index < SAMPLES; index++) {
       const above = ((0.5 - index / (SAMPLES - 1)) * camera.height) / camera.fy;
       // From the camera's frame to the level one.
-      const across = Math.cos(roll) * right + Math.sin(roll) * above, up = Math.cos(roll) * above - Math.sin(roll) * right;
-      const forward = Math.cos(pitch) - Math.sin(pitch) * up, rise = Math.sin(pitch) + Math.cos(pitch) * up;
-      if (Math.abs(Math.atan2(rise, Math.hypot(across, forward))) < MAX_ELEVATION) azimuths.push(Math.atan2(across, forward));
+      const across = Math.cos(roll) * right + Math.sin(roll) * above,
+        up = Math.cos(roll) * above - Math.sin(roll) * right;
+      const forward = Math.cos(pitch) - Math.sin(pitch) * up,
+        rise = Math.sin(pitch) + Math.cos(pitch) * up;
+      if (Math.abs(Math.atan2(rise, Math.hypot(across, forward))) < MAX_ELEVATION)
+        azimuths.push(Math.atan2(across, forward));
     }
   }
   const degrees = (angle: number): number => (angle * 180) / Math.PI;

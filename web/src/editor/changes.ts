@@ -8,7 +8,9 @@ export const NEAR_WALL_M = 0.35;
 const MIN_WIDTH_M = 0.2;
 export const DEFAULT_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
 const DEFAULT_HEIGHTS: Record<OpeningKind, { sill_m: number; head_m: number }> = {
-  door: { sill_m: 0, head_m: 2 }, window: { sill_m: 0.9, head_m: 2.1 }, passage: { sill_m: 0, head_m: 2.1 },
+  door: { sill_m: 0, head_m: 2 },
+  window: { sill_m: 0.9, head_m: 2.1 },
+  passage: { sill_m: 0, head_m: 2.1 },
 };
 
 export const rounded = ([x, y]: Point): Point => [Math.round(x * 1000) / 1000, Math.round(y * 1000) / 1000];
@@ -46,7 +48,8 @@ function carried(opening: OpeningDocument, before: Point[], after: Point[]): Ope
   if (edge < 0) return opening;
   const next = (edge + 1) % before.length;
   if (same(before[edge]!, after[edge]!) && same(before[next]!, after[next]!)) return opening;
-  const along = frame(before[edge]!, before[next]!), to = frame(after[edge]!, after[next]!);
+  const along = frame(before[edge]!, before[next]!),
+    to = frame(after[edge]!, after[next]!);
   // Keep the share along the wall and the distance to it.
   const line = opening.line.map((end): Point => {
     const share = along.length === 0 ? 0 : along.along(end) / along.length;
@@ -60,33 +63,55 @@ function resized(line: [Point, Point], before: [Point, Point], direction: Point)
   const width = Math.hypot(before[1][0] - before[0][0], before[1][1] - before[0][1]);
   const middle: Point = [0.5 * (line[0][0] + line[1][0]), 0.5 * (line[0][1] + line[1][1])];
   const way = (line[1][0] - line[0][0]) * direction[0] + (line[1][1] - line[0][1]) * direction[1] < 0 ? -0.5 : 0.5;
-  return [plus(middle, [-way * width * direction[0], -way * width * direction[1]]),
-    plus(middle, [way * width * direction[0], way * width * direction[1]])];
+  return [
+    plus(middle, [-way * width * direction[0], -way * width * direction[1]]),
+    plus(middle, [way * width * direction[0], way * width * direction[1]]),
+  ];
 }
 
 const same = (a: Point, b: Point): boolean => a[0] === b[0] && a[1] === b[1];
 
-function frame(from: Point, to: Point): {
-  length: number; direction: Point; along: (point: Point) => number; off: (point: Point) => number; point: (along: number, off: number) => Point;
+function frame(
+  from: Point,
+  to: Point,
+): {
+  length: number;
+  direction: Point;
+  along: (point: Point) => number;
+  off: (point: Point) => number;
+  point: (along: number, off: number) => Point;
 } {
   const length = Math.hypot(to[0] - from[0], to[1] - from[1]);
   const direction: Point = length === 0 ? [1, 0] : [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
   return {
-    length, direction,
+    length,
+    direction,
     along: ([x, y]) => (x - from[0]) * direction[0] + (y - from[1]) * direction[1],
     off: ([x, y]) => (y - from[1]) * direction[0] - (x - from[0]) * direction[1],
-    point: (along, off) => [from[0] + along * direction[0] - off * direction[1], from[1] + along * direction[1] + off * direction[0]],
+    point: (along, off) => [
+      from[0] + along * direction[0] - off * direction[1],
+      from[1] + along * direction[1] + off * direction[0],
+    ],
   };
 }
 
 export function moveCorner(plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument {
-  return withOutline(plan, room, plan.rooms[room]!.polygon.map((point, position) => (position === corner ? rounded(to) : point)));
+  return withOutline(
+    plan,
+    room,
+    plan.rooms[room]!.polygon.map((point, position) => (position === corner ? rounded(to) : point)),
+  );
 }
 
 /** Move both ends of a wall. */
 export function moveWall(plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon, next = (edge + 1) % polygon.length;
-  return withOutline(plan, room, polygon.map((point, position) => (position === edge || position === next ? plus(point, by) : point)));
+  const polygon = plan.rooms[room]!.polygon,
+    next = (edge + 1) % polygon.length;
+  return withOutline(
+    plan,
+    room,
+    polygon.map((point, position) => (position === edge || position === next ? plus(point, by) : point)),
+  );
 }
 
 /** Add a corner on a wall. */
@@ -98,7 +123,13 @@ export function splitWall(plan: PlanDocument, { room, edge }: WallRef, corner: P
 /** Remove a corner; triangles stay as they are. */
 export function removeCorner(plan: PlanDocument, room: number, corner: number): PlanDocument {
   const polygon = plan.rooms[room]!.polygon;
-  return polygon.length <= 3 ? plan : withOutline(plan, room, polygon.filter((_, position) => position !== corner));
+  return polygon.length <= 3
+    ? plan
+    : withOutline(
+        plan,
+        room,
+        polygon.filter((_, position) => position !== corner),
+      );
 }
 
 export function addRoom(plan: PlanDocument, polygon: Point[]): PlanDocument {
@@ -112,27 +143,38 @@ export function changeRoom(plan: PlanDocument, index: number, change: Partial<Ro
 
 export function removeRoom(plan: PlanDocument, index: number): PlanDocument {
   const removed = plan.rooms[index]?.id;
-  const openings = (plan.openings ?? []).map((opening) => (opening.rooms && removed ?
-    { ...opening, rooms: opening.rooms.filter((id) => id !== removed) } : opening));
-  return { ...plan, rooms: plan.rooms.filter((_, position) => position !== index), openings: openings.filter(({ rooms }) => rooms?.length !== 0) };
+  const openings = (plan.openings ?? []).map((opening) =>
+    opening.rooms && removed ? { ...opening, rooms: opening.rooms.filter((id) => id !== removed) } : opening,
+  );
+  return {
+    ...plan,
+    rooms: plan.rooms.filter((_, position) => position !== index),
+    openings: openings.filter(({ rooms }) => rooms?.length !== 0),
+  };
 }
 
 /** Return the wall nearest to a place, and its distance. */
 export function nearestWall(plan: PlanDocument, place: Point): { wall: WallRef; distance: number } | null {
   let best: { wall: WallRef; distance: number } | null = null;
-  plan.rooms.forEach(({ polygon }, room) => polygon.forEach((corner, edge) => {
-    const distance = distanceTo(place, corner, polygon[(edge + 1) % polygon.length]!);
-    if (best === null || distance < best.distance) best = { wall: { room, edge }, distance };
-  }));
+  plan.rooms.forEach(({ polygon }, room) =>
+    polygon.forEach((corner, edge) => {
+      const distance = distanceTo(place, corner, polygon[(edge + 1) % polygon.length]!);
+      if (best === null || distance < best.distance) best = { wall: { room, edge }, distance };
+    }),
+  );
   return best;
 }
 
 /** Add an opening of usual size on a wall, as near to a place as it fits. */
 export function addOpening(plan: PlanDocument, kind: OpeningKind, wall: WallRef, place: Point): PlanDocument {
-  const [from, to] = wallOf(plan, wall), along = frame(from, to);
+  const [from, to] = wallOf(plan, wall),
+    along = frame(from, to);
   const width = Math.min(DEFAULT_WIDTHS_M[kind], 0.9 * along.length);
   const middle = clamp(along.along(place), 0.5 * width, along.length - 0.5 * width);
-  const line: [Point, Point] = [rounded(along.point(middle - 0.5 * width, 0)), rounded(along.point(middle + 0.5 * width, 0))];
+  const line: [Point, Point] = [
+    rounded(along.point(middle - 0.5 * width, 0)),
+    rounded(along.point(middle + 0.5 * width, 0)),
+  ];
   const opening: OpeningDocument = { kind, line, ...DEFAULT_HEIGHTS[kind] };
   const next = { ...plan, openings: [...(plan.openings ?? []), opening] };
   // The first opening of a kind makes the kind complete, unless the plan lists no complete kinds.
@@ -152,7 +194,12 @@ export function claimKind(plan: PlanDocument, kind: OpeningKind, isComplete: boo
 }
 
 export function changeOpening(plan: PlanDocument, index: number, change: Partial<OpeningDocument>): PlanDocument {
-  return { ...plan, openings: (plan.openings ?? []).map((opening, position) => (position === index ? { ...opening, ...change } : opening)) };
+  return {
+    ...plan,
+    openings: (plan.openings ?? []).map((opening, position) =>
+      position === index ? { ...opening, ...change } : opening,
+    ),
+  };
 }
 
 export function removeOpening(plan: PlanDocument, index: number): PlanDocument {
@@ -161,22 +208,28 @@ export function removeOpening(plan: PlanDocument, index: number): PlanDocument {
 
 /** Slide an opening along its direction, as near to a place as possible. */
 export function slideOpening(plan: PlanDocument, index: number, place: Point): PlanDocument {
-  const line = plan.openings![index]!.line, along = frame(...line);
+  const line = plan.openings![index]!.line,
+    along = frame(...line);
   const by = along.along(place) - 0.5 * along.length;
-  return changeOpening(plan, index, { line: [rounded(along.point(by, 0)), rounded(along.point(by + along.length, 0))] });
+  return changeOpening(plan, index, {
+    line: [rounded(along.point(by, 0)), rounded(along.point(by + along.length, 0))],
+  });
 }
 
 /** Move one end of an opening along its direction. */
 export function stretchOpening(plan: PlanDocument, index: number, end: 0 | 1, place: Point): PlanDocument {
-  const line = plan.openings![index]!.line, along = frame(...line);
+  const line = plan.openings![index]!.line,
+    along = frame(...line);
   const share = along.along(place);
-  const [from, to] = end === 0 ? [Math.min(share, along.length - MIN_WIDTH_M), along.length] : [0, Math.max(share, MIN_WIDTH_M)];
+  const [from, to] =
+    end === 0 ? [Math.min(share, along.length - MIN_WIDTH_M), along.length] : [0, Math.max(share, MIN_WIDTH_M)];
   return changeOpening(plan, index, { line: [rounded(along.point(from, 0)), rounded(along.point(to, 0))] });
 }
 
 /** Set the width of an opening about its centre. */
 export function widenOpening(plan: PlanDocument, index: number, width: number): PlanDocument {
-  const line = plan.openings![index]!.line, along = frame(...line);
+  const line = plan.openings![index]!.line,
+    along = frame(...line);
   const from = 0.5 * (along.length - width);
   return changeOpening(plan, index, { line: [rounded(along.point(from, 0)), rounded(along.point(from + width, 0))] });
 }
@@ -187,12 +240,14 @@ export const widthOf = ({ line: [a, b] }: OpeningDocument): number => Math.hypot
 export function scaled(plan: PlanDocument, factor: number): PlanDocument {
   const all = (points: Point[]): Point[] => points.map(([x, y]) => rounded([factor * x, factor * y]));
   const scaledRoom = (room: RoomDocument): RoomDocument => ({
-    ...room, polygon: all(room.polygon),
+    ...room,
+    polygon: all(room.polygon),
     ...(room.holes ? { holes: room.holes.map(all) } : {}),
     ...(room.walls ? { walls: room.walls.map((wall) => all(wall) as [Point, Point]) } : {}),
   });
   return {
-    ...plan, rooms: plan.rooms.map(scaledRoom),
+    ...plan,
+    rooms: plan.rooms.map(scaledRoom),
     openings: (plan.openings ?? []).map((opening) => ({ ...opening, line: all(opening.line) as [Point, Point] })),
   };
 }
@@ -201,9 +256,17 @@ const clamp = (value: number, low: number, high: number): number => Math.max(low
 
 /** Snap a place to the coordinates of nearby corners, so that walls become straight. */
 export function snapped(plan: PlanDocument, place: Point, within: number, besides: Point | null = null): Point {
-  const corners = plan.rooms.flatMap(({ polygon }) => polygon).filter((corner) => besides === null || !same(corner, besides));
-  const nearest = (axis: 0 | 1): number => corners.reduce((best, corner) =>
-    (Math.abs(corner[axis] - place[axis]) < Math.abs(best - place[axis]) ? corner[axis] : best), Infinity);
+  const corners = plan.rooms
+    .flatMap(({ polygon }) => polygon)
+    .filter((corner) => besides === null || !same(corner, besides));
+  const nearest = (axis: 0 | 1): number =>
+    corners.reduce(
+      (best, corner) => (Math.abs(corner[axis] - place[axis]) < Math.abs(best - place[axis]) ? corner[axis] : best),
+      Infinity,
+    );
   const [x, y] = [nearest(0), nearest(1)];
-  return [Math.abs(x - place[0]) < within ? x : Math.round(place[0] * 100) / 100, Math.abs(y - place[1]) < within ? y : Math.round(place[1] * 100) / 100];
+  return [
+    Math.abs(x - place[0]) < within ? x : Math.round(place[0] * 100) / 100,
+    Math.abs(y - place[1]) < within ? y : Math.round(place[1] * 100) / 100,
+  ];
 }

@@ -26,7 +26,14 @@ const EMPTY: PlanDocument = { name: "New plan", ceiling_height_m: 2.5, rooms: []
 // Note of the importer that its coordinates are not those of the picture.
 const TURNED = /\b(turned|rotated)\b/;
 const NEW_ROOM_M: Point = [4, 3];
-const TOOLS: [Tool, string][] = [["select", "Select"], ["room", "Draw a room"], ["door", "Door"], ["window", "Window"], ["passage", "Passage"], ["scale", "Scale"]];
+const TOOLS: [Tool, string][] = [
+  ["select", "Select"],
+  ["room", "Draw a room"],
+  ["door", "Door"],
+  ["window", "Window"],
+  ["passage", "Passage"],
+  ["scale", "Scale"],
+];
 
 export class Editor {
   readonly underlay: Underlay;
@@ -43,21 +50,33 @@ export class Editor {
   private selection: Selection = { kind: "none" };
   private measured = 0;
 
-  constructor(svg: SVGSVGElement, private readonly host: EditorHost) {
+  constructor(
+    svg: SVGSVGElement,
+    private readonly host: EditorHost,
+  ) {
     this.underlay = new Underlay(svg);
-    this.handles = new Handles(svg, { edit: (plan, goesOn) => this.edit(plan, goesOn), select: (selection) => this.select(selection) });
+    this.handles = new Handles(svg, {
+      edit: (plan, goesOn) => this.edit(plan, goesOn),
+      select: (selection) => this.select(selection),
+    });
     this.tools = new Tools(svg, {
       edit: (plan) => {
         const isRoom = plan.rooms.length > (this.history?.now.rooms.length ?? 0);
-        this.selection = isRoom ? { kind: "room", index: plan.rooms.length - 1 } : { kind: "opening", index: (plan.openings ?? []).length - 1 };
+        this.selection = isRoom
+          ? { kind: "room", index: plan.rooms.length - 1 }
+          : { kind: "opening", index: (plan.openings ?? []).length - 1 };
         this.edit(plan, false);
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
-      instruct: (text) => { this.hint.textContent = text; },
+      instruct: (text) => {
+        this.hint.textContent = text;
+      },
     });
     addEventListener("keydown", (event) => this.onKey(event));
-    addEventListener("beforeunload", (event) => { if (this.isChanged) event.preventDefault(); });
+    addEventListener("beforeunload", (event) => {
+      if (this.isChanged) event.preventDefault();
+    });
   }
 
   /** Layers over the plan while it is edited. */
@@ -91,7 +110,12 @@ export class Editor {
   /** Lay the picture that a plan was read from under it, unless the importer turned it. */
   private async layOriginal(plan: Plan): Promise<void> {
     const report = plan.import_report;
-    if (report?.format !== "picture" || report.metres_per_unit == null || report.notes.some((note) => TURNED.test(note))) return;
+    if (
+      report?.format !== "picture" ||
+      report.metres_per_unit == null ||
+      report.notes.some((note) => TURNED.test(note))
+    )
+      return;
     try {
       const original = await api.original(plan.id);
       if (this.base?.revision !== plan.revision) return;
@@ -105,12 +129,16 @@ export class Editor {
   /** Redraw, as after zooming. */
   redraw(): void {
     if (this.history === null) return;
-    const plan = this.history.now, unit = unitOf(this.host.visible());
+    const plan = this.history.now,
+      unit = unitOf(this.host.visible());
     setFormPlan(plan);
     this.host.draw(plan);
     this.tools.update(plan, unit);
     this.handles.draw(plan, this.selection, unit);
-    showForm(this.form, plan, this.selection, { edit: (next) => this.edit(next, false), select: (selection) => this.select(selection) });
+    showForm(this.form, plan, this.selection, {
+      edit: (next) => this.edit(next, false),
+      select: (selection) => this.select(selection),
+    });
   }
 
   private edit(plan: PlanDocument, goesOn: boolean): void {
@@ -138,26 +166,59 @@ export class Editor {
 
   private drawBar(): void {
     if (this.history === null) return;
-    const tool = ([name, label]: [Tool, string]): HTMLElement => button(label, () => { this.measure.hidden = true; this.tools.choose(name); this.drawBar(); },
-      { "aria-pressed": String(this.tools.current === name), id: `tool-${name}` });
+    const tool = ([name, label]: [Tool, string]): HTMLElement =>
+      button(
+        label,
+        () => {
+          this.measure.hidden = true;
+          this.tools.choose(name);
+          this.drawBar();
+        },
+        { "aria-pressed": String(this.tools.current === name), id: `tool-${name}` },
+      );
     const picture = h("input", { type: "file", accept: "image/png,image/jpeg,image/webp", id: "underlay-file" });
-    picture.addEventListener("change", () => { if (picture.files?.[0]) void this.lay(picture.files[0]); });
-    show(this.bar,
-      h("div", { class: "tools", role: "toolbar", "aria-label": "Editing" }, ...TOOLS.map(tool),
+    picture.addEventListener("change", () => {
+      if (picture.files?.[0]) void this.lay(picture.files[0]);
+    });
+    show(
+      this.bar,
+      h(
+        "div",
+        { class: "tools", role: "toolbar", "aria-label": "Editing" },
+        ...TOOLS.map(tool),
         button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
         h("label", { class: "file" }, picture, h("span", {}, "Picture to trace")),
-        button("Undo", () => this.step("undo"), { id: "undo" }), button("Redo", () => this.step("redo"), { id: "redo" })),
-      this.underlay.box !== null && h("label", { class: "inline", for: this.underlay.slider.id }, "Picture through the rooms", this.underlay.slider),
-      this.measure, this.hint,
-      h("div", { class: "ask" },
-        button(this.base === null ? "Store the plan" : "Save as a new revision", () => void this.save(), { class: "primary", id: "save" }),
+        button("Undo", () => this.step("undo"), { id: "undo" }),
+        button("Redo", () => this.step("redo"), { id: "redo" }),
+      ),
+      this.underlay.box !== null &&
+        h(
+          "label",
+          { class: "inline", for: this.underlay.slider.id },
+          "Picture through the rooms",
+          this.underlay.slider,
+        ),
+      this.measure,
+      this.hint,
+      h(
+        "div",
+        { class: "ask" },
+        button(this.base === null ? "Store the plan" : "Save as a new revision", () => void this.save(), {
+          class: "primary",
+          id: "save",
+        }),
         this.base !== null && button("Save as a new plan", () => void this.saveNew(), { id: "save-new" }),
-        button("Stop editing", () => this.leave(), { id: "stop" })));
+        button("Stop editing", () => this.leave(), { id: "stop" }),
+      ),
+    );
     this.drawUndo();
   }
 
   private drawUndo(): void {
-    for (const [id, can] of [["undo", this.history?.canUndo], ["redo", this.history?.canRedo]] as const) {
+    for (const [id, can] of [
+      ["undo", this.history?.canUndo],
+      ["redo", this.history?.canRedo],
+    ] as const) {
       const control = document.getElementById(id) as HTMLButtonElement | null;
       if (control !== null) control.disabled = !can;
     }
@@ -173,11 +234,21 @@ export class Editor {
 
   private addRoom(): void {
     if (this.history === null) return;
-    const plan = this.history.now, right = plan.rooms.length === 0 ? 0 : Math.max(...plan.rooms.flatMap(({ polygon }) => polygon.map(([x]) => x))) + 0.1;
+    const plan = this.history.now,
+      right =
+        plan.rooms.length === 0 ? 0 : Math.max(...plan.rooms.flatMap(({ polygon }) => polygon.map(([x]) => x))) + 0.1;
     const [width, depth] = NEW_ROOM_M;
     this.tools.choose("select");
     this.selection = { kind: "room", index: plan.rooms.length };
-    this.edit(change.addRoom(plan, [[right, 0], [right + width, 0], [right + width, depth], [right, depth]]), false);
+    this.edit(
+      change.addRoom(plan, [
+        [right, 0],
+        [right + width, 0],
+        [right + width, depth],
+        [right, depth],
+      ]),
+      false,
+    );
     this.host.fit(boxOf(this.history.now));
   }
 
@@ -197,10 +268,23 @@ export class Editor {
 
   private onMeasured(distance: number): void {
     this.measured = distance;
-    const field = h("input", { type: "number", min: 0.01, step: "any", id: "known-distance", value: distance.toFixed(2) });
+    const field = h("input", {
+      type: "number",
+      min: 0.01,
+      step: "any",
+      id: "known-distance",
+      value: distance.toFixed(2),
+    });
     const apply = (): void => this.applyScale(field.valueAsNumber);
-    field.addEventListener("keydown", (event) => { if (event.key === "Enter") apply(); });
-    show(this.measure, h("label", { for: "known-distance" }, "Real distance of these points in metres:"), field, button("Set the scale", apply, { id: "apply-scale" }));
+    field.addEventListener("keydown", (event) => {
+      if (event.key === "Enter") apply();
+    });
+    show(
+      this.measure,
+      h("label", { for: "known-distance" }, "Real distance of these points in metres:"),
+      field,
+      button("Set the scale", apply, { id: "apply-scale" }),
+    );
     this.measure.hidden = false;
     field.select();
   }
@@ -211,7 +295,8 @@ export class Editor {
       return;
     }
     clearError(this.error);
-    const factor = distance / this.measured, seen = this.host.visible();
+    const factor = distance / this.measured,
+      seen = this.host.visible();
     this.measure.hidden = true;
     this.underlay.scale(factor);
     this.tools.choose("select");
@@ -244,12 +329,18 @@ export class Editor {
 
   /** Offer ways to keep both versions after somebody else stored a revision. */
   private offerResolutions(): void {
-    show(this.error, h("strong", {}, "Somebody changed this plan while you were editing"),
+    show(
+      this.error,
+      h("strong", {}, "Somebody changed this plan while you were editing"),
       h("p", {}, "Both versions are kept. Choose what to do with yours."),
-      h("div", { class: "ask" },
+      h(
+        "div",
+        { class: "ask" },
         button("Show their version", () => void this.loadTheirs(true), { id: "look-at-theirs" }),
         button("Overwrite it with mine", () => void this.loadTheirs(false), { id: "save-over" }),
-        button("Save mine as a new plan", () => void this.saveNew())));
+        button("Save mine as a new plan", () => void this.saveNew()),
+      ),
+    );
   }
 
   private async loadTheirs(isShown: boolean): Promise<void> {
@@ -273,7 +364,14 @@ export class Editor {
       return;
     }
     dialog.showModal();
-    dialog.addEventListener("close", () => { if (dialog.returnValue === "leave") this.close(null); dialog.returnValue = ""; }, { once: true });
+    dialog.addEventListener(
+      "close",
+      () => {
+        if (dialog.returnValue === "leave") this.close(null);
+        dialog.returnValue = "";
+      },
+      { once: true },
+    );
   }
 
   private onKey(event: KeyboardEvent): void {

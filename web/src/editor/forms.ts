@@ -7,8 +7,24 @@ import type { Selection } from "./handles";
 
 type RoomType = NonNullable<RoomDocument["type"]>;
 
-const ROOM_TYPES: RoomType[] = ["unknown", "bedroom", "living", "kitchen", "dining", "bathroom", "corridor", "entrance", "closet",
-  "storage", "laundry", "garage", "stairs", "balcony", "office", "meeting"];
+const ROOM_TYPES: RoomType[] = [
+  "unknown",
+  "bedroom",
+  "living",
+  "kitchen",
+  "dining",
+  "bathroom",
+  "corridor",
+  "entrance",
+  "closet",
+  "storage",
+  "laundry",
+  "garage",
+  "stairs",
+  "balcony",
+  "office",
+  "meeting",
+];
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
 export interface FormActions {
@@ -26,7 +42,8 @@ export function showForm(place: HTMLElement, plan: PlanDocument, selection: Sele
   const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
   const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
   if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
-  else if (opening !== undefined && selection.kind === "opening") show(place, ...openingForm(opening, selection.index, actions));
+  else if (opening !== undefined && selection.kind === "opening")
+    show(place, ...openingForm(opening, selection.index, actions));
   else show(place, ...planForm(plan, actions));
 }
 
@@ -43,23 +60,33 @@ function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
     h("h3", {}, "The whole plan"),
     text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
     number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
-    number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value ?? undefined })),
+    number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) =>
+      set({ camera_height_m: value ?? undefined }),
+    ),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
     completeKinds(plan, edit),
-    h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click an element to change it.`),
+    h(
+      "p",
+      { class: "hint" },
+      `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click an element to change it.`,
+    ),
   ];
 }
 
 /** Checkboxes for the kinds that are shown completely, whose absence then counts as well. */
 function completeKinds(plan: PlanDocument, edit: FormActions["edit"]): HTMLElement {
   const claimed = change.claimedKinds(plan);
-  return h("fieldset", { class: "claims" }, h("legend", {}, "Complete in this plan, and used by the search"),
+  return h(
+    "fieldset",
+    { class: "claims" },
+    h("legend", {}, "Complete in this plan, and used by the search"),
     ...OPENING_KINDS.map((kind) => {
       const box = h("input", { type: "checkbox", id: `plan-form-all-${kind}`, checked: claimed.includes(kind) });
       box.addEventListener("change", () => edit(change.claimKind(current, kind, box.checked)));
       const count = (plan.openings ?? []).filter((opening) => opening.kind === kind).length;
       return h("label", { class: "inline" }, box, `${count} ${kind}${count === 1 ? "" : "s"}`);
-    }));
+    }),
+  );
 }
 
 function roomForm(room: RoomDocument, index: number, { edit, select }: FormActions): HTMLElement[] {
@@ -69,7 +96,10 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: FormActio
     text("room-form-name", "Name", room.name ?? "", (name) => set({ name })),
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) => set({ type })),
     number("room-form-ceiling", "Ceiling, m", room.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
-    button("Remove this room", () => { select({ kind: "none" }); edit(change.removeRoom(current, index)); }),
+    button("Remove this room", () => {
+      select({ kind: "none" });
+      edit(change.removeRoom(current, index));
+    }),
   ];
 }
 
@@ -78,10 +108,15 @@ function openingForm(opening: OpeningDocument, index: number, { edit, select }: 
   return [
     h("h3", {}, "Opening"),
     choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind })),
-    number("opening-form-width", "Width, m", change.widthOf(opening), (value) => { if (value !== null && value > 0) edit(change.widenOpening(current, index, value)); }),
+    number("opening-form-width", "Width, m", change.widthOf(opening), (value) => {
+      if (value !== null && value > 0) edit(change.widenOpening(current, index, value));
+    }),
     number("opening-form-sill", "From, m over the floor", opening.sill_m, (value) => set({ sill_m: value })),
     number("opening-form-head", "To, m over the floor", opening.head_m, (value) => set({ head_m: value })),
-    button("Remove this opening", () => { select({ kind: "none" }); edit(change.removeOpening(current, index)); }),
+    button("Remove this opening", () => {
+      select({ kind: "none" });
+      edit(change.removeOpening(current, index));
+    }),
   ];
 }
 
@@ -96,13 +131,29 @@ function text(id: string, label: string, value: string, set: (value: string) => 
   return field(id, label, input);
 }
 
-function number(id: string, label: string, value: number | null | undefined, set: (value: number | null) => void): HTMLElement {
-  const input = h("input", { type: "number", step: "any", placeholder: "unknown", value: value == null ? null : String(Math.round(value * 1000) / 1000) });
+function number(
+  id: string,
+  label: string,
+  value: number | null | undefined,
+  set: (value: number | null) => void,
+): HTMLElement {
+  const input = h("input", {
+    type: "number",
+    step: "any",
+    placeholder: "unknown",
+    value: value == null ? null : String(Math.round(value * 1000) / 1000),
+  });
   input.addEventListener("change", () => set(input.value.trim() === "" ? null : input.valueAsNumber));
   return field(id, label, input);
 }
 
-function choice<T extends string>(id: string, label: string, value: T, options: T[], set: (value: T) => void): HTMLElement {
+function choice<T extends string>(
+  id: string,
+  label: string,
+  value: T,
+  options: T[],
+  set: (value: T) => void,
+): HTMLElement {
   const input = h("select", {}, ...options.map((option) => h("option", { selected: option === value }, option)));
   input.addEventListener("change", () => set(input.value as T));
   return field(id, label, input);

@@ -24,7 +24,10 @@ export class Handles {
   private plan: PlanDocument = { rooms: [] };
   private unit = 0.1;
 
-  constructor(private readonly svg: SVGSVGElement, private readonly actions: HandleActions) {}
+  constructor(
+    private readonly svg: SVGSVGElement,
+    private readonly actions: HandleActions,
+  ) {}
 
   /** Draw the handles of the selection and keep the focus. */
   draw(plan: PlanDocument, selection: Selection, unit: number): void {
@@ -43,27 +46,47 @@ export class Handles {
     const name = this.plan.rooms[index]!.name || `room ${index + 1}`;
     const select = (): void => this.actions.select({ kind: "room", index });
     return s("path", {
-      d: path(polygon), class: `grab-room${isSelected ? " selected" : ""}`, id: `edit-room-${index}`, tabindex: 0,
-      role: "button", "aria-label": `Room ${name}`, "aria-pressed": String(isSelected), onclick: select,
+      d: path(polygon),
+      class: `grab-room${isSelected ? " selected" : ""}`,
+      id: `edit-room-${index}`,
+      tabindex: 0,
+      role: "button",
+      "aria-label": `Room ${name}`,
+      "aria-pressed": String(isSelected),
+      onclick: select,
       onkeydown: (event) => {
         const key = (event as KeyboardEvent).key;
-        if (key === "Enter" || key === " ") { event.preventDefault(); select(); }
-        if (key === "Delete") { this.actions.select({ kind: "none" }); this.actions.edit(change.removeRoom(this.plan, index), false); }
+        if (key === "Enter" || key === " ") {
+          event.preventDefault();
+          select();
+        }
+        if (key === "Delete") {
+          this.actions.select({ kind: "none" });
+          this.actions.edit(change.removeRoom(this.plan, index), false);
+        }
       },
     });
   }
 
   private cornerShapes(room: number): SVGElement[] {
     return this.plan.rooms[room]!.polygon.map(([x, y], corner) => {
-      const move = (to: Point, goesOn: boolean): void => this.actions.edit(change.moveCorner(this.plan, room, corner, to), goesOn);
+      const move = (to: Point, goesOn: boolean): void =>
+        this.actions.edit(change.moveCorner(this.plan, room, corner, to), goesOn);
       const handle = s("circle", {
-        cx: x, cy: -y, r: 1.1 * this.unit, class: "corner", id: `edit-corner-${corner}`, tabindex: 0, role: "button",
+        cx: x,
+        cy: -y,
+        r: 1.1 * this.unit,
+        class: "corner",
+        id: `edit-corner-${corner}`,
+        tabindex: 0,
+        role: "button",
         "aria-label": `Corner ${corner + 1}, x ${x.toFixed(2)}, y ${y.toFixed(2)} m. Arrow keys move it, Delete removes it.`,
         ondblclick: () => this.actions.edit(change.removeCorner(this.plan, room, corner), false),
-        onkeydown: (event) => this.onKey(event as KeyboardEvent, {
-          move: (by) => move([x + by[0], y + by[1]], false),
-          remove: () => this.actions.edit(change.removeCorner(this.plan, room, corner), false),
-        }),
+        onkeydown: (event) =>
+          this.onKey(event as KeyboardEvent, {
+            move: (by) => move([x + by[0], y + by[1]], false),
+            remove: () => this.actions.edit(change.removeCorner(this.plan, room, corner), false),
+          }),
       });
       this.drag(handle, (to, goesOn) => {
         const here = this.plan.rooms[room]!.polygon[corner]!;
@@ -75,17 +98,29 @@ export class Handles {
 
   private wallShapes(room: number): SVGElement[] {
     return this.plan.rooms[room]!.polygon.flatMap((_, edge) => {
-      const wall = { room, edge }, [[ax, ay], [bx, by]] = change.wallOf(this.plan, wall);
+      const wall = { room, edge },
+        [[ax, ay], [bx, by]] = change.wallOf(this.plan, wall);
       const middle: Point = [0.5 * (ax + bx), 0.5 * (ay + by)];
       const split = (): void => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
       const line = s("line", {
-        x1: ax, y1: -ay, x2: bx, y2: -by, class: "grab-wall", id: `edit-wall-${edge}`, tabindex: 0, role: "button",
+        x1: ax,
+        y1: -ay,
+        x2: bx,
+        y2: -by,
+        class: "grab-wall",
+        id: `edit-wall-${edge}`,
+        tabindex: 0,
+        role: "button",
         "aria-label": `Wall ${edge + 1}, ${Math.hypot(bx - ax, by - ay).toFixed(2)} m. Arrow keys move it, Enter adds a corner; D, W and P add a door, a window or a passage.`,
         ondblclick: split,
         onkeydown: (event) => {
           const kind = KINDS[(event as KeyboardEvent).key.toLowerCase()];
           if (kind !== undefined) this.actions.edit(change.addOpening(this.plan, kind, wall, middle), false);
-          else this.onKey(event as KeyboardEvent, { move: (by) => this.actions.edit(change.moveWall(this.plan, wall, by), false), split });
+          else
+            this.onKey(event as KeyboardEvent, {
+              move: (by) => this.actions.edit(change.moveWall(this.plan, wall, by), false),
+              split,
+            });
         },
       });
       let from: Point | null = null;
@@ -95,32 +130,59 @@ export class Handles {
         from = to;
         if (by[0] !== 0 || by[1] !== 0 || !goesOn) this.actions.edit(change.moveWall(this.plan, wall, by), goesOn);
       });
-      const plus = s("circle", { cx: middle[0], cy: -middle[1], r: 0.7 * this.unit, class: "split", "aria-hidden": "true", onclick: split });
+      const plus = s("circle", {
+        cx: middle[0],
+        cy: -middle[1],
+        r: 0.7 * this.unit,
+        class: "split",
+        "aria-hidden": "true",
+        onclick: split,
+      });
       return [line, plus];
     });
   }
 
   private openingShapes(index: number, selection: Selection): SVGElement[] {
-    const opening = this.plan.openings![index]!, [[ax, ay], [bx, by]] = opening.line;
+    const opening = this.plan.openings![index]!,
+      [[ax, ay], [bx, by]] = opening.line;
     const isSelected = selection.kind === "opening" && selection.index === index;
-    const slide = (to: Point, goesOn: boolean): void => this.actions.edit(change.slideOpening(this.plan, index, to), goesOn);
-    const select = (): void => { if (!isSelected) this.actions.select({ kind: "opening", index }); };
+    const slide = (to: Point, goesOn: boolean): void =>
+      this.actions.edit(change.slideOpening(this.plan, index, to), goesOn);
+    const select = (): void => {
+      if (!isSelected) this.actions.select({ kind: "opening", index });
+    };
     const line = s("line", {
-      x1: ax, y1: -ay, x2: bx, y2: -by, class: `grab-opening${isSelected ? " selected" : ""}`, id: `edit-opening-${index}`,
-      tabindex: 0, role: "button", "aria-pressed": String(isSelected),
+      x1: ax,
+      y1: -ay,
+      x2: bx,
+      y2: -by,
+      class: `grab-opening${isSelected ? " selected" : ""}`,
+      id: `edit-opening-${index}`,
+      tabindex: 0,
+      role: "button",
+      "aria-pressed": String(isSelected),
       "aria-label": `${opening.kind} ${index + 1}, ${change.widthOf(opening).toFixed(2)} m wide. Arrow keys slide it, Delete removes it.`,
       onclick: select,
-      onkeydown: (event) => this.onKey(event as KeyboardEvent, {
-        move: (by_) => slide([0.5 * (ax + bx) + by_[0], 0.5 * (ay + by) + by_[1]], false),
-        remove: () => { this.actions.select({ kind: "none" }); this.actions.edit(change.removeOpening(this.plan, index), false); },
-        split: select,
-      }),
+      onkeydown: (event) =>
+        this.onKey(event as KeyboardEvent, {
+          move: (by_) => slide([0.5 * (ax + bx) + by_[0], 0.5 * (ay + by) + by_[1]], false),
+          remove: () => {
+            this.actions.select({ kind: "none" });
+            this.actions.edit(change.removeOpening(this.plan, index), false);
+          },
+          split: select,
+        }),
     });
-    this.drag(line, (to, goesOn) => { if (!goesOn) select(); slide(to, goesOn); });
+    this.drag(line, (to, goesOn) => {
+      if (!goesOn) select();
+      slide(to, goesOn);
+    });
     if (!isSelected) return [line];
     const ends = opening.line.map(([x, y], end) => {
       const handle = s("circle", { cx: x, cy: -y, r: 0.9 * this.unit, class: "corner", "aria-hidden": "true" });
-      this.drag(handle, (to, goesOn) => this.actions.edit(change.stretchOpening(this.plan, index, end as 0 | 1, to), goesOn));
+      this.drag(handle, (to, goesOn) =>
+        this.actions.edit(change.stretchOpening(this.plan, index, end as 0 | 1, to), goesOn),
+      );
       return handle;
     });
     return [line, ...ends];
@@ -144,8 +206,12 @@ export class Handles {
     });
   }
 
-  private onKey(event: KeyboardEvent, does: { move: (by: Point) => void; remove?: () => void; split?: () => void }): void {
-    const arrow = ARROWS[event.key], step = event.shiftKey ? FAR_STEP_M : STEP_M;
+  private onKey(
+    event: KeyboardEvent,
+    does: { move: (by: Point) => void; remove?: () => void; split?: () => void },
+  ): void {
+    const arrow = ARROWS[event.key],
+      step = event.shiftKey ? FAR_STEP_M : STEP_M;
     if (arrow !== undefined) does.move([arrow[0] * step, arrow[1] * step]);
     else if (event.key === "Delete" && does.remove !== undefined) does.remove();
     else if (event.key === "Enter" && does.split !== undefined) does.split();

@@ -36,10 +36,15 @@ export class Tools {
   private unit = 0.1;
   private plan: PlanDocument = { rooms: [] };
 
-  constructor(private readonly svg: SVGSVGElement, private readonly actions: ToolActions) {
+  constructor(
+    private readonly svg: SVGSVGElement,
+    private readonly actions: ToolActions,
+  ) {
     // Capture runs before the listeners of handles and viewport.
     svg.addEventListener("pointerdown", (event) => this.onDown(event), { capture: true });
-    svg.addEventListener("pointermove", (event) => { if (this.points.length > 0) this.draw(this.snap(placeOf(svg, event))); });
+    svg.addEventListener("pointermove", (event) => {
+      if (this.points.length > 0) this.draw(this.snap(placeOf(svg, event)));
+    });
     addEventListener("keydown", (event) => {
       if (this.tool === "select") return;
       if (event.key === "Escape") this.choose("select");
@@ -73,7 +78,8 @@ export class Tools {
     // Snap nearly straight walls, as most are parallel to the axes.
     if (this.tool !== "room" || previous === undefined) return to;
     const first = this.points[0]!;
-    const align = (axis: 0 | 1): number => [previous[axis], first[axis]].find((value) => Math.abs(value - place[axis]) < within) ?? to[axis];
+    const align = (axis: 0 | 1): number =>
+      [previous[axis], first[axis]].find((value) => Math.abs(value - place[axis]) < within) ?? to[axis];
     return [align(0), align(1)];
   }
 
@@ -89,7 +95,10 @@ export class Tools {
 
   private addCorner(corner: Point, place: Point): void {
     const first = this.points[0];
-    const closes = first !== undefined && this.points.length > 2 && Math.hypot(place[0] - first[0], place[1] - first[1]) < CLOSE_UNITS * this.unit;
+    const closes =
+      first !== undefined &&
+      this.points.length > 2 &&
+      Math.hypot(place[0] - first[0], place[1] - first[1]) < CLOSE_UNITS * this.unit;
     if (closes) this.close();
     else {
       this.points.push(corner);
@@ -123,9 +132,12 @@ export class Tools {
   }
 
   private draw(ahead: Point | null): void {
-    const points = ahead === null || (this.tool === "scale" && this.points.length === 2) ? this.points : [...this.points, ahead];
-    show(this.element,
+    const points =
+      ahead === null || (this.tool === "scale" && this.points.length === 2) ? this.points : [...this.points, ahead];
+    show(
+      this.element,
       points.length > 1 && s("path", { class: "drawn", d: path(points).slice(0, -1) }),
-      ...this.points.map(([x, y]) => s("circle", { cx: x, cy: -y, r: 0.9 * this.unit, class: "corner" })));
+      ...this.points.map(([x, y]) => s("circle", { cx: x, cy: -y, r: 0.9 * this.unit, class: "corner" })),
+    );
   }
 }

@@ -19,7 +19,9 @@ export class Underlay {
   }
 
   get box(): { width: number; height: number } | null {
-    return this.url === null ? null : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
+    return this.url === null
+      ? null
+      : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
   }
 
   /** Lay a picture under the plan, 12 m wide if its scale is unknown. Rejects if the file is not a picture. */
@@ -61,7 +63,17 @@ export class Underlay {
   private draw(): void {
     const box = this.box;
     if (box === null || this.url === null) return;
-    show(this.element, s("image", { href: this.url, x: 0, y: -box.height, width: box.width, height: box.height, preserveAspectRatio: "none" }));
+    show(
+      this.element,
+      s("image", {
+        href: this.url,
+        x: 0,
+        y: -box.height,
+        width: box.width,
+        height: box.height,
+        preserveAspectRatio: "none",
+      }),
+    );
     this.mix();
   }
 }

@@ -1,0 +1,40 @@
+/** Caption of the plan that is shown: name, facts, progress and warnings. */
+
+import { byId, h, show } from "./dom";
+import { InputError, showError } from "./notices";
+import { plainWords } from "./plain_words";
+import type { Plan, PlanDocument } from "./types";
+
+const DRAFT =
+  "This plan is a draft, derived from a picture or from lines: check it, and correct it with “Edit”. When all doors or " +
+  "all windows are right, tick them in the editor: only then the search uses them.";
+const MAX_WARNINGS = 4;
+
+/** Describe a stored plan, or the example before it is stored; null: no plan is shown. */
+export function showCaption(plan: Plan | null, example: PlanDocument | null = null): void {
+  byId("plan-name").textContent = plan?.name ?? example?.name ?? "No plan chosen";
+  const facts = (shown: Plan): string =>
+    `${shown.rooms.length} rooms, ${shown.area_m2.toFixed(1)} m², revision ${shown.revision_number}`;
+  byId("plan-facts").textContent =
+    plan !== null ? facts(plan) : example !== null ? "example, stored with the first query" : "";
+  byId("preparing").hidden = plan?.status !== "preparing";
+  byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
+  byId<HTMLButtonElement>("edit-plan").disabled = plan === null;
+  if (plan?.status === "failed") {
+    showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
+  }
+  showWarnings(plan);
+}
+
+/** Show the warnings about a plan; the rest of a long list opens with a click. */
+function showWarnings(plan: Plan | null): void {
+  const report = plan?.import_report;
+  const texts = [...(report?.is_draft ? [DRAFT] : []), ...(plan?.warnings ?? []), ...(report?.unsure ?? [])];
+  const items = texts.map((text) => h("li", {}, plainWords(text)));
+  const rest = items.splice(MAX_WARNINGS);
+  show(
+    byId("plan-warnings"),
+    ...items,
+    rest.length > 0 && h("li", {}, h("details", {}, h("summary", {}, `${rest.length} more`), h("ul", {}, ...rest))),
+  );
+}
