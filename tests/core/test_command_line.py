@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 from PIL import ExifTags, Image
 
-import lalaloc_core
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
@@ -304,7 +303,7 @@ def test_default_bundle_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(ROOT)
     assert default_bundle() == Path("models/default")
     monkeypatch.chdir(tmp_path)
-    assert default_bundle() == Path(lalaloc_core.bundle.__file__).resolve().parents[2] / "models" / "default"
+    assert default_bundle() == ROOT / "models" / "default"
     assert Bundle.open(default_bundle()).manifest.name == "default"
 
 

@@ -55,7 +55,7 @@ def test_equal_plans_give_equal_bytes_in_every_process(flat: FloorPlan):
 
 def test_options_of_ezdxf_stay_as_they_are(flat: FloorPlan):
     export_plan(flat, "dxf")
-    assert not ezdxf.options.write_fixed_meta_data_for_testing
+    assert not ezdxf.options.write_fixed_meta_data_for_testing  # pyright: ignore[reportPrivateImportUsage]
 
 
 @pytest.mark.parametrize("format", ["geojson", "imdf"])
