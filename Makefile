@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml requirements.lock torch.lock scripts/setup.sh scripts/i
 	PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh
 	@touch $@
 
-demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
+demo: $(STAMP) ## localise the example photographs over HTTP, write demo.png
 	$(BIN)/python -m examples.demo
 
 serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data

@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser of all commands."""
-    parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
+    parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (localising, encoding, tracking, plans, evaluation, measuring, synthesis, training):
