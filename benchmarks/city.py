@@ -91,11 +91,7 @@ def _venue_rows(reports: Sequence[dict[str, Any]], plans: int) -> Iterator[_Row]
         "≤ 500 MB",
         cells(lambda report: f"{report['resident_mb']['ready']}; {report['resident_mb']['localised']} MB"),
     )
-    yield (
-        prefix + "slowest change of one plan, until it is searched rightly",
-        "≤ 1 s",
-        cells(_slowest_change),
-    )
+    yield (prefix + "slowest change of one plan, until it is searched rightly", "≤ 1 s", cells(_slowest_change))
     yield prefix + "first query after a kill", _NONE, cells(_after_kill)
     yield prefix + "all as expected", "yes", cells(_as_expected)
 

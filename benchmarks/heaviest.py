@@ -438,13 +438,7 @@ LOADS = (
         _read_and_delete_answer,
     ),
     Load(
-        (
-            "POST /admin/keys",
-            f"POST {_KEY}/rotation",
-            f"GET {_KEY}",
-            f"DELETE {_KEY}",
-            "PATCH /admin/tenants/{tenant}",
-        ),
+        ("POST /admin/keys", f"POST {_KEY}/rotation", f"GET {_KEY}", f"DELETE {_KEY}", "PATCH /admin/tenants/{tenant}"),
         "keys and limits",
         _administer,
     ),

@@ -230,13 +230,7 @@ class Follower:
             move = still if place == 0 or order[place - 1] != index - 1 else walk.moves[index - 1]
             begin = time.perf_counter()
             answer = run_steps(
-                track_steps(
-                    self._ground,
-                    self._encoders,
-                    state,
-                    walk.queries[index],
-                    move if odometry else None,
-                ),
+                track_steps(self._ground, self._encoders, state, walk.queries[index], move if odometry else None),
                 self._refiner,
             )
             # As between two requests.

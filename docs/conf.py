@@ -13,12 +13,7 @@ author = "The LaLaLoc authors"
 project_copyright = author
 release = version = __version__
 
-extensions = [
-    "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-    "sphinx.ext.apidoc",
-]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc"]
 myst_heading_anchors = 3
 exclude_patterns = ["tables", "report"]
 

@@ -100,11 +100,7 @@ def view_document(view: Photograph) -> dict[str, Any]:
     """Return what was assumed about a photograph, with the field names of the API."""
 
     def angle(assumed: Assumed) -> dict[str, Any]:
-        return {
-            "value_deg": math.degrees(assumed.value),
-            "std_deg": math.degrees(assumed.sd),
-            "source": assumed.source,
-        }
+        return {"value_deg": math.degrees(assumed.value), "std_deg": math.degrees(assumed.sd), "source": assumed.source}
 
     angles = {name: angle(getattr(view, name)) for name in ("hfov", "pitch", "roll")}
     return {"projection": view.projection, "projection_source": view.projection_source, **angles}

@@ -111,9 +111,7 @@ def add_commands(commands: Any) -> None:
         "--views", action="store_true", help="calibrate the encoder of views, on views of 55° to 110°, not on spheres"
     )
     calibrate.add_argument(
-        "--errors",
-        action="store_true",
-        help="only measure the predictions' errors, for `plan check --localisability`",
+        "--errors", action="store_true", help="only measure the predictions' errors, for `plan check --localisability`"
     )
     calibrate.add_argument(
         "--out", type=Path, metavar="DIR", help="folder to store predictions in and to continue from"

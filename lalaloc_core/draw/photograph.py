@@ -41,11 +41,7 @@ def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> 
 
 
 def wall_stroke(
-    outline: Outline,
-    size: tuple[int, int],
-    colour: str = WALL_COLOUR,
-    width: float = 2.0,
-    edge_width: float = 3.0,
+    outline: Outline, size: tuple[int, int], colour: str = WALL_COLOUR, width: float = 2.0, edge_width: float = 3.0
 ) -> Stroke:
     """Return floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
     return Stroke([line * size for line in outline.edges], colour, width, edge_width)
@@ -78,10 +74,7 @@ def photograph_key(outline: Outline, x: Number, y: Number) -> str:
     """Draw the legend of the lines in a photograph; `y` is the base line of its text."""
     kinds = sorted({opening.kind for opening in outline.openings}, key=_KINDS.index)
     parts = []
-    for name, colour in (
-        ("walls of the plan", WALL_COLOUR),
-        *((kind + "s", ON_PHOTOGRAPH[kind]) for kind in kinds),
-    ):
+    for name, colour in (("walls of the plan", WALL_COLOUR), *((kind + "s", ON_PHOTOGRAPH[kind]) for kind in kinds)):
         parts.append(
             f'<rect x="{x:.1f}" y="{y - 13:.1f}" width="26" height="13" rx="3" fill="{colour}" stroke="{INK}"/>'
             + words(x + 36, y, name, 17)

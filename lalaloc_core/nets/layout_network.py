@@ -106,10 +106,7 @@ class RingLayoutEncoder(nn.Module):
         self.head = RingHead(config)
 
     def ring(
-        self,
-        profile_m: Float[Tensor, "b w"],
-        camera_height_m: Float[Tensor, "b"],
-        ceiling_height_m: Float[Tensor, "b"],
+        self, profile_m: Float[Tensor, "b w"], camera_height_m: Float[Tensor, "b"], ceiling_height_m: Float[Tensor, "b"]
     ) -> Float[Tensor, "b c s"]:
         """Return the ring of the bare layout."""
         distance = profile_m.clamp(_MIN_DISTANCE_M, _MAX_DISTANCE_M)
@@ -119,10 +116,7 @@ class RingLayoutEncoder(nn.Module):
         return self.project(self.blocks(functional.silu(self.stem(features))))
 
     def forward(
-        self,
-        profile_m: Float[Tensor, "b w"],
-        camera_height_m: Float[Tensor, "b"],
-        ceiling_height_m: Float[Tensor, "b"],
+        self, profile_m: Float[Tensor, "b w"], camera_height_m: Float[Tensor, "b"], ceiling_height_m: Float[Tensor, "b"]
     ) -> Float[Tensor, "b d"]:
         """Encode layouts as latents."""
         return self.head(self.ring(profile_m, camera_height_m, ceiling_height_m))

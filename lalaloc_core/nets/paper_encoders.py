@@ -136,10 +136,7 @@ class PaperLayoutEncoder(nn.Module):
             self.fc = nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), self.fc)
 
     def forward(
-        self,
-        profile_m: Float[Tensor, "b w"],
-        camera_height_m: Float[Tensor, "b"],
-        ceiling_height_m: Float[Tensor, "b"],
+        self, profile_m: Float[Tensor, "b w"], camera_height_m: Float[Tensor, "b"], ceiling_height_m: Float[Tensor, "b"]
     ) -> Float[Tensor, "b d"]:
         """Encode layouts as latents."""
         depth = layout_depth(profile_m, camera_height_m, ceiling_height_m, self.config.layout_height)

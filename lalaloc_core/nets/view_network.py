@@ -77,13 +77,7 @@ class ViewNetwork(HorizonEncoder):
             raise ConfigError(
                 f"view.sectors is {config.sectors}; it must lie between 1 and ring.sectors, {ring.sectors}"
             )
-        super().__init__(
-            config,
-            config.sectors,
-            ring.profile_columns // ring.sectors,
-            extra_inputs=1,
-            circular=False,
-        )
+        super().__init__(config, config.sectors, ring.profile_columns // ring.sectors, extra_inputs=1, circular=False)
         columns = config.sectors * self.columns_per_sector
         self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
         self.pooling: Tensor
@@ -131,11 +125,7 @@ class ViewNetwork(HorizonEncoder):
         by_sector = seen.unflatten(1, (-1, self.columns_per_sector)).mean(dim=2)
         mixed = self.sector_features(pixels, styles, by_sector[..., None])
         log_height = torch.log(camera_height_m)
-        return ViewFeatures(
-            walls=self.walls(mixed, log_height),
-            seen=seen,
-            structure=self.structure(mixed, log_height),
-        )
+        return ViewFeatures(walls=self.walls(mixed, log_height), seen=seen, structure=self.structure(mixed, log_height))
 
 
 def _pooling(width: int, columns: int) -> Float[Tensor, "w c"]:

@@ -129,10 +129,7 @@ def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], ed
 
 
 def wall_profile(
-    position_m: Float[Array, "b 2"],
-    heading: Float[Array, "b"],
-    walls_m: Float[Array, "b n 4"],
-    columns: int,
+    position_m: Float[Array, "b 2"], heading: Float[Array, "b"], walls_m: Float[Array, "b n 4"], columns: int
 ) -> Float[Array, "b {columns}"]:
     """Return the wall profile (m) of each pose, one value per azimuth column of a sphere with that heading.
 
@@ -145,10 +142,7 @@ def wall_profile(
 
 
 def layout_depth(
-    profile_m: Float[Array, "b w"],
-    camera_height_m: Float[Array, "b"],
-    ceiling_height_m: Float[Array, "b"],
-    rows: int,
+    profile_m: Float[Array, "b w"], camera_height_m: Float[Array, "b"], ceiling_height_m: Float[Array, "b"], rows: int
 ) -> Float[Array, "b {rows} w"]:
     """Return the range (m) along each pixel's ray to the nearest of wall, floor and ceiling.
 

@@ -25,12 +25,7 @@ def room_mesh(room: Room) -> trimesh.Trimesh:
 
 
 def reference_depth(
-    room: Room,
-    position_m: Float[np.ndarray, "2"],
-    heading: float,
-    camera_height_m: float,
-    rows: int,
-    columns: int,
+    room: Room, position_m: Float[np.ndarray, "2"], heading: float, camera_height_m: float, rows: int, columns: int
 ) -> Float[np.ndarray, "{rows} {columns}"]:
     """Return the layout depth (m) of one pose by ray casting; inf for rays that escape through a seam of the mesh."""
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))

@@ -135,8 +135,7 @@ def sample_triplets(
         near = len(pool) + k * sampling.positives + np.arange(sampling.positives)
         rows.append(np.concatenate([[anchor], near, negatives]))
     merged = PoseSet(
-        np.concatenate([pool.position_m, positives.position_m]),
-        np.concatenate([pool.room_index, positives.room_index]),
+        np.concatenate([pool.position_m, positives.position_m]), np.concatenate([pool.room_index, positives.room_index])
     )
     return merged, np.stack(rows)
 

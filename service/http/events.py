@@ -146,10 +146,7 @@ class PlanEvents:
         states = self._grids.states(summaries)
         return {
             summary.id: PlanEvent(
-                status=state.status,
-                progress=state.progress,
-                revision=summary.revision_id,
-                reason=state.reason,
+                status=state.status, progress=state.progress, revision=summary.revision_id, reason=state.reason
             )
             for summary, state in zip(summaries, states, strict=True)
         }

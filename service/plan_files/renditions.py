@@ -86,10 +86,5 @@ def plan_layout(plan: FloorPlan, plan_id: str, revision_id: str) -> bytes:
 def _opening(plan: FloorPlan, face: OpeningFace) -> OpeningFaceAnswer:
     opening = plan.openings[face.opening]
     return OpeningFaceAnswer(
-        kind=opening.kind,
-        wall=face.wall,
-        start=face.start,
-        end=face.end,
-        sill_m=opening.sill_m,
-        head_m=opening.head_m,
+        kind=opening.kind, wall=face.wall, start=face.start, end=face.end, sill_m=opening.sill_m, head_m=opening.head_m
     )

@@ -74,11 +74,7 @@ class JobQueue:
     """
 
     def __init__(
-        self,
-        limit: int,
-        served_by: Callable[[float], bool],
-        accounts: CpuAccounts,
-        workers: Shares | None = None,
+        self, limit: int, served_by: Callable[[float], bool], accounts: CpuAccounts, workers: Shares | None = None
     ) -> None:
         """Create an empty queue.
 

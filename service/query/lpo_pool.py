@@ -21,12 +21,7 @@ class LpoPool:
     """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
 
     def __init__(
-        self,
-        bundle: Bundle,
-        settings: Settings,
-        telemetry: Telemetry,
-        permits: FairSemaphore,
-        by_latents: bool = True,
+        self, bundle: Bundle, settings: Settings, telemetry: Telemetry, permits: FairSemaphore, by_latents: bool = True
     ) -> None:
         """Create a pool, which `start` starts.
 

@@ -49,11 +49,7 @@ class PhotographReader:
         `north` is the azimuth of true north (radians) in the plan.
         """
         return known_heading(
-            north,
-            form.heading_deg,
-            form.heading_tolerance_deg,
-            photograph.compass_heading,
-            self._compass_tolerance_deg,
+            north, form.heading_deg, form.heading_tolerance_deg, photograph.compass_heading, self._compass_tolerance_deg
         )
 
     async def encode(

@@ -135,12 +135,7 @@ class SessionSearch:
         )
 
     def _stored(
-        self,
-        ground: Ground,
-        found: Tracked,
-        spot: Spot,
-        form: PhotographForm,
-        timings_ms: dict[str, float],
+        self, ground: Ground, found: Tracked, spot: Spot, form: PhotographForm, timings_ms: dict[str, float]
     ) -> StoredPose:
         """Compose the part of the answer that is stored with the session; its path is the new pose alone."""
         pose, query, best = found.pose, found.query, found.candidates[0]

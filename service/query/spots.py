@@ -39,10 +39,7 @@ def view_answer(spot: Spot, ground: Ground, found: Localisation, confidence: Con
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
     return ViewAnswer(
-        **vars(read_view(spot)),
-        information_bits=bits,
-        ruled_out=1.0 - 2.0**-bits,
-        advice=advice_for(spot.arcs, sure),
+        **vars(read_view(spot)), information_bits=bits, ruled_out=1.0 - 2.0**-bits, advice=advice_for(spot.arcs, sure)
     )
 
 

@@ -33,8 +33,7 @@ _MAX_LISTED = 500
 
 Running = Annotated[Runtime, Depends(get_runtime)]
 Name = Annotated[
-    str | None,
-    Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$", description="Part of the name; case is ignored."),
+    str | None, Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$", description="Part of the name; case is ignored.")
 ]
 Revision = Annotated[str | None, Query(description="Id of an older revision.")]
 Limit = Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")]

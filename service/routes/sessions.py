@@ -92,10 +92,7 @@ def get_session(session_id: str, call: Call) -> Response:
 
 
 @router.delete(
-    "/{session_id}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    summary="End a session",
-    responses=_READ_RESPONSES,
+    "/{session_id}", status_code=status.HTTP_204_NO_CONTENT, summary="End a session", responses=_READ_RESPONSES
 )
 def delete_session(session_id: str, call: Call) -> None:
     """Delete a session before it expires."""

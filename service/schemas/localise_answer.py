@@ -83,7 +83,7 @@ class CandidateAnswer(ResponseModel):
     room_id: str = Field(description="`id` of the room, unique in the plan.")
     probability: Share | None = Field(
         description="Probability that this candidate, and no better one, is right within 1 m and 25°; null for a model "
-        "without confidence.",
+        "without confidence."
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
@@ -141,8 +141,7 @@ class LocaliseAnswer(ResponseModel):
     venue_id: str | None = Field(default=None, description="Venue in the request; null for a query about one plan.")
     level: float | None = Field(description="Level of the plan in the venue; null if `venue_id` is null.")
     plans: list[PlanProbability] | None = Field(
-        default=None,
-        description="Most probable plans of the venue, best first; null if `venue_id` is null.",
+        default=None, description="Most probable plans of the venue, best first; null if `venue_id` is null."
     )
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
@@ -151,7 +150,7 @@ class LocaliseAnswer(ResponseModel):
     confidence: Share | None = Field(
         description="Probability that the position is right within 1 m: the probability that the photograph is of this "
         "plan, times the share of this place in the posterior over all places (of all plans of a venue). Null for a "
-        "model without confidence.",
+        "model without confidence."
     )
     heading_confidence: Share | None = Field(
         description="Probability that the heading is right within 5°; null if `confidence` is null."

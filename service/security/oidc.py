@@ -218,10 +218,7 @@ async def fetch_keys(issuer: str) -> KeySet:
     # Without compression, so that the bytes on the wire bound those in memory.
     headers = {"Accept": "application/json", "Accept-Encoding": "identity"}
     try:
-        async with (
-            asyncio.timeout(_FETCH_S),
-            httpx.AsyncClient(verify=tls, timeout=_STEP_S, headers=headers) as client,
-        ):
+        async with asyncio.timeout(_FETCH_S), httpx.AsyncClient(verify=tls, timeout=_STEP_S, headers=headers) as client:
             document = await _json(client, issuer.rstrip("/") + _DISCOVERY)
             if document.get("issuer") != issuer:
                 name = str(document.get("issuer"))[:200]

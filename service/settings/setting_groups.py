@@ -360,10 +360,7 @@ class StorageSettings(SettingGroup):
         default=1000, description="Sessions of tracked cameras per tenant; further ones get 507."
     )
     audit_keep_s: float = Field(
-        default=365 * 86400.0,
-        ge=86400.0,
-        le=3660 * 86400.0,
-        description="Lifetime of entries of the audit log.",
+        default=365 * 86400.0, ge=86400.0, le=3660 * 86400.0, description="Lifetime of entries of the audit log."
     )
     max_audit_entries: int = Field(
         default=10**6,

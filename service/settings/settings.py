@@ -47,10 +47,7 @@ _REMOVED = frozenset(
 
 
 # Earlier names of settings, which stay valid.
-_EARLIER_NAMES = {
-    "max_panorama_bytes": "max_photograph_bytes",
-    "max_sequence_panoramas": "max_sequence_photographs",
-}
+_EARLIER_NAMES = {"max_panorama_bytes": "max_photograph_bytes", "max_sequence_panoramas": "max_sequence_photographs"}
 
 
 class Settings(BaseModel):

@@ -72,14 +72,7 @@ class Sessions:
         self._claim_s = claim_s
 
     def add(
-        self,
-        tenant: str,
-        session_id: str,
-        place: PlanRecord | VenueRecord,
-        options: str,
-        *,
-        ttl_s: float,
-        limit: int,
+        self, tenant: str, session_id: str, place: PlanRecord | VenueRecord, options: str, *, ttl_s: float, limit: int
     ) -> SessionRecord:
         """Store a session in a plan or venue; return the one that exists under this id, if the request is repeated.
 

@@ -59,9 +59,7 @@ def test_concurrent_queries_are_not_rejected(narrow: httpx.Client, plan_id: str,
 def test_concurrent_queries_with_asyncio_are_not_rejected(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
     async def query() -> list[Any]:
         async with AsyncClient(str(narrow.base_url), retry=ONCE) as client:
-            return await asyncio.gather(
-                *(client.localise(plan_id, panorama, refine="none") for _ in range(COUNT)),
-            )
+            return await asyncio.gather(*(client.localise(plan_id, panorama, refine="none") for _ in range(COUNT)))
 
     before = count_rejections(narrow)
     answers = asyncio.run(query())

@@ -182,12 +182,7 @@ class TestFilter:
 
     @pytest.mark.parametrize(("off_deg", "right"), [(0.0, True), (25.0, True), (80.0, False)])
     def test_known_heading_is_right_within_its_tolerance(
-        self,
-        ground: TrackedPlans,
-        encoders: PhotographEncoder,
-        queries: list[Query],
-        off_deg: float,
-        right: bool,
+        self, ground: TrackedPlans, encoders: PhotographEncoder, queries: list[Query], off_deg: float, right: bool
     ) -> None:
         state, heading = TrackState.first(len(queries[0].roll)), WALK[0][2]
         beliefs = []

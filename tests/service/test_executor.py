@@ -102,10 +102,7 @@ def test_failed_refinement_has_no_result(
 
 
 def test_refinement_stops_at_its_timeout(
-    runner_of: Callable[[int], StepRunner],
-    job: RefinementJob,
-    telemetry: Telemetry,
-    monkeypatch: pytest.MonkeyPatch,
+    runner_of: Callable[[int], StepRunner], job: RefinementJob, telemetry: Telemetry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A clock that passes a second whenever it is read.
     seconds = iter(range(1000))

@@ -21,10 +21,7 @@ from tests.service.conftest import FLAT, assert_problem, localise, upload
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
 # Required by GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11).
-YPR = {
-    "position": ("lat", "lon", "h"),
-    "angles": ("yaw", "pitch", "roll"),
-}
+YPR = {"position": ("lat", "lon", "h"), "angles": ("yaw", "pitch", "roll")}
 
 
 def check_schema(geopose: dict[str, Any]) -> None:

@@ -692,11 +692,7 @@ def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_
 
 
 def test_profile_model_needs_one_grid_for_all_heights(
-    start_app: StartApp,
-    database_of: DatabaseOf,
-    tmp_path: Path,
-    panorama: bytes,
-    monkeypatch: pytest.MonkeyPatch,
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(builder, "_MAX_GRIDS_PER_PLAN", 3)
     with start_app(tmp_path) as client:

@@ -118,12 +118,7 @@ def test_contradicted_hints_are_warned_about() -> None:
     posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0, Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1)))
     hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
     found = Localisation(
-        query=query,
-        candidates=[answer],
-        posterior=posterior,
-        stage="lpo",
-        signals={},
-        hints_missed=("near", "rooms"),
+        query=query, candidates=[answer], posterior=posterior, stage="lpo", signals={}, hints_missed=("near", "rooms")
     )
     now = datetime.now(UTC)
     record = PlanRecord(

@@ -116,10 +116,7 @@ def _with_issuer(url: str) -> dict[str, Any]:
 @needs_node
 @pytest.mark.one_replica
 def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
-    with (
-        node_issuer(_free_port(), FIRST) as issuer,
-        start_app(tmp_path, **_with_issuer(issuer.url)) as client,
-    ):
+    with node_issuer(_free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
         usage = client.get("/usage", headers=bearer(reader))
         assert usage.json()["tenant"] == "acme"

@@ -501,9 +501,7 @@ def test_many_invalid_keys_do_not_block_valid_ones(
         store.close()
 
 
-def test_address_counters_are_bounded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 1)
 
     async def count() -> int:

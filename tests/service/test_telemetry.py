@@ -315,10 +315,7 @@ def test_unsampled_trace_is_not_exported() -> None:
 
 @pytest.mark.slow
 def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    with (
-        collector() as (endpoint, received),
-        start_app(tmp_path, otlp_endpoint=endpoint) as client,
-    ):
+    with collector() as (endpoint, received), start_app(tmp_path, otlp_endpoint=endpoint) as client:
         plan_id = upload(client, FLAT)
         answered = localise(client, plan_id, panorama, refine="vdr").headers["traceparent"].split("-")
         # Spans are sent in batches; the test does not wait for the last batch.

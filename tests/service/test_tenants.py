@@ -94,8 +94,7 @@ def test_limits_are_set_and_reset(url: str, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.parametrize(
-    "options",
-    [["--stored-bytes", "-1"], ["--stored-bytes", str(2**63)], ["--cpu-share", "0"], ["--cpu-share", "nan"]],
+    "options", [["--stored-bytes", "-1"], ["--stored-bytes", str(2**63)], ["--cpu-share", "0"], ["--cpu-share", "nan"]]
 )
 def test_invalid_limit_is_a_usage_error(options: list[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:

@@ -200,12 +200,7 @@ def test_most_probable_plans_are_searched(
 
 @pytest.mark.parametrize("stored", ["NULL", "x'4c4c5032'"], ids=["nothing", "fewer poses"])
 def test_missing_prototypes_are_made(
-    start_app: StartApp,
-    tmp_path: Path,
-    database_of: Any,
-    panorama: bytes,
-    monkeypatch: pytest.MonkeyPatch,
-    stored: str,
+    start_app: StartApp, tmp_path: Path, database_of: Any, panorama: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
     from service.storage import Store
 

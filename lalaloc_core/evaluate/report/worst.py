@@ -169,10 +169,7 @@ def summarise(
             "expected_by_chance": sum(query.symmetric_by_chance for query in misaligned),
         },
         "lost_after_first_stage": int(((started_m < 1.0) & ~(errors_m < 1.0)).sum()),
-        "true_pose_fits": {
-            "compared": len(costs),
-            "better_than_found": sum(true < found for true, found in costs),
-        },
+        "true_pose_fits": {"compared": len(costs), "better_than_found": sum(true < found for true, found in costs)},
         "median_distance_bias": float(np.median(np.abs(biases))) if biases else None,
         "mean_confidence": {"worst": _mean_confidence(chosen), "all": _mean_confidence(predictions)},
         "facts": _lifts(predictions, chosen),

@@ -56,12 +56,7 @@ _SMALL = TrainConfig(
         cloud_columns=32,
         optimiser=OptimiserConfig(learning_rate=2e-3),
     ),
-    image=ImageStageConfig(
-        steps=1500,
-        batch=16,
-        shots_per_home=1,
-        optimiser=OptimiserConfig(learning_rate=1e-3),
-    ),
+    image=ImageStageConfig(steps=1500, batch=16, shots_per_home=1, optimiser=OptimiserConfig(learning_rate=1e-3)),
 )
 _BASES: dict[Budget, TrainConfig] = {
     "small": _SMALL,
@@ -115,13 +110,7 @@ ABLATIONS: dict[str, Ablation] = {
 
 
 def train_ablation(
-    name: str,
-    budget: Budget,
-    dataset: Dataset,
-    out: Path,
-    *,
-    device: torch.device,
-    workers: int = 1,
+    name: str, budget: Budget, dataset: Dataset, out: Path, *, device: torch.device, workers: int = 1
 ) -> Bundle:
     """Train a variant on a data set and export it to `out/<name>/bundle`.
 

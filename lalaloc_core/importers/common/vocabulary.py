@@ -34,10 +34,7 @@ _ROLES: tuple[tuple[Role, str], ...] = (
         "window windows win glaz glazing fenster fenetre fenetres ventana ventanas finestra finestre janela "
         "janelas raam ramen okno fonster vindu vindue ikkuna verglasung baie baies",
     ),
-    (
-        "passage",
-        "opening openings passage passages durchgang durchgange offnung offnungen ouverture ouvertures vano",
-    ),
+    ("passage", "opening openings passage passages durchgang durchgange offnung offnungen ouverture ouvertures vano"),
     (
         "obstacle",
         "column columns col cols pillar pillars stutze stutzen stuetze stuetzen pfeiler saule saulen poteau "
@@ -56,10 +53,7 @@ _ROLES: tuple[tuple[Role, str], ...] = (
         "piece pieces local locaux habitacion habitaciones estancia estancias stanza stanze locale locali "
         "ruimte ruimten kamer kamers rum rom unit units",
     ),
-    (
-        "text",
-        "text texts texte label labels name names iden note notes annotation anno beschriftung",
-    ),
+    ("text", "text texts texte label labels name names iden note notes annotation anno beschriftung"),
 )
 _ROLE_OF: dict[str, Role] = {word: role for role, words in reversed(_ROLES) for word in words.split()}
 _ORDER: list[Role] = [role for role, _ in _ROLES]

@@ -271,9 +271,7 @@ def _near(tree: shapely.STRtree, point: shapely.Point, distance_m: float) -> Int
     return np.sort(tree.query(point.buffer(1.01 * distance_m, cap_style="square")))
 
 
-def _loose_ends(
-    segments: Sequence[shapely.LineString],
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+def _loose_ends(segments: Sequence[shapely.LineString]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Return the ends that no other segment shares, and the outward unit vectors of their lines."""
     tips, outward = [], []
     for segment in segments:

@@ -203,10 +203,7 @@ def _closers(drawing: Drawing) -> list[BaseGeometry]:
 
 
 def name_rooms(
-    shapes: Sequence[Area],
-    letterings: Sequence[Lettering],
-    builder: ReportBuilder,
-    drawn: BaseGeometry | None = None,
+    shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder, drawn: BaseGeometry | None = None
 ) -> list[SketchedRoom]:
     """Name rooms by the first text inside that is a name, preferably a known room type; compare the areas written.
 

@@ -176,11 +176,7 @@ class Structured3D:
                 file = f"rgb_{lighting}light.png"
                 if file in files:
                     found[Appearance(furniture, lighting)] = FilePhotograph(
-                        path=level / file,
-                        scene=scene,
-                        room=room,
-                        depth_path=depth_path,
-                        size=self.panorama_size,
+                        path=level / file, scene=scene, room=room, depth_path=depth_path, size=self.panorama_size
                     )
         return found
 

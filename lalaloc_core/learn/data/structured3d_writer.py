@@ -152,10 +152,7 @@ class _Drawing:
         uprights = [self._line(*ends) for ends in zip(below, above, strict=True)]
         caps = (-1, -1)
         if not is_open:
-            caps = (
-                self._plane("floor", (0.0, 0.0, 1.0), floor),
-                self._plane("ceiling", (0.0, 0.0, -1.0), ceiling),
-            )
+            caps = (self._plane("floor", (0.0, 0.0, 1.0), floor), self._plane("ceiling", (0.0, 0.0, -1.0), ceiling))
         walls = []
         for k, (dx, dy) in enumerate((np.roll(polygon_m, -1, axis=0) - polygon_m).tolist()):
             length = float(np.hypot(dx, dy))

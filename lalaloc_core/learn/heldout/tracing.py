@@ -59,10 +59,7 @@ class Tracer:
         return Hits(found["primID"], distance, found["u"], found["v"])
 
     def blocked(
-        self,
-        origin_m: Float[np.ndarray, "n 3"],
-        direction: Float[np.ndarray, "n 3"],
-        within_m: Float[np.ndarray, "n"],
+        self, origin_m: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"], within_m: Float[np.ndarray, "n"]
     ) -> Bool[np.ndarray, "n"]:
         """Return for each ray if an obstacle is nearer than `within_m`."""
         reach = np.ascontiguousarray(within_m, dtype=np.float32)

@@ -243,11 +243,7 @@ def opening_kinds(
 
 
 def _batches(
-    visit: Callable[[int], list[T] | None],
-    pack: Callable[[list[T]], _Packed],
-    source: Source,
-    size: int,
-    first: int,
+    visit: Callable[[int], list[T] | None], pack: Callable[[list[T]], _Packed], source: Source, size: int, first: int
 ) -> Iterator[_Packed | LoadFailure]:
     """Yield batches of `size` rows from the visits from number `first` on, and load failures in between."""
     rows: list[T] = []

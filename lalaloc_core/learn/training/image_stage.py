@@ -41,11 +41,7 @@ class ImageStage(TrainingStage[ImageStageConfig]):
     name = "image"
 
     def __init__(
-        self,
-        config: TrainConfig,
-        source: Source,
-        layout_encoder: LayoutNetwork,
-        photographs: Photographs | None = None,
+        self, config: TrainConfig, source: Source, layout_encoder: LayoutNetwork, photographs: Photographs | None = None
     ) -> None:
         self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
         self.teacher: LayoutNetwork = layout_encoder.eval().requires_grad_(False)

@@ -83,10 +83,7 @@ PRESETS: dict[str, TrainConfig] = {
         architecture="paper",
         layout=LayoutStageConfig(steps=90_000, homes_per_step=4, anchors_per_home=1, optimiser=PAPER_SGD),
         image=ImageStageConfig(
-            steps=56_000,
-            batch=64,
-            shots_per_home=1,
-            optimiser=dataclasses.replace(PAPER_SGD, learning_rate=0.1),
+            steps=56_000, batch=64, shots_per_home=1, optimiser=dataclasses.replace(PAPER_SGD, learning_rate=0.1)
         ),
     ),
     "ring": TrainConfig(

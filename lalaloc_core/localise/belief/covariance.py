@@ -60,9 +60,7 @@ def pose_uncertainty(
     return PoseUncertainty(0.5 * (covariance + covariance.T), heading_std)
 
 
-def marginal_information(
-    information: Float[np.ndarray, "p p"],
-) -> tuple[Float[np.ndarray, "2 2"], float | None]:
+def marginal_information(information: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "2 2"], float | None]:
     """Return the information about the position with the heading integrated out, and about the heading likewise.
 
     Both are inverses of blocks of the inverse (Schur complements), and exist where that does not. The information is by

@@ -263,10 +263,7 @@ def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int
 
 
 def _width_corrections(
-    log_weight: Float[np.ndarray, "m"],
-    mode: Int[np.ndarray, "m"],
-    depth: Float[np.ndarray, "r"],
-    temperature: float,
+    log_weight: Float[np.ndarray, "m"], mode: Int[np.ndarray, "m"], depth: Float[np.ndarray, "r"], temperature: float
 ) -> Float[np.ndarray, "m"]:
     """Return log factors that give all refined modes the width of the deepest; of tied modes, of the widest.
 

@@ -245,11 +245,7 @@ def _spread(plan: FloorPlan, count: int, rng: np.random.Generator) -> PoseSet:
 
 
 def _summary(
-    plan: FloorPlan,
-    step_m: float,
-    places: PoseSet,
-    outcomes: Outcomes,
-    undrawn: list[list[Draw]] | None,
+    plan: FloorPlan, step_m: float, places: PoseSet, outcomes: Outcomes, undrawn: list[list[Draw]] | None
 ) -> Localisability:
     found: dict[Condition, Float[np.ndarray, "p"]] = {name: _shares(rows, "found") for name, rows in outcomes.items()}
     rooms: dict[Condition, Float[np.ndarray, "r"]] = {

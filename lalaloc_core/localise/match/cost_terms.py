@@ -66,10 +66,7 @@ def median_distance_m(centre: Float[np.ndarray, "w"], precision: Float[np.ndarra
 
 
 def ceiling_costs(
-    predicted: PredictedCeiling,
-    clearance_m: Float[np.ndarray, "*#n"],
-    offset: Float[np.ndarray, "*#n"],
-    tail: float,
+    predicted: PredictedCeiling, clearance_m: Float[np.ndarray, "*#n"], offset: Float[np.ndarray, "*#n"], tail: float
 ) -> Float[np.ndarray, "*n"]:
     """Return the cost of ceilings at some heights (m) above the camera, each at a δ."""
     difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)

@@ -277,10 +277,7 @@ class MatchingCost:
         return cost.min(axis=0) + self._weights.openings * self._openings(gathered, hypothesis), cost.argmin(axis=0)
 
     def _walls(
-        self,
-        gathered: _Gathered,
-        hypothesis: Int[np.ndarray, "#m"],
-        offset: Float[np.ndarray, "j #m"],
+        self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
         precision, offset = self._first.precision[hypothesis], offset.astype(np.float32)

@@ -282,11 +282,7 @@ class _SequenceSearch:
         )
 
     def localisation(
-        self,
-        picture: Observation,
-        answers: list[Candidate],
-        posterior: Posterior,
-        stage: Literal["retrieval", "lpo"],
+        self, picture: Observation, answers: list[Candidate], posterior: Posterior, stage: Literal["retrieval", "lpo"]
     ) -> Localisation:
         """Return the localisation of one picture, with the penalty of the camera height as for a single picture."""
         query, weights, matching = picture.query, picture.weights, self.config.matching

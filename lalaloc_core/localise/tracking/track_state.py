@@ -143,10 +143,7 @@ class TrackState:
             else {**vars(pose), "covariance": np.asarray(pose.covariance, float).ravel().tolist()},
         }
         text = json.dumps(header).encode()
-        arrays = (
-            (belief.pose * self.sectors + belief.sector).astype("<i4"),
-            belief.weight.astype("<f4"),
-        )
+        arrays = ((belief.pose * self.sectors + belief.sector).astype("<i4"), belief.weight.astype("<f4"))
         content = struct.pack("<I", len(text)) + text + b"".join(part.tobytes() for part in arrays)
         # Level 1, because most of the content hardly shrinks.
         return _HEADER.pack(_MAGIC, _VERSIONS[-1], zlib.crc32(content)) + zlib.compress(content, 1)

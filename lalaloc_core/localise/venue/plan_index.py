@@ -149,13 +149,7 @@ class PlanIndex:
 
     @classmethod
     def build(
-        cls,
-        rows: np.ndarray,
-        begin: Int[np.ndarray, "p"],
-        count: Int[np.ndarray, "p"],
-        *,
-        step_m: float,
-        cells: Cells,
+        cls, rows: np.ndarray, begin: Int[np.ndarray, "p"], count: Int[np.ndarray, "p"], *, step_m: float, cells: Cells
     ) -> PlanIndex:
         """Return the index of plans whose prototypes are in `rows`.
 

@@ -9,15 +9,7 @@ from service.security.permissions import NEEDED
 
 # A test compares the table with the routes.
 _METHODS = sorted({method for method, _ in NEEDED} | {"HEAD"})
-_SENT = (
-    "Authorization",
-    "Content-Type",
-    "Idempotency-Key",
-    "If-Match",
-    "If-None-Match",
-    "X-Request-ID",
-    "traceparent",
-)
+_SENT = ("Authorization", "Content-Type", "Idempotency-Key", "If-Match", "If-None-Match", "X-Request-ID", "traceparent")
 _ANSWERED = ("ETag", "Idempotency-Replayed", "Location", "Retry-After", "X-Request-ID")
 _PREFLIGHT_KEPT_S = 600
 

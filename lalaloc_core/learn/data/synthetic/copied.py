@@ -107,10 +107,7 @@ def _with_moved_doors(
 
 
 def _free_line(
-    polygon_m: Float[np.ndarray, "v 2"],
-    door: dict[str, Any],
-    openings: list[dict[str, Any]],
-    rng: np.random.Generator,
+    polygon_m: Float[np.ndarray, "v 2"], door: dict[str, Any], openings: list[dict[str, Any]], rng: np.random.Generator
 ) -> list[list[float]] | None:
     """Draw a free position for a door on a room's walls; None if there is none."""
     width_m = float(np.linalg.norm(np.subtract(*door["line"])))

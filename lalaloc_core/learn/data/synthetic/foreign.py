@@ -37,10 +37,7 @@ def office_plan(rng: np.random.Generator) -> FloorPlan:
         boxes, usual_m, depth_m = int(rng.integers(5, 11)), rng.uniform(2.4, 4.5), rng.uniform(3.0, 6.0)
         corridor_m, ceiling_m = rng.uniform(1.5, 2.4), float(rng.uniform(2.4, 3.2))
         top_m, length_m = begin_m + depth_m + corridor_m + 2 * _GAP_M, 0.0
-        for y_m, door_m, window_m in (
-            (begin_m, begin_m + depth_m, begin_m),
-            (top_m, top_m, top_m + depth_m),
-        ):
+        for y_m, door_m, window_m in ((begin_m, begin_m + depth_m, begin_m), (top_m, top_m, top_m + depth_m)):
             x_m = 0.0
             for _ in range(boxes):
                 width_m = usual_m * rng.choice([1.0, 1.0, 1.0, 2.0]) if rng.random() < 0.8 else rng.uniform(2.4, 7.0)

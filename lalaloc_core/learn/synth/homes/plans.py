@@ -157,10 +157,7 @@ def _place_in_frame(
 
 
 def _plan(
-    names: Sequence[str],
-    polygons_m: Sequence[np.ndarray],
-    ceilings_m: Sequence[float],
-    openings: Sequence[Opening],
+    names: Sequence[str], polygons_m: Sequence[np.ndarray], ceilings_m: Sequence[float], openings: Sequence[Opening]
 ) -> FloorPlan:
     ids = [name.replace(" ", "-") for name in names]
     rooms = [

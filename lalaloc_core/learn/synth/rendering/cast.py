@@ -183,11 +183,7 @@ def _before(
     vertical = torch.where(furniture, torch.where(is_side, 0.0, up), shell.vertical)
     flat = (vertical != 0.0).float()
     normal = torch.stack(
-        [
-            normals[..., 0].gather(2, chosen) * (1.0 - flat),
-            normals[..., 1].gather(2, chosen) * (1.0 - flat),
-            vertical,
-        ],
+        [normals[..., 0].gather(2, chosen) * (1.0 - flat), normals[..., 1].gather(2, chosen) * (1.0 - flat), vertical],
         dim=-1,
     )
     # Furniture in the own room before a hole; beyond the hole it shares the slot of the surface behind it.

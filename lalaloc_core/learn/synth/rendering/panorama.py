@@ -34,10 +34,7 @@ _BATCH_PIXELS_ELSEWHERE = 1 << 21
 _SHEET_ROWS, _SHEET_COLUMNS = 4, 4
 # Padding of tables: walls of no room, decals on no wall, and a small box far away.
 _NO_ROOM = -(10**6)
-_PADDING = {
-    "decals": Decals.row(wall=-1.0),
-    "prisms": Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0),
-}
+_PADDING = {"decals": Decals.row(wall=-1.0), "prisms": Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0)}
 
 
 @dataclasses.dataclass(frozen=True)

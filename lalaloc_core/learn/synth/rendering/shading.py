@@ -126,10 +126,7 @@ def _albedo(
     u = torch.where(flat, x, y * nx - x * ny)
     v = torch.where(flat, y, -z)
     scale, cosine, sine = surface.scale, surface.cosine, surface.sine
-    u, v = (
-        scale * (cosine * u - sine * v) + surface.shift_u,
-        scale * (sine * u + cosine * v) + surface.shift_v,
-    )
+    u, v = (scale * (cosine * u - sine * v) + surface.shift_u, scale * (sine * u + cosine * v) + surface.shift_v)
     distance = hits.distance_m * torch.sqrt(1.0 + slope**2)
     # The footprint of a pixel grows with distance and at grazing angles.
     grazing = torch.where(flat, (slope.abs() / torch.sqrt(1.0 + slope**2)), 1.0).clamp(min=0.1)

@@ -62,10 +62,7 @@ def _facts_of_place(shot: Shot) -> set[Fact]:
 
 
 def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
-    holds: dict[Fact, bool] = {
-        "nadir_patch": bool(scene.exposure.nadir > 0.0),
-        "sun_patch": _sees_sun(shot, scene.sun),
-    }
+    holds: dict[Fact, bool] = {"nadir_patch": bool(scene.exposure.nadir > 0.0), "sun_patch": _sees_sun(shot, scene.sun)}
     return {fact for fact, true in holds.items() if true}
 
 

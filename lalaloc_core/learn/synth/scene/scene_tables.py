@@ -154,14 +154,7 @@ class SceneTables:
                 self.add_wall(np.concatenate([back, front]), -1 - index, hole.surface)
 
     def to_scene(
-        self,
-        shot: Shot,
-        *,
-        lights: Lights,
-        sun: Sun,
-        backdrop: Backdrop,
-        exposure: Exposure,
-        facts: Iterable[Fact],
+        self, shot: Shot, *, lights: Lights, sun: Sun, backdrop: Backdrop, exposure: Exposure, facts: Iterable[Fact]
     ) -> RenderScene:
         """Return the finished scene; see `RenderScene` for the other arguments."""
         return RenderScene(
