@@ -36,7 +36,7 @@ heading = _within("heading", float, "between -360 and 360 degrees", lambda value
 tolerance = _within("tolerance", float, "between 0 and 45 degrees", lambda value: 0.0 <= value <= 45.0)
 
 _OPTIONS: dict[str, dict[str, Any]] = {
-    "--bundle": {"type": Path, "default": default_bundle(), "help": "model bundle (default: the shipped one)"},
+    "--bundle": {"type": Path, "help": "model bundle (default: the shipped one)"},
     "--camera-height": {
         "type": positive,
         "metavar": "M",
@@ -56,4 +56,6 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add shared options by name, such as "--bundle"."""
     for name in names:
-        parser.add_argument(name, **_OPTIONS[name])
+        # The path of the shipped model depends on the working folder.
+        default = {"default": default_bundle()} if name == "--bundle" else {}
+        parser.add_argument(name, **_OPTIONS[name], **default)

@@ -183,7 +183,7 @@ class TestScenes:
 
     def test_training_split_is_refused(self) -> None:
         assert list(HeldoutScenes(homes=3).scenes("train")) == []
-        with pytest.raises(DatasetError, match="unknown out-of-distribution scene"):
+        with pytest.raises(DatasetError, match="unknown generated scene"):
             HeldoutScenes(homes=3).load("train-00000")
 
     @pytest.mark.parametrize(
