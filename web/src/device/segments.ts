@@ -11,7 +11,7 @@ const TOLERANCE = (22.5 / 180) * Math.PI,
   CLOSER = 0.75;
 // Gradients below this (grey levels) have no sure direction: an error of 2 levels turns them by the tolerance.
 const LEAST_GRADIENT = 2 / Math.sin(TOLERANCE);
-// As in lalaloc_core/photograph/lines.py.
+// As in lalaloc_core/photograph/levelling.py.
 const MIN_LENGTH = 0.025,
   MAX_SEGMENTS = 150;
 const NONE = 10;
