@@ -1,7 +1,7 @@
-"""`make demo`: localise the example panoramas over HTTP and draw the results to demo.png.
+"""`make demo`: localise the example photographs over HTTP and draw the results to demo.png.
 
 The demo starts the service on a free port with a temporary data folder, uploads the example flat, and localises each
-panorama with and without its heading. It prints the results beside the true poses, draws them, and stops the service.
+photograph with and without its heading. It prints the results beside the true poses, draws them, and stops the service.
 The exit status is 0 if every stage ran.
 """
 
@@ -51,12 +51,12 @@ def main() -> int:
     except (StageMissingError, ServiceFailedError, ClientError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
-    print(f"\nwrote {out}: the layout over every panorama, and the probability of poses on the plan")
+    print(f"\nwrote {out}: the layout over every photograph, and the probability of poses on the plan")
     return 0
 
 
 def localise_examples() -> list[Panel]:
-    """Localise every example panorama with a new service, and print a line per result.
+    """Localise every example photograph with a new service, and print a line per result.
 
     Raises:
         ClientError: the plan did not become ready, or a request failed.
@@ -69,7 +69,7 @@ def localise_examples() -> list[Panel]:
         with running_service(0, environment) as service, Client(service.url) as client:
             plan_id = prepare_plan(client)
             print(_HEADER, flush=True)
-            return [_localise_panorama(client, plan_id, truth) for truth in read_poses()]
+            return [_localise_photograph(client, plan_id, truth) for truth in read_poses()]
 
 
 def prepare_plan(client: Client) -> str:
@@ -82,7 +82,7 @@ def prepare_plan(client: Client) -> str:
     return plan.id
 
 
-def _localise_panorama(client: Client, plan_id: str, truth: TruePose) -> Panel:
+def _localise_photograph(client: Client, plan_id: str, truth: TruePose) -> Panel:
     known = client.localise(
         plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
     )
@@ -125,7 +125,7 @@ def _numbers(value: Any, path: str = "localisation") -> Iterator[tuple[str, floa
 
 
 _HEADER = (
-    f"{'panorama':<16} {'heading':<8} {'true x, y':>12} {'found x, y':>12} {'error_m':>8} {'heading_deg':>12} "
+    f"{'photograph':<16} {'heading':<8} {'true x, y':>12} {'found x, y':>12} {'error_m':>8} {'heading_deg':>12} "
     f"{'confidence':>10} {'room':<12} {'ms':>6}"
 )
 

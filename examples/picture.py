@@ -21,7 +21,7 @@ _JPEG_QUALITY = 88
 
 @dataclass(frozen=True)
 class Panel:
-    """Results for one panorama with and without its heading; `picture` is the PNG of `known`."""
+    """Results for one photograph with and without its heading; `picture` is the PNG of `known`."""
 
     truth: TruePose
     known: Localisation

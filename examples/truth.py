@@ -1,4 +1,4 @@
-"""True poses of the example panoramas in `poses.json`, written by `make_examples.py`."""
+"""True poses of the example photographs in `poses.json`, written by `make_examples.py`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POSES_PATH = FOLDER / "poses.json"
 
 @dataclass(frozen=True, kw_only=True)
 class TruePose:
-    """True pose of one panorama, with the fields of the file; `heading_deg` is that of the centre column."""
+    """True pose of one photograph, with the fields of the file; `heading_deg` is that of the centre column."""
 
     file: str
     plan: str
@@ -32,7 +32,7 @@ class TruePose:
 
 
 def read_poses() -> list[TruePose]:
-    """Return the true poses of all example panoramas."""
+    """Return the true poses of all example photographs."""
     return [TruePose(**record) for record in json.loads(POSES_PATH.read_bytes())]
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.tracking.passages import Passages, PlanOnLevel
 from lalaloc_core.localise.tracking.track_state import StatePlan, TrackedPose, TrackState
 from lalaloc_core.localise.tracking.walk_motion import Odometry, States, WalkGraph, moved
@@ -113,11 +112,6 @@ class TrackedPlans:
         else:
             best[:] = True
         return share_searched(log_mass, searched[best], (by_plan / by_plan.sum())[best])
-
-    def in_own_plan(self, candidate: Candidate) -> tuple[int, Candidate]:
-        """Return the number of a candidate's plan, and the candidate in that plan's frame."""
-        number = self.plan_of_room(candidate.room_index)
-        return number, translated(candidate, -self.shift_m[number], -int(self.first_room[number]))
 
     def entered(self, state: TrackState) -> TrackState:
         """Return a state with the poses and in the frame of these plans, without those that are left out.
