@@ -13,7 +13,7 @@ from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from service.query.geopose import geopose_at
-from service.query.ground import Ground, Place
+from service.query.ground import Ground, PlacedCandidate
 from service.query.spots import Spot, view_answer
 from service.schemas import (
     CandidateAnswer,
@@ -101,7 +101,7 @@ def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
     return [f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"]
 
 
-def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
+def _candidate(place: PlacedCandidate, query: Query, probability: float | None) -> CandidateAnswer:
     candidate = place.candidate
     room = place.plan.rooms[candidate.room_index]
     heading_deg = heading_to_degrees(photograph_heading(query, candidate))

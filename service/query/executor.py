@@ -37,7 +37,7 @@ def finish_with(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> 
 
 
 class Executor:
-    """Runs the work of queries on its own threads, never on the event loop."""
+    """Compute threads of queries."""
 
     def __init__(
         self, settings: Settings, optimiser: OptimiserBackend, telemetry: Telemetry, permits: FairSemaphore
@@ -62,7 +62,7 @@ class Executor:
             return await self._threads.run(context.client, work)
 
     async def run_search(self, steps: SearchSteps[T], context: QueryContext) -> T:
-        """Run a search on the compute threads; it holds none in its pauses (None) and while a worker refines poses."""
+        """Run a search on the compute threads; it holds no thread in its pauses and while a worker refines poses."""
         lpo_timeout_s = partial(self._lpo_timeout_s, context)
         step = await self.compute(context, partial(self._steps.next, steps, None, lpo_timeout_s))
         while step is None or isinstance(step, RefinementJob | SequenceJob):

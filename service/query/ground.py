@@ -26,7 +26,7 @@ _TIED = 1e-9
 
 
 @dataclass(frozen=True)
-class Place:
+class PlacedCandidate:
     """A candidate and the plan that it lies in.
 
     Attributes:
@@ -59,8 +59,8 @@ class Ground:
         hints: hints in the frame of `plan`.
         warnings: warnings about plans that are not searched.
         merged: the plans side by side; None for one plan outside of venues.
-        loaded: the plans of the venue; None for one plan outside of venues.
-        stated: hints of the request about the venue; None outside of venues.
+        venue_plans: the plans of the venue; None for one plan outside of venues.
+        venue_hints: hints of the request about the venue; None outside of venues.
     """
 
     plan: FloorPlan
@@ -71,8 +71,8 @@ class Ground:
     hints: Hints = NO_HINTS
     warnings: Sequence[str] = ()
     merged: MergedPlans | None = None
-    loaded: LoadedPlans | None = None
-    stated: VenueHints | None = None
+    venue_plans: LoadedPlans | None = None
+    venue_hints: VenueHints | None = None
 
     @classmethod
     def of_plan(cls, record: PlanRecord, grid: PoseGrid, hints: Hints = NO_HINTS) -> Ground:
@@ -99,36 +99,38 @@ class Ground:
             hints=hints,
             warnings=loaded.warnings,
             merged=merged,
-            loaded=loaded,
-            stated=stated,
+            venue_plans=loaded,
+            venue_hints=stated,
         )
 
     @property
     def left_out(self) -> LeftOut | None:
         """Plans of the venue that are not searched; None if there are none."""
-        if self.loaded is None or self.loaded.log_mass is None:
+        if self.venue_plans is None or self.venue_plans.log_mass is None:
             return None
-        return LeftOut(self.loaded.area_share, self.loaded.log_mass, np.array(self.loaded.numbers))
+        return LeftOut(self.venue_plans.area_share, self.venue_plans.log_mass, np.array(self.venue_plans.numbers))
 
-    def place(self, candidate: Candidate) -> Place:
+    def place(self, candidate: Candidate) -> PlacedCandidate:
         """Return the plan of a candidate, and the candidate in that plan's frame."""
         number, own = (0, candidate) if self.merged is None else self.merged.in_own_plan(candidate)
         record = self.records[number]
-        return Place(record.id, record.revision_id, record.plan, own, self.anchors[number], self.levels[number])
+        return PlacedCandidate(
+            record.id, record.revision_id, record.plan, own, self.anchors[number], self.levels[number]
+        )
 
     def share(self, found: Localisation) -> float:
         """Return the probability that the camera is in a searched plan."""
-        if self.loaded is None or self.loaded.log_mass is None:
+        if self.venue_plans is None or self.venue_plans.log_mass is None:
             return 1.0
-        return share_searched(self.loaded.log_mass, np.array(self.loaded.numbers), self._share_by_plan(found))
+        return share_searched(self.venue_plans.log_mass, np.array(self.venue_plans.numbers), self._share_by_plan(found))
 
     def plan_probabilities(self, found: Localisation, fit: float | None) -> list[PlanProbability]:
         """Return the plans of a venue, most probable first.
 
         `fit` is the probability that the photograph is of a searched plan; None where it is unknown.
         """
-        assert self.loaded is not None
-        share, rows = self._share_by_plan(found), self.loaded.rows
+        assert self.venue_plans is not None
+        share, rows = self._share_by_plan(found), self.venue_plans.rows
         return [
             PlanProbability(
                 floorplan_id=rows[number].plan_id,
@@ -136,7 +138,7 @@ class Ground:
                 name=rows[number].name,
                 probability=None if fit is None else min(fit * float(share[number]), 1.0),
             )
-            for number in _by_probability(share, np.array(self.loaded.numbers))
+            for number in _by_probability(share, np.array(self.venue_plans.numbers))
         ]
 
     def hint_warnings(self, found: Localisation) -> list[str]:
@@ -156,15 +158,15 @@ class Ground:
             stated = f"near is within {hints.near.radius_m:g} m of {hints.near}"
             instead = f"the answer is {distance_m:.1f} m from there"
         elif name == "rooms":
-            if self.stated is None:
+            if self.venue_hints is None:
                 rooms, within = [self.plan.rooms[index].id for index in sorted(hints.rooms or ())], ""
             else:
-                rooms, within = self.stated.rooms, f" of floor plan '{place.plan_id}'"
+                rooms, within = self.venue_hints.rooms, f" of floor plan '{place.plan_id}'"
             stated = f"rooms is {', '.join(map(repr, rooms))}"
             instead = f"the answer lies in room '{place.plan.rooms[place.candidate.room_index].id}'{within}"
         else:
-            assert self.stated is not None
-            stated = f"level is {self.stated.level:g}"
+            assert self.venue_hints is not None
+            stated = f"level is {self.venue_hints.level:g}"
             instead = f"the answer is on level {place.level:g}"
         followed = "the answer follows it because strict is set" if hints.strict else instead
         return f"{stated}, which the panorama contradicts: {followed}"

@@ -24,7 +24,7 @@ from service.query.executor import Executor
 from service.query.ground import Ground
 from service.query.queries import Nearby, Where
 from service.query.stated_pose import stated_height, stated_hints
-from service.schemas import SessionDocument
+from service.schemas import LocaliseForm, SessionDocument
 from service.schemas.query_fields import CameraFields, HintFields
 from service.storage.records import PlanRecord, VenueRecord
 from service.venues.plan_list import PlanList
@@ -37,7 +37,7 @@ _CHOOSING = 8
 
 
 class Grounds:
-    """Finds the ground of a query: checks what it states, waits for plans, and loads their pose grids."""
+    """Finder of a query's ground, which checks what the query states, waits for plans, and loads their pose grids."""
 
     def __init__(
         self,
@@ -92,24 +92,22 @@ class Grounds:
         hints = VenueHints(anchor=anchor) if hinted is None else VenueHints.from_form(hinted, anchor)
         return VenueSite(self, where, form, hints, anchor, gap_m, max_poses)
 
-    async def check(
-        self, where: PlanRecord | VenueRecord, form: CameraFields, hinted: HintFields | SessionDocument
-    ) -> None:
+    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None:
         """Check what a request states about a plan or a venue.
 
         Raises:
-            InvalidPoseError: the camera height is above the ceiling.
+            InvalidPoseError: the camera height is impossible in the plan.
             InvalidHintError: the hints do not match the plan or venue.
             VenueUnsearchableError: the venue has no plans.
         """
         if isinstance(where, PlanRecord):
             stated_height(form, where)
-            stated_hints(hinted, where.plan).check(where.plan)
+            stated_hints(form, where.plan).check(where.plan)
             return
         members = await self.members(where)
         if not members:
             raise VenueUnsearchableError(where.id, 0)
-        VenueHints.from_form(hinted, where.anchor).check(members)
+        VenueHints.from_form(form, where.anchor).check(members)
 
     async def members(self, where: VenueRecord | Nearby) -> PlanList:
         """Return the current row of every plan of a venue or near a place.
@@ -227,7 +225,7 @@ class VenueSite:
 
     @property
     def height(self) -> CameraHeight:
-        """The stated camera height, else the one that the plans share."""
+        """The stated camera height, else the one that the plans share, else an unknown one; after `wait`."""
         return venue_height(self._form, self.ready)
 
     async def wait(self, context: QueryContext) -> None:
@@ -271,6 +269,7 @@ class VenueSite:
                 compute=partial(self._grounds.executor.compute, context),
                 favour=favour,
             )
+            # As `VenueSearch.load`: the photograph whose search compares most.
             height_m = max(choosing, key=lambda query: len(query.roll)).camera_height.height_m
             merge = partial(Ground.of_venue, loaded, self._hints, height_m, self._gap_m)
             return await self._grounds.executor.compute(context, merge)

@@ -18,7 +18,7 @@ from service.storage.records import PlanRecord, VenueRecord
 
 
 class Localiser:
-    """Answers queries about plans and venues."""
+    """Localisation of photographs in stored plans and venues."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class Localiser:
 
         Raises:
             InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
-            InvalidPoseError: the camera height is above the ceiling.
+            InvalidPoseError: the camera height is impossible in the plan.
             InvalidHintError: the hints do not match the plan, or exclude all of it.
             PlanFailedError: the plan's pose grid could not be computed.
             PlanNotReadyError: the pose grid was not ready by the deadline.
@@ -98,11 +98,11 @@ class Localiser:
         """Check what a request states about a plan or a venue.
 
         Raises:
-            InvalidPoseError: the camera height is above the ceiling.
+            InvalidPoseError: the camera height is impossible in the plan.
             InvalidHintError: the hints do not match the plan or venue.
             VenueUnsearchableError: the venue has no plans.
         """
-        await self._grounds.check(where, form, form)
+        await self._grounds.check(where, form)
 
     def close(self) -> None:
         """Wait for the computations in progress, and stop the threads."""

@@ -18,7 +18,7 @@ from service.schemas import LocaliseForm, PhotographForm, StatedHeading
 
 
 class PhotographReader:
-    """Decodes photographs in worker processes, and encodes them on the compute threads."""
+    """Decoder, in worker processes, and encoder, on compute threads, of a query's photographs."""
 
     def __init__(
         self, *, decoder: Decoder, encoder: PhotographEncoder, executor: Executor, compass_tolerance_deg: float

@@ -132,7 +132,7 @@ class SequenceSearch:
         known: Sequence[KnownHeading],
         turns: Sequence[float],
         height: CameraHeight,
-        place: Site | Ground,
+        site_or_ground: Site | Ground,
     ) -> tuple[Ground, Localisation]:
         """Search the place of photographs from one spot with known headings (radians) minus that of the first.
 
@@ -146,7 +146,7 @@ class SequenceSearch:
             if heading.heading is not None
         )
         encoded = await self._reader.encode([spot], [next(stated, known[0])], [height], context)
-        ground = place if isinstance(place, Ground) else await place.ground(encoded, context)
+        ground = site_or_ground if isinstance(site_or_ground, Ground) else await site_or_ground.ground(encoded, context)
         steps = localise_steps(
             ground.plan,
             ground.grid,

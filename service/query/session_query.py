@@ -27,7 +27,7 @@ from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.query.executor import Executor
 from service.query.geopose import geopose_at
-from service.query.ground import Ground, Place
+from service.query.ground import Ground, PlacedCandidate
 from service.query.grounds import Grounds, VenueSite
 from service.query.photograph_reader import PhotographReader
 from service.query.queries import TrackOutcome, TrackQuery
@@ -117,9 +117,9 @@ class SessionSearch:
 
     def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackedPlans:
         """Return a ground with the ways through its plans; `levels` are those of all plans of the venue."""
-        if ground.merged is None or ground.loaded is None:
+        if ground.merged is None or ground.venue_plans is None:
             return TrackedPlans.of_plan(ground.plan, ground.grid, self._graph(ground.records[0], ground.grid))
-        loaded = ground.loaded
+        loaded = ground.venue_plans
         plans = [
             PlanOnLevel(record.plan, row.level, anchor)
             for record, row, anchor in zip(loaded.records, loaded.rows, ground.anchors, strict=True)
@@ -175,7 +175,7 @@ class SessionSearch:
         return StoredPose(mode=pose.mode, pose=answer, path=[point])
 
 
-def _rival(place: Place, heading_deg: float, probability: float) -> RivalAnswer:
+def _rival(place: PlacedCandidate, heading_deg: float, probability: float) -> RivalAnswer:
     room = place.plan.rooms[place.candidate.room_index]
     return RivalAnswer(
         position=Position(x_m=place.candidate.x_m, y_m=place.candidate.y_m),

@@ -1,4 +1,4 @@
-"""The way into training: a stage is trained in the folder of a run, which has the checkpoints and logs of stages."""
+"""Training of one stage in the folder of a run, which has the checkpoints and logs of stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the exported image encoders have in common: sessions of onnxruntime, outputs, and queries made of outputs."""
+"""Common parts of the exported image encoders: sessions of onnxruntime, outputs, and queries made of outputs."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Pose refinement from the search's side: jobs for the refiner, and candidates from its results.
 
-`refinement_job` makes a `RefinementJob` of candidates, the caller has it run (`latent_refiner.PoseRefiner`, in this
-process or a worker), and `refined_candidates` turns the `RefinementResult` into candidates.
+`refinement_job` makes a `RefinementJob` of candidates, the caller has it run, and `refined_candidates` turns the
+`RefinementResult` into candidates. `descent_methods.refine_walls` runs jobs by walls, and `latent_refiner.PoseRefiner`
+those by latents, in this process or a worker.
 """
 
 from __future__ import annotations

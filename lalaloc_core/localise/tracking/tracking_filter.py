@@ -1,4 +1,4 @@
-"""Path of a photograph of a tracked camera: move the belief, compare the photograph, refine the modes, answer.
+"""Bayes filter for one photograph of a tracked camera: predict, compare, refine the modes, answer.
 
 The belief after a photograph is
 
