@@ -32,7 +32,7 @@ def test_limits_match_the_settings(client: httpx.Client) -> None:
     assert limits.pop("max_queries") == resolved.query_limit > 0
     assert limits.pop("max_queries_per_tenant") == max_per_client(resolved.query_limit) < resolved.query_limit
     assert limits.pop("max_pending_requests") == resolved.pending_limit > resolved.query_limit
-    assert limits == {name: settings.values()[name] for name in limits}
+    assert limits == {name: settings.value(name) for name in limits}
 
 
 @pytest.mark.parametrize(
