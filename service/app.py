@@ -1,6 +1,6 @@
 """The application: `uvicorn service.app:app`.
 
-Creating the app does no work; at start-up it reads the settings, loads the model and starts the LPO pool.
+Creating the app does no work; at start-up it reads the settings, loads the model and starts the worker processes.
 """
 
 from __future__ import annotations

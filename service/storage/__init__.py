@@ -9,6 +9,8 @@
         └── grid_leases      owner, end and progress of each grid's computation
     venues           id, tenant, name, revision, anchor, created_at, updated_at
     └── venue_plans      floor plan, level, name
+    sessions         plan or venue, state of the tracked camera, photographs, claim, expires_at
+    tenants          limits of each tenant
     api_keys         tenant, name, hash, scopes, rate, created_at, expires_at, revoked_at, last_used_at, key it replaces
     audit_log        actor, tenant, address, action, resource, status, result, count, created_at
     idempotency      (tenant, route, key) -> digest of the body, and the answer once it exists

@@ -35,7 +35,7 @@ _BATCH_SIZE = 1000
 # Maximum number of venues whose last index is remembered; the indices themselves are bounded in bytes.
 _MAX_LATEST = 1000
 
-# Function that runs CPU work on the threads of `Localiser`.
+# Function that runs CPU work on the threads of `Executor`.
 Compute = Callable[[Callable[[], Any]], Awaitable[Any]]
 
 

@@ -1,4 +1,4 @@
-"""Optimisers: from a refinement job to refined poses."""
+"""Refinement by latents on torch: from a refinement job to refined poses."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 class RefinementJob:
     """Starting poses for pose refinement, each with its own targets and room.
 
-    `PoseOptimiser` compares embedded layouts with `targets`, by differences times `precision` if that is not None.
+    `descent_methods.refine_walls` compares wall profiles with `log_profile`, on numpy. `latent_refiner.PoseOptimiser`
+    compares embedded layouts with `targets`, by differences times `precision` if that is not None.
     `PoseRefiner` reads a job with `log_profile` differently: it passes the optimiser a copy with `log_profile` as the
     targets, and uses the job's own `targets`, which are latents, for the latent distance alone. Without `log_profile`
     it compares latents and ignores `precision`.

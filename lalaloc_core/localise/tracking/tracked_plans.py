@@ -88,7 +88,7 @@ class TrackedPlans:
         return cls(merged.plan, merged.grid, graph, tuple(keys), merged.first_room, merged.shift_m, passages, left_out)
 
     def moved(self, states: States, sectors: int, odometry: Odometry | None) -> Float[np.ndarray, "n k"]:
-        """Return the belief over all poses and sectors after a motion; see `motion.moved`."""
+        """Return the belief over all poses and sectors after a motion; see `walk_motion.moved`."""
         if self.passages is None:
             return moved(self.graph, states, sectors, odometry)
         staying, arrived = self.passages.taken(self.graph, states, odometry)

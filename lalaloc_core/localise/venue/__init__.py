@@ -1,8 +1,8 @@
 """Search for the pose of a photograph in a venue of many plans.
 
 Begin with `merged_plans.py`, which merges the plans to search into one; `localise.search.pipeline` then searches it
-like a single plan. For a large venue, `plan_index.py` selects these plans by prototypes, a few poses of each plan
-(`prototypes.py`). Prototypes are stored in the cells of inverted files (`index_segment.py`, `prototype_cells.py`),
-compared by product codes (`prototype_codes.py`), the best ones exactly (`prototype_costs.py`), and the best of these at
-the best pose nearby (`prototype_alignment.py`).
+like a single plan. For a large venue, `index_search.py` selects these plans by prototypes, a few poses of each plan
+(`prototypes.py`), in the stages of `plan_index.py`. Prototypes are stored in the cells of inverted files
+(`index_segment.py`, `prototype_cells.py`), compared by product codes (`prototype_codes.py`), the best ones exactly
+(`prototype_costs.py`), and the best of these at the best pose nearby (`prototype_alignment.py`).
 """

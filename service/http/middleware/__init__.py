@@ -5,7 +5,7 @@ security_headers  security headers of answers
 cors              cross-origin requests of allowed pages
 framing           400 for a request with two body lengths
 head              HEAD as GET without a body
-authorisation     caller and tenant, or 401 and 403
+authorisation     caller and tenant, or 401, 403 and 429
 admission         slot for the request, or 503
 
 Begin with `telemetry.py`. `service.app` stacks them; their rules are in `service.telemetry`,
