@@ -57,5 +57,5 @@ def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add shared options by name, such as "--bundle"."""
     for name in names:
         # The path of the shipped model depends on the working folder.
-        default = {"default": default_bundle()} if name == "--bundle" else {}
+        default: dict[str, Any] = {"default": default_bundle()} if name == "--bundle" else {}
         parser.add_argument(name, **_OPTIONS[name], **default)
