@@ -180,7 +180,7 @@ def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
     page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
     expect(page.locator("#plan-error")).to_contain_text("bow")
     # The form imports the same file again with other options.
-    page.get_by_label("Level").fill("")
+    page.get_by_role("textbox", name="Level").fill("")
     with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/floorplans")):
         page.get_by_role("button", name="Import again").click()
     expect(page.locator("#plan-error")).to_contain_text("bow")
