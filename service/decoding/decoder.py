@@ -161,14 +161,14 @@ class Decoder:
                 return InvalidPhotographError("the photograph crashed the decoder twice: save it anew or smaller")
             case "stalled":
                 return InvalidPhotographError(
-                    f"decoding the photograph took longer than {self._settings.decode.stall_s:g} s "
+                    f"decoding the photograph took more than {self._settings.decode.stall_s:g} s of CPU time "
                     "(LALALOC_DECODE_STALL_S): save it anew, or send a smaller one"
                 )
             case "fault":
                 return InvalidPhotographError("the photograph is damaged: save it anew")
             case "queue-full":
                 return errors.OverloadedError(_QUEUE)
-            case "not-ready":
+            case "not-ready" | "stopped":
                 return errors.DecoderNotReadyError()
             case "closing":
                 return errors.StoppingError()

@@ -220,7 +220,7 @@ class Converter:
                 ) from error
             case "stalled":
                 raise InvalidFloorPlanError(
-                    f"reading the file took longer than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s "
+                    f"reading the file took more than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s of CPU time "
                     f"(max_import_s is {settings.plans.max_import_s:g}); export a single storey, or fewer layers"
                 ) from error
             case "fault":
@@ -229,7 +229,7 @@ class Converter:
                 ) from error
             case "queue-full":
                 raise OverloadedError(_QUEUE) from error
-            case "not-ready":
+            case "not-ready" | "stopped":
                 raise ConverterNotReadyError from error
             case "closing":
                 raise StoppingError from error

@@ -13,7 +13,9 @@ from cachetools import TTLCache
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairQueue, Shares
 
-LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
+LostReason = Literal[
+    "not-ready", "queue-full", "deadline", "poisoned", "stalled", "stopped", "fault", "died", "closing"
+]
 
 # Interval (s) in which an idle supervisor checks that its worker is alive.
 _IDLE_CHECK_S = 0.2
@@ -27,9 +29,10 @@ class JobLostError(Exception):
 
     Attributes:
         reason: `not-ready`: no worker is warm, nor will be in time. `queue-full`: too many jobs wait already.
-            `deadline`: no result in time. `poisoned`: the job crashed workers. `stalled`: the job exceeded its time
-            limit. `fault`: the job raised an error, which is logged. `died`: the worker died, and no time is left
-            for another try. `closing`: the pool shuts down.
+            `deadline`: no result in time. `poisoned`: the job crashed workers. `stalled`: the job exceeded its limit of
+            CPU time. `stopped`: two workers stood still, or got too little CPU time on a busy machine. `fault`: the job
+            raised an error, which is logged. `died`: the worker died, and no time is left for another try. `closing`:
+            the pool shuts down.
     """
 
     def __init__(self, reason: LostReason) -> None:
@@ -51,6 +54,7 @@ class PendingJob:
         self.deadline = deadline
         self.client = client
         self.deaths = 0
+        self.stops = 0
         self.stalled = False
         self.future: Future[Any] = Future()
 
@@ -150,9 +154,10 @@ class JobQueue:
                 # Its worker was killed for that.
                 reason = "closing"
             elif pending.stalled:
-                # Not retried, because it would take as long again. A new submission is tried: the machine may have
-                # been busy.
+                # Not retried, because it would take as long again.
                 reason = "stalled"
+            elif pending.stops >= _TRIES_PER_JOB:
+                reason = "stopped"
             elif pending.deaths >= _TRIES_PER_JOB:
                 reason = "poisoned"
                 self._poisoned[pending.digest] = True

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, Literal
 
 from service.pools.job_queue import JobQueue, PendingJob
 from service.telemetry import LOGGER_NAME
@@ -29,6 +29,10 @@ _MAX_BACKOFF_S, _MAX_BACKOFF_ONCE_WARM_S, _MAX_WARM_BACKOFF_S = 30.0, 5.0, 1.0
 _HOPELESS_STARTS = 3
 # Time limit and poll interval (s) for the end of a killed worker.
 _KILL_S, _JOIN_S = 5.0, 0.2
+# A busy machine may take this many times as long as a time limit for the work that it allows.
+_PATIENCE = 4.0
+# Looks at a process within its time limit, and the time (s) for which it may do nothing, if the limit is shorter.
+_LOOKS, _MIN_IDLE_S = 4, 1.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class WorkerSpec:
         name: name in the log and in the process list.
         target: called in the worker as `target(connection, *arguments)`; must be importable there.
         arguments: picklable arguments.
-        stall_s: time limit (s) of a job; the worker is killed after it.
+        stall_s: limit (s) of a job's CPU time; the worker is killed after it, or if it does nothing for as long.
         start_s: usual duration (s) of a start, until one has been measured.
         max_start_s: time limit (s) of a start.
         nice: niceness above the service's own, for work that no query waits for.
@@ -100,12 +104,8 @@ class Supervisor:
     @property
     def resident_bytes(self) -> int:
         """Memory of the worker; 0 without a worker, and on systems other than Linux."""
-        pid = self._process.pid if self._process is not None else None
-        try:
-            pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
-        except (OSError, IndexError):
-            return 0
-        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+        values = _status(self._process, "statm").split()
+        return int(values[1]) * os.sysconf("SC_PAGE_SIZE") if values else 0
 
     def stop(self, deadline: float) -> None:
         """End the worker after its job, or at the deadline (`monotonic`); the queue must be closed."""
@@ -194,7 +194,7 @@ class Supervisor:
         if isinstance(message, WorkerFailure):
             return message.reason
         late = f"the worker did not start within {self._spec.max_start_s:g} s"
-        return late if watchdog.expired else "the worker died starting"
+        return late if watchdog.verdict else "the worker died starting"
 
     def _serve(self, connection: Connection, process: BaseProcess) -> str:
         """Hand out jobs until the worker dies or stalls, or the queue is closed; return the reason."""
@@ -210,16 +210,18 @@ class Supervisor:
                 # A worker that died before it had the whole job was not crashed by it.
                 sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
-            # A worker that died or stalled has not told its CPU time, which is at most this long.
-            cpu_s = answer.cpu_s if isinstance(answer, JobResult | WorkerFailure) else monotonic() - begin
+            # A worker that died has not told its CPU time, which is at most this long.
+            known = answer.cpu_s if isinstance(answer, JobResult | WorkerFailure) else watchdog.cpu_s
+            cpu_s = known if known is not None else monotonic() - begin
             self._queue.accounts.charge(pending.client, cpu_s)
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                pending.stalled = sent and watchdog.expired
-                pending.deaths += sent and not watchdog.expired
+                pending.stalled = sent and watchdog.verdict == "stalled"
+                pending.stops += watchdog.verdict == "stopped"
+                pending.deaths += sent and watchdog.verdict is None
                 self._queue.give_back(pending)
-                return "stalled" if watchdog.expired else "died at work" if sent else "died idle"
+                return watchdog.verdict or ("died at work" if sent else "died idle")
             self._release()
             self._settle(pending, answer)
         return "closing"
@@ -240,28 +242,84 @@ class Supervisor:
 
 
 class Watchdog:
-    """Timer that kills a process unless the block ends in time; reads and writes of its pipe then end as well."""
+    """Timer that kills a process at its time limit; reads and writes of its pipe then end as well.
+
+    The limit is one of CPU time, so that a busy machine ends no job. A process that does nothing for as long is killed
+    too, and one that gets too little CPU time for several times as long.
+
+    Attributes:
+        verdict: `stalled` if the process used up its CPU time, `stopped` if it was killed otherwise, else None.
+        cpu_s: CPU time of a killed process; None if it is not known.
+    """
 
     def __init__(self, process: BaseProcess, limit_s: float) -> None:
         """Prepare the timer of a process, in seconds."""
-        self.expired = False
+        self.verdict: Literal["stalled", "stopped"] | None = None
+        self.cpu_s: float | None = None
         self._process = process
-        self._timer = threading.Timer(limit_s, self.expire)
-        self._timer.daemon = True
+        self._limit_s = limit_s
+        self._lock = threading.Lock()
+        self._ended = False
 
     def __enter__(self) -> Watchdog:
         """Start the timer."""
-        self._timer.start()
+        self._begin = self._progress = monotonic()
+        self._used_before = self._used = _cpu_s(self._process)
+        self._arm(self._limit_s / _LOOKS)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """Cancel the timer."""
-        self._timer.cancel()
+        with self._lock:
+            self._ended = True
+            self._timer.cancel()
 
-    def expire(self) -> None:
+    def expire(self, verdict: Literal["stalled", "stopped"] = "stalled") -> None:
         """Kill the process."""
-        self.expired = True
-        self._process.kill()
+        with self._lock:
+            if self._ended:
+                return
+            self._ended = True
+            self.verdict = verdict
+            self._process.kill()
+
+    def _arm(self, pause_s: float) -> None:
+        self._timer = threading.Timer(pause_s, self._look)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _look(self) -> None:
+        now, used = monotonic(), _cpu_s(self._process)
+        if used is None or self._used_before is None:
+            # The platform does not tell the CPU time.
+            spent_s = now - self._begin
+        else:
+            self.cpu_s = spent_s = used - self._used_before
+            if used != self._used:
+                self._used, self._progress = used, now
+        if spent_s >= self._limit_s:
+            self.expire("stalled")
+        elif now - self._progress >= max(self._limit_s, _MIN_IDLE_S) or now - self._begin >= _PATIENCE * self._limit_s:
+            self.expire("stopped")
+        else:
+            with self._lock:
+                if not self._ended:
+                    self._arm(self._limit_s / _LOOKS)
+
+
+def _cpu_s(process: BaseProcess) -> float | None:
+    """Return the CPU time (s) of a process; None on systems other than Linux, and after its end."""
+    # The second value is the name in brackets; user and system time are the 12th and 13th after it.
+    values = _status(process, "stat").rpartition(")")[2].split()
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK") if values else None
+
+
+def _status(process: BaseProcess | None, file: str) -> str:
+    """Return a file of /proc; empty without the process, and on systems other than Linux."""
+    try:
+        return Path(f"/proc/{process.pid if process is not None else None}/{file}").read_text(encoding="utf-8")
+    except OSError:
+        return ""
 
 
 def _send(connection: Connection, content: Sequence[bytes]) -> bool:

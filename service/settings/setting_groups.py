@@ -75,7 +75,7 @@ class LpoSettings(SettingGroup):
     deadline_s: Seconds = Field(
         default=2.0, description="LPO timeout per query; the answer then falls back to the VDR pose."
     )
-    stall_s: Seconds = Field(default=10.0, description="Timeout for one LPO job; its worker is then restarted.")
+    stall_s: Seconds = Field(default=10.0, description="CPU time limit for one LPO job; its worker is then restarted.")
 
 
 class DecodeSettings(SettingGroup):
@@ -91,7 +91,7 @@ class DecodeSettings(SettingGroup):
     )
     stall_s: Seconds = Field(
         default=4.0,
-        description="Timeout for decoding one photograph; the process is then replaced and the query fails.",
+        description="CPU time limit for decoding one photograph; the process is then replaced and the query fails.",
     )
     memory_bytes: int = Field(
         default=2**30, ge=64 * 2**20, description="Memory limit for decoding one photograph; enforced on Linux."

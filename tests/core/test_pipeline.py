@@ -113,7 +113,12 @@ class TestCandidates:
         refined = [candidate.cost for candidate in found.candidates if candidate.information is not None]
         coarse = [candidate.cost for candidate in found.candidates if candidate.information is None]
         assert bool(refined) == (refine == "lpo")
-        assert [candidate.cost for candidate in found.candidates] == sorted(refined) + sorted(coarse)
+        assert [candidate.information is None for candidate in found.candidates] == sorted(
+            candidate.information is None for candidate in found.candidates
+        )
+        for costs in (refined, coarse):
+            # The candidates' costs are computed in other batches than those that ranked them, and round differently.
+            assert np.all(np.diff(costs) >= -1e-5)
         assert found.best[found.stage] == found.candidates[0]
         assert flat.room_index_at(positions).tolist() == [candidate.room_index for candidate in found.candidates]
         for candidate in found.candidates:

@@ -12,7 +12,7 @@ from functools import cache
 from itertools import cycle
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 import numpy as np
@@ -220,13 +220,13 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
         sleep(0.05)
 
 
-def end_time_limits() -> int:
+def end_time_limits(verdict: Literal["stalled", "stopped"] = "stalled") -> int:
     """Let the time limits of all running jobs and starts of this process's pools pass; return their number."""
     timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
     watchdogs = [getattr(timer.function, "__self__", None) for timer in timers if not timer.finished.is_set()]
     running = [watchdog for watchdog in watchdogs if isinstance(watchdog, Watchdog)]
     for watchdog in running:
-        watchdog.expire()
+        watchdog.expire(verdict)
     return len(running)
 
 

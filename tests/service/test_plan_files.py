@@ -339,7 +339,7 @@ def test_stalled_worker_is_replaced(start_app: StartApp, tmp_path: Path) -> None
         stalled = threads.submit(send_plan, client, plan_file("dxf"))
         wait_for(lambda: end_time_limits() > 0)
         problem = assert_problem(stalled.result(), 422, "invalid-floorplan")
-        assert "longer than 40 s (max_import_s is 30)" in problem["detail"]
+        assert "more than 40 s of CPU time (max_import_s is 30)" in problem["detail"]
         wait_for(lambda: client.get("/readyz").json()["import_pool"]["ready"] == 1)
         # A killed worker loses no upload.
         (pid,) = import_workers() - earlier

@@ -159,6 +159,33 @@ def test_stalled_job_fails_and_can_be_resubmitted(log: Path, gate: Path) -> None
             wait_for(lambda: pool.state.ready == 2)
 
 
+def test_limit_of_a_job_is_cpu_time(log: Path, gate: Path) -> None:
+    with _warm_pool(log, stall_s=0.5) as pool:
+        waiting = pool.submit(("wait", str(gate)), _LONG_S)
+        sleep(0.8)
+        gate.touch()
+        # Waiting for something uses next to no CPU time.
+        assert waiting.result(_LONG_S) in _pids()
+        assert _reason(pool.submit(("spin", 600.0), _LONG_S)) == "stalled"
+
+
+def test_job_of_a_stopped_worker_is_tried_once_more(log: Path, gate: Path) -> None:
+    with _warm_pool(log, workers=2) as pool:
+        stopped = pool.submit(("wait", str(gate)), _LONG_S)
+        wait_for(lambda: _count(log, "wait") == 1)
+        end_time_limits("stopped")
+        wait_for(lambda: _count(log, "wait") == 2)
+        gate.touch()
+        assert stopped.result(_LONG_S) is not None
+        gate.unlink()
+        wait_for(lambda: pool.state.ready == 2)
+        stopped = pool.submit(("wait", str(gate)), _LONG_S)
+        for tries in (3, 4):
+            wait_for(lambda tries=tries: _count(log, "wait") == tries)
+            end_time_limits("stopped")
+        assert _reason(stopped) == "stopped"
+
+
 def test_job_cancelled_during_submission_is_not_started(log: Path, gate: Path) -> None:
     async def leave_at_once(pool: Pool) -> None:
         # Large enough that copying and hashing it takes a while.

@@ -42,6 +42,10 @@ def _work(log: str, kind: str, argument: Any) -> Any:
             return argument
         case "wait":
             _wait_for_file(argument)
+        case "spin":
+            begin = time.process_time()
+            while time.process_time() < begin + argument:
+                pass
         case "raise":
             raise ValueError(argument)
         case "die":
