@@ -70,10 +70,19 @@ def add_commands(commands: Any) -> None:
     train.add_argument(
         "--photographs",
         type=Path,
+        action="append",
         metavar="DIR",
-        help="image stage: panoramas without labels; --teacher predicts their walls and openings (preset trunk)",
+        help="image stages: folder of panoramas; --teacher predicts walls and openings of those without an annotation; "
+        "may be repeated (preset trunk)",
     )
-    train.add_argument("--teacher", type=Path, metavar="FILE", help="TensorFlow Lite segmenter with ADE20K's classes")
+    train.add_argument(
+        "--teacher",
+        type=Path,
+        action="append",
+        metavar="PATH",
+        help="TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them; "
+        "may be repeated for one of each",
+    )
     train.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
     train.add_argument("--device", help="cpu or cuda (default: cuda if available)")
     train.add_argument(
@@ -167,8 +176,8 @@ def _train(arguments: argparse.Namespace) -> None:
         deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
         heldout=None if arguments.data is not None else HeldoutScenes(homes=heldout_homes),
-        photographs=arguments.photographs,
-        segmenter=arguments.teacher,
+        photographs=tuple(arguments.photographs or ()),
+        teachers=tuple(arguments.teacher or ()),
     )
     train_stage(
         arguments.stage,

@@ -169,7 +169,7 @@ class TestStructure:
         assert torch.isfinite(losses.ceiling(torch.zeros(1), torch.zeros(1), torch.tensor([-0.1])))
 
     def test_teacher_openings_leave_passages_free(self) -> None:
-        target = torch.tensor([[[0.8, 0.1]]])
+        target = torch.tensor([[[0.8, 0.1, math.nan]]])
         for passage in (0.0, 0.05):
             probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
             logits = (probability + 1e-12).log().requires_grad_()
@@ -179,6 +179,24 @@ class TestStructure:
         (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, target), without_door)
         assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
 
+    def test_teacher_that_sees_passages_is_followed(self) -> None:
+        probability = torch.tensor([[[0.2, 0.3, 0.1, 0.4]]])
+        logits = probability.log().requires_grad_()
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, probability[..., 1:]), logits)
+        torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, torch.tensor([[[0.3, 0.1, 0.6]]])), logits)
+        assert gradient[0, 0, 3] < 0.0 < gradient[0, 0, 0]
+
+    def test_shape_of_walls_ignores_their_scale(self) -> None:
+        target, known = torch.randn(2, 9), torch.rand(2, 9) < 0.8
+        scaled = target + torch.tensor([[0.7], [-0.4]])
+        assert losses.wall_shape(walls(scaled, 0.0), target, known) < 1e-6
+        bent = torch.where(known, scaled, 99.0)
+        bent[:, 0] += 0.5
+        known[:, 0] = True
+        expected = torch.tensor(2 * 0.5 / float(known.sum()))
+        torch.testing.assert_close(losses.wall_shape(walls(bent, 0.0), target, known), expected)
+
     def test_teacher_walls_are_ignored_at_passages(self) -> None:
         log_profile = torch.zeros(1, 4, requires_grad=True)
         target = torch.tensor([[1.0, math.nan, 1.0, -1.0]])
@@ -187,11 +205,15 @@ class TestStructure:
             [[[0.9, 0.0, 0.0, 0.1], [0.9, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.9], [0, 0.6, 0, 0.4]]]
         )
         logits = (probability + 1e-9).log().requires_grad_()
-        loss = losses.teacher_walls(walls(log_profile, 0.0), target, logits)
+        openings = torch.zeros(1, 4, 3)
+        openings[..., 2] = math.nan
+        known = losses.visible_walls(target, openings, logits)
+        loss = losses.laplace_mixture(walls(log_profile, 0.0), target.nan_to_num(), known)
         gradient, logits_gradient = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
         assert torch.equal(gradient.sign(), torch.tensor([[-1.0, 0.0, 0.0, 1.0]]))
         # The student must not reduce the loss by predicting a passage.
         assert logits_gradient is None
+        assert losses.visible_walls(target, openings.nan_to_num(), logits).tolist() == [[True, False, True, True]]
 
 
 class TestChamfer:

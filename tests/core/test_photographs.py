@@ -1,8 +1,9 @@
-"""Unlabelled photographs with their segmenter, and simulated lens and file effects."""
+"""Photographs that are trained on, with their annotations and teachers, and simulated lens and file effects."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,12 @@ from PIL import Image
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.synth.augmentation.photometric import _blurred, _lenses, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched
+from lalaloc_core.learn.training.photograph_batches import Photographs
+from lalaloc_core.learn.training.photograph_targets import load_photographs, read_by_encoder
 from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.segmenter import _class_map, read_walls_and_openings
 from lalaloc_core.learn.training.training_data import TrainingData
-from lalaloc_core.learn.training.unlabelled_photographs import (
-    Photographs,
-    _class_map,
-    load_photographs,
-    read_walls_and_openings,
-)
+from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from tests.painted import painted_surfaces, wall_distance_m
 
 ROWS, COLUMNS, WIDTH = 512, 1024, 128
@@ -135,10 +134,10 @@ class TestDrawing:
         mark = (127.0 + 100.0 * torch.sin(2.0 * torch.pi * torch.arange(width) / width)).to(torch.uint8)
         images = mark[None, None, :, None].expand(1, 8, width, 3).contiguous()
         target = (mark.float() / 256.0)[None]
-        photographs = Photographs(images, target[..., None].expand(1, width, 2).contiguous(), torch.zeros(1, width))
+        photographs = Photographs(images, target[..., None].expand(1, width, 3).contiguous(), torch.zeros(1, width))
         drawn = photographs.draw(32, columns, torch.Generator().manual_seed(0))
         expected = (drawn.images[:, 4, :, 0].float() / 256.0).unflatten(1, (columns, 2)).mean(dim=2)
-        torch.testing.assert_close(drawn.openings, expected[..., None].expand(-1, -1, 2), atol=0.03, rtol=0.0)
+        torch.testing.assert_close(drawn.openings, expected[..., None].expand(-1, -1, 3), atol=0.03, rtol=0.0)
         brightest = drawn.images[:, 4, :, 0].argmax(dim=1)
         assert len(set(brightest.tolist())) > 10
         assert drawn.log_distance.shape == (32, columns)
@@ -147,24 +146,63 @@ class TestDrawing:
 
 
 class TestLoading:
-    def test_photographs_need_a_teacher(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="together"):
-            TrainingData(photographs=tmp_path).load_photographs(PRESETS["tiny-trunk"])
+    def test_photographs_without_annotation_need_a_teacher(self, tmp_path: Path) -> None:
+        Image.new("RGB", (64, 32)).save(tmp_path / "room.png")
+        with pytest.raises(ConfigError, match="1 photographs without annotation need one segmenter"):
+            TrainingData(photographs=(tmp_path,)).load_photographs(PRESETS["tiny-trunk"])
+
+    def test_teachers_need_photographs(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="--teacher is for --photographs"):
+            TrainingData(teachers=(tmp_path,)).load_photographs(PRESETS["tiny-trunk"])
+
+    def test_annotations_are_exact_targets(self, tmp_path: Path) -> None:
+        # A square room of two camera heights a side; a door in the middle of the wall ahead.
+        corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+        half = 256 * np.arctan(0.2) / (2 * np.pi)
+        door = {"kind": "door", "columns": [128 - half, 128 + half], "line": [[-0.2, 1.0], [0.2, 1.0]]}
+        annotation = {
+            "photograph": "room.png",
+            "quality": "good",
+            "polygon": corners,
+            "ceiling_above_camera": 0.7,
+            "openings": [door],
+        }
+        (tmp_path / "room.json").write_text(json.dumps(annotation), encoding="utf-8")
+        Image.new("RGB", (256, 128), (9, 9, 9)).save(tmp_path / "room.png")
+        photographs = load_photographs([tmp_path], [], 32, 64)
+        azimuth = ((np.arange(64) + 0.5) / 64 - 0.5) * 2 * np.pi
+        nearest = np.maximum(abs(np.cos(azimuth)), abs(np.sin(azimuth)))
+        np.testing.assert_allclose(photographs.log_distance[0].exp(), 1.0 / nearest, rtol=1e-4)
+        assert photographs.openings[0, :, 0].nonzero().flatten().tolist() == [30, 31, 32, 33]
+        assert not photographs.openings[0, :, 1:].any()
+
+    def test_encoder_reads_turned_spheres_alike(self) -> None:
+        torch.manual_seed(0)
+        config = PRESETS["tiny-trunk"]
+        encoder = TrunkImageEncoder(config.trunk, config.ring).eval()
+        sphere = torch.randint(0, 256, (1, *config.image_size, 3), dtype=torch.uint8)
+        width = config.image_size[1]
+        openings, log_distance = read_by_encoder(encoder, sphere, width)
+        shifted = read_by_encoder(encoder, sphere.roll(width // 4, 2), width)
+        torch.testing.assert_close(shifted[0], openings.roll(width // 4, 1))
+        torch.testing.assert_close(shifted[1], log_distance.roll(width // 4, 1))
+        mirrored = read_by_encoder(encoder, sphere.flip(2), width)
+        torch.testing.assert_close(mirrored[1], log_distance.flip(1))
 
     def test_photographs_need_an_architecture_with_openings(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="'ring' predicts no openings"):
-            TrainingData(photographs=tmp_path, segmenter=tmp_path / "t").load_photographs(PRESETS["tiny"])
+            TrainingData(photographs=(tmp_path,), teachers=(tmp_path / "t",)).load_photographs(PRESETS["tiny"])
 
     def test_folder_without_photographs_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no photographs"):
-            load_photographs(tmp_path, tmp_path / "teacher.tflite", 32, 64)
+            load_photographs([tmp_path], [tmp_path / "teacher.tflite"], 32, 64)
 
     @pytest.mark.skipif(not has_runtime, reason="ai-edge-litert is not installed")
     def test_invalid_teacher_is_refused(self, tmp_path: Path) -> None:
         Image.new("RGB", (64, 32)).save(tmp_path / "room.png")
         (tmp_path / "teacher.tflite").write_bytes(b"no model")
         with pytest.raises(ConfigError, match=r"teacher\.tflite"):
-            load_photographs(tmp_path, tmp_path / "teacher.tflite", 32, 64)
+            load_photographs([tmp_path], [tmp_path / "teacher.tflite"], 32, 64)
 
 
 class TestOptics:

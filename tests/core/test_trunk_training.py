@@ -27,12 +27,12 @@ from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.loop import run_stage
+from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.training_data import TrainingData
-from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
@@ -57,7 +57,7 @@ def some_photographs() -> Photographs:
     width = TINY.image_size[1]
     log_distance = torch.rand(3, width, generator=generator)
     log_distance[:, : width // 2] = torch.nan
-    return Photographs(images, 0.5 * torch.rand(3, width, 2, generator=generator), log_distance)
+    return Photographs(images, 0.3 * torch.rand(3, width, 3, generator=generator), log_distance)
 
 
 def stage_of(config: TrainConfig = TINY, photographs: Photographs | None = None) -> ImageStage:

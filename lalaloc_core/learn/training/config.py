@@ -39,6 +39,8 @@ class OptimiserConfig:
         trunk_factor: factor on the learning rate of a pretrained trunk; lower values keep it closer to its weights.
         only: names, or their beginnings, of the parameters that are trained, such as "image_encoder.to_profile"; the
             others keep their weights. Empty trains all.
+        keep_depthwise: keep the depthwise convolutions of a trunk as they are; their gradients take half of a step on a
+            processor, and they have a twentieth of the weights.
     """
 
     kind: Literal["adamw", "sgd"] = "adamw"
@@ -53,6 +55,7 @@ class OptimiserConfig:
     clip_norm: float = 1.0
     trunk_factor: float = 1.0
     only: tuple[str, ...] = ()
+    keep_depthwise: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +119,7 @@ class ImageStageConfig:
         profile_weight: weight of the Laplace likelihood of the wall profile (architectures `ring` and `trunk`).
         optics: strength, 0 to 1, of random lens and file effects: blur, vignetting, seams, tone curves, JPEG.
         pretrained: start with ImageNet weights of the trunk (architecture `trunk`).
+        shape_weight: weight of the error of a view's walls that remains when its scale is removed (stage `view`).
         opening_weight: weight of the cross entropy of the opening class at each azimuth (architecture `trunk`, like
             all following settings but the last two).
         opening_balance: 0 gives all azimuths the same weight in it, 1 all classes regardless of their share.
@@ -146,6 +150,7 @@ class ImageStageConfig:
     kd_weight: float = 0.0
     ring_weight: float = 0.0
     profile_weight: float = 0.0
+    shape_weight: float = 0.0
     optics: float = 0.0
     pretrained: bool = False
     opening_weight: float = 0.0

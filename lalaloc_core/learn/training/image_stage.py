@@ -15,6 +15,7 @@ from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
+from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
     TrainingStage,
@@ -23,7 +24,6 @@ from lalaloc_core.learn.training.stages import (
     photograph_loss,
     sample_styles,
 )
-from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
 from lalaloc_core.nets.layout_network import RingLayoutEncoder

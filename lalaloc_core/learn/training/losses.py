@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, WALL_CODE
 from lalaloc_core.nets.image_features import WallModes
 
 # Keeps log and its gradient finite when two latents coincide.
@@ -73,16 +73,26 @@ def is_passage(opening_logits: Float[Tensor, "b w c"]) -> Bool[Tensor, "b w"]:
     return torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")] >= 0.5
 
 
-def teacher_walls(
-    walls: WallModes, log_distance: Float[Tensor, "b w"], opening_logits: Float[Tensor, "b w c"]
-) -> Tensor:
-    """Return the `laplace_mixture` loss of the walls that a teacher sees; its log distance is NaN elsewhere.
+def wall_shape(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tensor, "b w"]) -> Tensor:
+    """Return the mean absolute error of log distances where known, after each picture's median error is removed.
 
-    Azimuths where the student predicts a passage are left out: the teacher sees the wall of the next room, but a room
-    ends in the plane of its own wall.
+    The error of a view's scale is large; this loss is not concerned with it.
     """
-    known = torch.isfinite(log_distance) & ~is_passage(opening_logits)
-    return laplace_mixture(walls, log_distance.nan_to_num(), known)
+    mean = (walls.log_share.exp() * walls.log_profile).sum(dim=2)
+    error = torch.where(known, mean - target, torch.nan)
+    scale = error.detach().nanmedian(dim=1, keepdim=True).values
+    return torch.where(known, (error - scale).abs(), 0.0).sum() / known.sum().clamp_min(1)
+
+
+def visible_walls(
+    log_distance: Float[Tensor, "b w"], openings: Float[Tensor, "b w 3"], opening_logits: Float[Tensor, "b w c"]
+) -> Bool[Tensor, "b w"]:
+    """Return the azimuths whose wall a teacher sees.
+
+    Where it cannot tell passages (their probability is NaN) and the student predicts one, the teacher sees the wall of
+    the next room, but a room ends in the plane of its own wall.
+    """
+    return torch.isfinite(log_distance) & ~(openings[..., 2].isnan() & is_passage(opening_logits))
 
 
 def opening(
@@ -119,18 +129,17 @@ def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], abov
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
-def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 2"]) -> Tensor:
-    """Return the cross entropy to a teacher's shares of (door, window) in each column.
+def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 3"]) -> Tensor:
+    """Return the cross entropy to a teacher's shares of (door, window, passage) in each column.
 
-    The teacher does not detect passages, so the remaining share can be wall or passage.
+    Where the share of passages is NaN, the remaining share can be wall or passage.
     """
     log_probability = torch.log_softmax(logits, dim=2)
-    door, window = (OPENING_CLASSES.index(kind) for kind in ("door", "window"))
-    other_codes = [code for code in range(len(OPENING_CLASSES)) if code not in (door, window)]
-    log_other = torch.logsumexp(log_probability[..., other_codes], dim=2)
-    other_share = (1.0 - shares.sum(dim=2)).clamp_min(0.0)
-    agreement = shares[..., 0] * log_probability[..., door] + shares[..., 1] * log_probability[..., window]
-    return -(agreement + other_share * log_other).mean()
+    wall, passage = log_probability[..., WALL_CODE], log_probability[..., PASSAGE_CODE]
+    log_other = torch.where(shares[..., 2].isnan(), torch.logaddexp(wall, passage), wall)
+    known = shares.nan_to_num()
+    other_share = (1.0 - known.sum(dim=2)).clamp_min(0.0)
+    return -((known * log_probability[..., WALL_CODE + 1 :]).sum(dim=2) + other_share * log_other).mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
+from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
-from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_features import WallModes
@@ -116,13 +116,18 @@ def photograph_loss(
     walls: WallModes,
     opening_logits: Float[Tensor, "n w c"],
     seen: Bool[Tensor, "n w"],
-    openings: Float[Tensor, "n w 2"],
+    openings: Float[Tensor, "n w 3"],
     log_distance: Float[Tensor, "n w"],
 ) -> Tensor:
-    """Return the weighted loss of predictions for photographs, against a segmenter's walls and openings where seen."""
+    """Return the weighted loss of predictions for photographs, against their targets where seen."""
     agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None])
-    distance = losses.teacher_walls(walls, torch.where(seen, log_distance, torch.nan), opening_logits)
-    return settings.photograph_weight * agreement + settings.photograph_profile_weight * distance
+    known = losses.visible_walls(torch.where(seen, log_distance, torch.nan), openings, opening_logits)
+    target = log_distance.nan_to_num()
+    distance = losses.laplace_mixture(walls, target, known)
+    loss = settings.photograph_weight * agreement + settings.photograph_profile_weight * distance
+    if settings.shape_weight:
+        loss += settings.shape_weight * losses.wall_shape(walls, target, known)
+    return loss
 
 
 def sample_styles(
@@ -157,6 +162,10 @@ def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> t
                 raise ConfigError(f"optimiser.only has '{wanted}', but no parameter begins with it; one is '{first}'")
         for name, parameter in names.items():
             parameter.requires_grad_(parameter.requires_grad and name.startswith(config.only))
+    if config.keep_depthwise:
+        for part in (part for module in modules.values() for part in module.modules()):
+            if isinstance(part, nn.Conv2d) and part.groups > 1:
+                part.requires_grad_(False)
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
     slow = {id(p) for trunk in trunks for p in trunk.parameters()}
     parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]

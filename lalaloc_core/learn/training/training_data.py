@@ -16,8 +16,9 @@ from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, 
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.training.checkpoint import Validate
 from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.photograph_batches import Photographs
+from lalaloc_core.learn.training.photograph_targets import load_photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, SceneSource, Source
-from lalaloc_core.learn.training.unlabelled_photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.validate import ImageValidation
 
 _LOG = logging.getLogger(__name__)
@@ -35,8 +36,8 @@ class TrainingData:
         validation_scenes: maximum number of validation scenes, spread evenly over the split.
         heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
             on it.
-        photographs: folder of unlabelled panoramas for the image stage.
-        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.unlabelled_photographs`.
+        photographs: folders of panoramas for the image stages, see `training.photograph_targets`.
+        teachers: segmenter and bundle that predict the walls and openings of those without annotation.
     """
 
     dataset: Dataset | None = None
@@ -45,8 +46,8 @@ class TrainingData:
     deferred: bool = False
     validation_scenes: int = 50
     heldout: Dataset | None = None
-    photographs: Path | None = None
-    segmenter: Path | None = None
+    photographs: tuple[Path, ...] = ()
+    teachers: tuple[Path, ...] = ()
 
     def source(self, config: TrainConfig) -> Source:
         """Create the source of training scenes."""
@@ -55,24 +56,24 @@ class TrainingData:
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def load_photographs(self, config: TrainConfig, size: tuple[int, int] | None = None) -> Photographs | None:
-        """Load the photographs with the segmenter's predictions; None if there are no photographs.
+        """Load the photographs with their targets; None if there are no photographs.
 
         `size` is their (height, width) in pixels (default: the image encoder's).
 
         Raises:
-            ConfigError: photographs without a segmenter or the reverse, an architecture without openings, or a
-                segmenter that cannot be run.
+            ConfigError: teachers without photographs, photographs with neither annotation nor teacher, an architecture
+                without openings, or a teacher that cannot be run.
             DatasetError: a photograph cannot be read.
         """
-        if self.photographs is None and self.segmenter is None:
+        if not self.photographs:
+            if self.teachers:
+                raise ConfigError("--teacher is for --photographs, which are not given")
             return None
-        if self.photographs is None or self.segmenter is None:
-            raise ConfigError("--photographs and --teacher must be given together")
         if config.architecture != "trunk":
             raise ConfigError(
                 f"architecture '{config.architecture}' predicts no openings; --photographs needs architecture 'trunk'"
             )
-        return load_photographs(self.photographs, self.segmenter, *(size or config.image_size))
+        return load_photographs(self.photographs, self.teachers, *(size or config.image_size))
 
     def validation(self, config: TrainConfig) -> list[Scene]:
         """Load the validation scenes; empty if the data set has none.

@@ -17,9 +17,9 @@ from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
-from lalaloc_core.learn.training.unlabelled_photographs import Photographs
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 
@@ -88,7 +88,9 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         part = middle(self.config)
         kind = torch.where(seen[rows], batch["opening_kind"][:, part], UNKNOWN)
         self.encoder.update_class_shares(kind, batch["room_type"])
-        walls = losses.laplace_mixture(features.walls.rows(rows), batch["profile_m"][:, part].log(), seen[rows])
+        log_profile = batch["profile_m"][:, part].log()
+        walls = losses.laplace_mixture(features.walls.rows(rows), log_profile, seen[rows])
+        shape = losses.wall_shape(features.walls.rows(rows), log_profile, seen[rows])
         above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
         ceiling = losses.ceiling(structure.log_ceiling[rows], structure.log_ceiling_scale[rows], above_m)
         openings = losses.opening(
@@ -97,6 +99,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         room_type = losses.room_type(structure.room_type_logits[rows], batch["room_type"])
         return {
             "profile": settings.profile_weight * walls,
+            "shape": settings.shape_weight * shape,
             "opening": settings.opening_weight * openings,
             "ceiling": settings.ceiling_weight * ceiling,
             "room_type": settings.room_type_weight * room_type,
