@@ -25,7 +25,16 @@ from service.grids import GridProvider, Sweeper
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
-from service.query import Executor, Grounds, Localiser, LocaliserBackend, LpoPool, OptimiserBackend
+from service.query import (
+    Executor,
+    Grounds,
+    Localiser,
+    LocaliserBackend,
+    LpoPool,
+    OptimiserBackend,
+    PhotographReader,
+    QueryParts,
+)
 from service.schemas import ModelAnswer
 from service.security import AccessControl, AuditTrail
 from service.settings import Settings
@@ -283,15 +292,14 @@ class _QueryComponents:
 
     def localiser(self, plans: VenuePlans, indices: IndexSource) -> Localiser:
         """Build the localiser."""
-        queries, executor = (
-            self.admission.queries,
-            Executor(self.settings, self.optimiser, self.telemetry, self.permits),
-        )
-        return Localiser(
+        executor = Executor(self.settings, self.optimiser, self.telemetry, self.permits)
+        queries, tolerance_deg = self.admission.queries, self.settings.photographs.compass_tolerance_deg
+        search = VenueSearch(plans=plans, indices=indices, encoder=self.encoder, queries=queries)
+        parts = QueryParts(
             bundle=self.bundle,
             encoder=self.encoder,
             decoder=self.decoder,
-            executor=executor,
+            reader=PhotographReader(self.decoder, self.encoder, executor, compass_tolerance_deg=tolerance_deg),
             grounds=Grounds(
                 encoder=self.encoder,
                 grids=self.grids,
@@ -299,11 +307,11 @@ class _QueryComponents:
                 reads=self.reads,
                 executor=executor,
                 plans=plans,
-                search=VenueSearch(plans=plans, indices=indices, encoder=self.encoder, queries=queries),
+                search=search,
             ),
-            queries=queries,
-            compass_tolerance_deg=self.settings.photographs.compass_tolerance_deg,
+            executor=executor,
         )
+        return Localiser(parts, queries)
 
     def venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""

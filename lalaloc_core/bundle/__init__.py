@@ -22,26 +22,3 @@ from lalaloc_core.bundle.manifest import (
     ViewManifest,
 )
 from lalaloc_core.bundle.prediction_errors import PredictionErrors
-
-__all__ = [
-    "BUNDLE_FILES",
-    "COHORT",
-    "DECODER_WEIGHTS",
-    "HEAD_ONNX",
-    "IMAGE_ONNX",
-    "IMAGE_WEIGHTS",
-    "LAYOUT_ONNX",
-    "LAYOUT_WEIGHTS",
-    "MANIFEST_NAME",
-    "VIEW_ONNX",
-    "VIEW_WEIGHTS",
-    "Bundle",
-    "ConfidenceModel",
-    "LogisticModel",
-    "Manifest",
-    "MatchingWeights",
-    "PredictionErrors",
-    "ViewManifest",
-    "default_bundle",
-    "write_manifest",
-]

@@ -5,5 +5,3 @@ implementation when they run, so `lalaloc --help` loads no network.
 """
 
 from lalaloc_core.cli.entry_point import main
-
-__all__ = ["main"]

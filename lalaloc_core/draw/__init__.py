@@ -7,5 +7,3 @@ else is re-exported.
 """
 
 from lalaloc_core.draw.canvas import rasterise
-
-__all__ = ["rasterise"]

@@ -12,21 +12,3 @@ from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_H
 from lalaloc_core.floorplan.plan import FloorPlan
 from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.rooms import Room, room_type_from_label
-
-__all__ = [
-    "DEFAULT_CAMERA_HEIGHT_M",
-    "DEFAULT_LIMITS",
-    "DEFAULT_OPENING_TOLERANCE_M",
-    "MAX_CAMERA_HEIGHT_STD_M",
-    "MAX_FROM_ORIGIN_M",
-    "USUAL_HEIGHTS_M",
-    "FloorPlan",
-    "Opening",
-    "OpeningFace",
-    "PlanGeometry",
-    "PlanLimits",
-    "Room",
-    "anchor_document",
-    "pad_walls",
-    "room_type_from_label",
-]

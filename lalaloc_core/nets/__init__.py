@@ -14,5 +14,3 @@ from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 
 ImageEncoder = RingImageEncoder | TrunkImageEncoder | PaperImageEncoder
-
-__all__ = ["ImageEncoder", "LayoutDecoder", "LayoutNetwork", "load_decoder", "load_layout_encoder"]

@@ -9,14 +9,3 @@ models of `cameras.py`. `picture_files.py` opens files.
 from lalaloc_core.photograph.patches import Patch, PatchSize
 from lalaloc_core.photograph.photograph import Assumed, Photograph, PhotographFeatures, open_photograph
 from lalaloc_core.photograph.stated_camera import Intrinsics, StatedCamera
-
-__all__ = [
-    "Assumed",
-    "Intrinsics",
-    "Patch",
-    "PatchSize",
-    "Photograph",
-    "PhotographFeatures",
-    "StatedCamera",
-    "open_photograph",
-]

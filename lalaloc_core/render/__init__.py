@@ -9,13 +9,3 @@ behind them, and `gradient.py` computes derivatives by the pose. These modules r
 from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import back_project, cast_rays, layout_depth, wall_profile
 from lalaloc_core.render.sweep import profiles_at
-
-__all__ = [
-    "RenderedLayout",
-    "back_project",
-    "cast_rays",
-    "layout_depth",
-    "profiles_at",
-    "render_layout",
-    "wall_profile",
-]

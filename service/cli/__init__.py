@@ -5,5 +5,3 @@ Begin with `entry_point.py`, which serves and manages keys; `data_commands.py` h
 """
 
 from service.cli.entry_point import add_serve_arguments, build_parser, main, serve
-
-__all__ = ["add_serve_arguments", "build_parser", "main", "serve"]

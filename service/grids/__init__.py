@@ -7,5 +7,3 @@ queues, under leases, and `sweeper.py` reacts to other replicas.
 from service.grids.grid_provider import GridProvider, GridState
 from service.grids.heights import check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
-
-__all__ = ["GridProvider", "GridState", "Sweeper", "check_height_m", "grid_height_m"]

@@ -8,5 +8,3 @@ the app, `api_description.py` describes it.
 
 from service.http.events import PlanEvents
 from service.http.idempotent_request import IdempotentRequest
-
-__all__ = ["IdempotentRequest", "PlanEvents"]

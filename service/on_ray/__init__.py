@@ -12,5 +12,3 @@ replica, which keeps its pose grid in memory. Begin with `application.py`; `repl
 """
 
 from service.on_ray.application import RayOptions, app
-
-__all__ = ["RayOptions", "app"]

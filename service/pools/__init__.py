@@ -14,5 +14,3 @@ when it stalls, and replaces it when it dies. Callers see only the result or a `
 from service.pools.job_queue import JobLostError, LostReason
 from service.pools.pool import PoolState, WorkerPool
 from service.pools.supervisor import WorkerSpec
-
-__all__ = ["JobLostError", "LostReason", "PoolState", "WorkerPool", "WorkerSpec"]

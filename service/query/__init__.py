@@ -15,6 +15,7 @@ from service.query.executor import Executor
 from service.query.grounds import Grounds
 from service.query.localiser import Localiser
 from service.query.lpo_pool import LpoPool
+from service.query.photograph_reader import PhotographReader
 from service.query.queries import (
     Content,
     Nearby,
@@ -25,23 +26,5 @@ from service.query.queries import (
     TrackQuery,
     Where,
 )
+from service.query.query_parts import QueryParts
 from service.query.session_query import MAX_POSES
-
-__all__ = [
-    "MAX_POSES",
-    "Content",
-    "Executor",
-    "Grounds",
-    "Localiser",
-    "LocaliserBackend",
-    "LpoPool",
-    "Nearby",
-    "OptimiserBackend",
-    "PhotographQuery",
-    "PictureRequest",
-    "QueryContext",
-    "SequenceQuery",
-    "TrackOutcome",
-    "TrackQuery",
-    "Where",
-]

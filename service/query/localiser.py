@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from service.capacity.admission_control import Slots
-from service.decoding.decoder import Decoder
-from service.query.executor import Executor
-from service.query.grounds import Grounds
-from service.query.photograph_reader import PhotographReader
 from service.query.queries import PhotographQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery, Where
+from service.query.query_parts import QueryParts
 from service.query.sequence_query import SequenceSearch
 from service.query.session_query import SessionSearch
 from service.query.single_query import SingleSearch
@@ -20,33 +15,15 @@ from service.storage.records import PlanRecord, VenueRecord
 class Localiser:
     """Localisation of photographs in stored plans and venues."""
 
-    def __init__(
-        self,
-        *,
-        bundle: Bundle,
-        encoder: PhotographEncoder,
-        decoder: Decoder,
-        executor: Executor,
-        grounds: Grounds,
-        queries: Slots,
-        compass_tolerance_deg: float,
-    ) -> None:
-        self._bundle = bundle
-        self._executor = executor
-        self._grounds = grounds
+    def __init__(self, parts: QueryParts, queries: Slots) -> None:
+        self._parts = parts
         self._queries = queries
-        reader = PhotographReader(
-            decoder=decoder, encoder=encoder, executor=executor, compass_tolerance_deg=compass_tolerance_deg
-        )
-        parts = {"bundle": bundle, "encoder": encoder, "reader": reader, "grounds": grounds, "executor": executor}
-        self._single = SingleSearch(decoder=decoder, **parts)
-        self._sequences = SequenceSearch(**parts)
-        self._sessions = SessionSearch(**parts)
+        self._single, self._sequences, self._sessions = SingleSearch(parts), SequenceSearch(parts), SessionSearch(parts)
 
     @property
     def model(self) -> ModelAnswer:
         """Name, version and digest of the model."""
-        return ModelAnswer.of(self._bundle)
+        return ModelAnswer.of(self._parts.bundle)
 
     async def localise(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
         """Localise a photograph in a stored plan, or in plans of a venue or near a place.
@@ -102,8 +79,8 @@ class Localiser:
             InvalidHintError: the hints do not match the plan or venue.
             VenueUnsearchableError: the venue has no plans.
         """
-        await self._grounds.check(where, form)
+        await self._parts.grounds.check(where, form)
 
     def close(self) -> None:
         """Wait for the computations in progress, and stop the threads."""
-        self._executor.close()
+        self._parts.executor.close()

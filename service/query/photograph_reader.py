@@ -21,7 +21,7 @@ class PhotographReader:
     """Decoder, in worker processes, and encoder, on compute threads, of a query's photographs."""
 
     def __init__(
-        self, *, decoder: Decoder, encoder: PhotographEncoder, executor: Executor, compass_tolerance_deg: float
+        self, decoder: Decoder, encoder: PhotographEncoder, executor: Executor, *, compass_tolerance_deg: float
     ) -> None:
         self._decoder = decoder
         self._encoder = encoder

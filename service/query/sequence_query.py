@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.sequence import Motion
@@ -17,11 +15,10 @@ from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged
 from lalaloc_core.localise.venue.merged_plans import GAP_M
 from lalaloc_core.photograph import Photograph
 from service.query.answers import compose_answer, compose_sequence_answer
-from service.query.executor import Executor
 from service.query.ground import Ground
-from service.query.grounds import Grounds, Site
-from service.query.photograph_reader import PhotographReader
+from service.query.grounds import Site
 from service.query.queries import SequenceQuery
+from service.query.query_parts import QueryParts
 from service.query.single_query import VENUE_CONFIG
 from service.query.spots import Spot
 from service.query.stated_pose import heights_of
@@ -35,20 +32,8 @@ _REACH_STD = 5.0
 class SequenceSearch:
     """Search of the places of several photographs of one visit."""
 
-    def __init__(
-        self,
-        *,
-        bundle: Bundle,
-        encoder: PhotographEncoder,
-        reader: PhotographReader,
-        grounds: Grounds,
-        executor: Executor,
-    ) -> None:
-        self._bundle = bundle
-        self._encoder = encoder
-        self._reader = reader
-        self._grounds = grounds
-        self._executor = executor
+    def __init__(self, parts: QueryParts) -> None:
+        self._parts = parts
 
     async def answer(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
         """Localise photographs jointly.
@@ -58,17 +43,17 @@ class SequenceSearch:
             LaLaLocError: see `Localiser.localise`.
         """
         form, context, count = query.form, query.context, len(query.contents)
-        if form.camera_heights_m is not None and not self._encoder.predicts_profile:
+        if form.camera_heights_m is not None and not self._parts.encoder.predicts_profile:
             raise InvalidPoseError(
                 "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
                 "give camera_height_m"
             )
         # Measured motions must not lead from one plan of a venue to its neighbour.
         gap_m = GAP_M + max(map(_reach_m, form.steps(count)))
-        site = await self._grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
-        photographs = await self._reader.decode(query.contents, form.stated_camera, context)
+        site = await self._parts.grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
+        photographs = await self._parts.reader.decode(query.contents, form.stated_camera, context)
         known = [
-            self._reader.known_heading(form.heading_of(index), site.north, photograph)
+            self._parts.reader.known_heading(form.heading_of(index), site.north, photograph)
             for index, photograph in enumerate(photographs)
         ]
         await site.wait(context)
@@ -84,22 +69,22 @@ class SequenceSearch:
             if one_query:
                 _, joint = await self._search_turn(query, photographs, known, found_turns(found), heights[0], ground)
                 found = judged_turn(found, joint)
-        timings_ms = self._executor.observe(context, found.stage)
+        timings_ms = self._parts.executor.observe(context, found.stage)
 
         def compose() -> SequenceAnswer:
             spots = _spots(photographs, found, one_spot=form.motion == "turn")
             answers = [
-                compose_answer(picture, ground, spot, heading, timings_ms=timings_ms, bundle=self._bundle)
+                compose_answer(picture, ground, spot, heading, timings_ms=timings_ms, bundle=self._parts.bundle)
                 for heading, picture, spot in zip(known, found.pictures, spots, strict=True)
             ]
             share = min(ground.share(picture) for picture in found.pictures)
-            answer = compose_sequence_answer(answers, found, form.steps(count), self._bundle.manifest, share)
+            answer = compose_sequence_answer(answers, found, form.steps(count), self._parts.bundle.manifest, share)
             extras: dict[str, object] = {"warnings": [*answer.warnings, *ground.warnings]}
             if isinstance(where, VenueRecord):
                 extras["venue_id"] = where.id
             return answer.model_copy(update=extras)
 
-        return await self._executor.compute(context, compose)
+        return await self._parts.executor.compute(context, compose)
 
     async def _search_sequence(
         self,
@@ -111,19 +96,21 @@ class SequenceSearch:
     ) -> tuple[Ground, SequenceLocalisation]:
         """Search the places of photographs that are linked by motions; return the ground, too."""
         form, context = query.form, query.context
-        encoded = await self._reader.encode([Spot(photograph) for photograph in photographs], known, heights, context)
+        encoded = await self._parts.reader.encode(
+            [Spot(photograph) for photograph in photographs], known, heights, context
+        )
         ground = await site.ground(encoded, context)
         steps = localise_sequence_steps(
             ground.plan,
             ground.grid,
-            self._encoder,
+            self._parts.encoder,
             encoded,
             form.steps(len(photographs)),
             refine=form.refine,
             top_k=form.top_k,
             clock=context.clock,
         )
-        return ground, await self._executor.run_search(steps, context)
+        return ground, await self._parts.executor.run_search(steps, context)
 
     async def _search_turn(
         self,
@@ -145,12 +132,12 @@ class SequenceSearch:
             for heading, turn in zip(known, turns, strict=True)
             if heading.heading is not None
         )
-        encoded = await self._reader.encode([spot], [next(stated, known[0])], [height], context)
+        encoded = await self._parts.reader.encode([spot], [next(stated, known[0])], [height], context)
         ground = site_or_ground if isinstance(site_or_ground, Ground) else await site_or_ground.ground(encoded, context)
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._encoder,
+            self._parts.encoder,
             encoded[0],
             refine=form.refine,
             top_k=form.top_k,
@@ -158,7 +145,7 @@ class SequenceSearch:
             config=replace(LocaliseConfig() if ground.merged is None else VENUE_CONFIG, vdr_candidates=0),
             clock=context.clock,
         )
-        return ground, await self._executor.run_search(steps, context)
+        return ground, await self._parts.executor.run_search(steps, context)
 
 
 def _reach_m(motion: Motion) -> float:

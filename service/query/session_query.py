@@ -11,11 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import KnownHeading
 from lalaloc_core.localise.tracking import TrackState
@@ -25,12 +23,11 @@ from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
-from service.query.executor import Executor
 from service.query.geopose import geopose_at
 from service.query.ground import Ground, PlacedCandidate
-from service.query.grounds import Grounds, VenueSite
-from service.query.photograph_reader import PhotographReader
+from service.query.grounds import VenueSite
 from service.query.queries import TrackOutcome, TrackQuery
+from service.query.query_parts import QueryParts
 from service.query.spots import Spot, read_view
 from service.schemas import (
     ModelAnswer,
@@ -60,20 +57,8 @@ _STAGES = {"retrieve": ("predict", "retrieve"), "lpo": ("lpo", "rank")}
 class SessionSearch:
     """Search of the places of a session's camera; links of pose grids stay in memory."""
 
-    def __init__(
-        self,
-        *,
-        bundle: Bundle,
-        encoder: PhotographEncoder,
-        reader: PhotographReader,
-        grounds: Grounds,
-        executor: Executor,
-    ) -> None:
-        self._bundle = bundle
-        self._encoder = encoder
-        self._reader = reader
-        self._grounds = grounds
-        self._executor = executor
+    def __init__(self, parts: QueryParts) -> None:
+        self._parts = parts
         self._graphs = BoundedCache[str, WalkGraph](_GRAPH_BYTES, lambda graph: graph.nbytes)
 
     async def answer(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
@@ -84,23 +69,23 @@ class SessionSearch:
             LaLaLocError: see `Localiser.localise`.
         """
         form, document, context = query.form, query.document, query.context
-        (photograph,) = await self._reader.decode([query.content], form.stated_camera, context)
+        (photograph,) = await self._parts.reader.decode([query.content], form.stated_camera, context)
         try:
             state = None if query.state is None else TrackState.from_bytes(query.state)
             # Hints are the prior of the first photograph.
             hinted = document if state is None else None
-            site = await self._grounds.site(where, document, hinted, max_poses=MAX_POSES)
-            known = self._reader.known_heading(form, site.north, photograph)
+            site = await self._parts.grounds.site(where, document, hinted, max_poses=MAX_POSES)
+            known = self._parts.reader.known_heading(form, site.north, photograph)
             await site.wait(context)
-            (encoded,) = await self._reader.encode([Spot(photograph)], [_UNKNOWN], [site.height], context)
+            (encoded,) = await self._parts.reader.encode([Spot(photograph)], [_UNKNOWN], [site.height], context)
             favour = None
             if isinstance(site, VenueSite):
                 favour = _favour_of(site, {} if state is None else state.by_plan, query.session_id)
             ground = await site.ground([encoded], context, favour)
             levels = [row.level for row in site.ready] if isinstance(site, VenueSite) else []
             steps = track_steps(
-                await self._executor.compute(context, partial(self._track_ground, ground, levels)),
-                self._encoder,
+                await self._parts.executor.compute(context, partial(self._track_ground, ground, levels)),
+                self._parts.encoder,
                 state or TrackState.first(len(encoded.roll)),
                 encoded,
                 form.odometry,
@@ -109,10 +94,10 @@ class SessionSearch:
                 top_k=document.top_k,
                 clock=context.clock,
             )
-            tracked = await self._executor.run_search(steps, context)
+            tracked = await self._parts.executor.run_search(steps, context)
         except InvalidStateError as error:
             raise SessionOutdatedError(query.session_id, str(error)) from error
-        timings_ms = self._executor.observe(context, tracked.stage)
+        timings_ms = self._parts.executor.observe(context, tracked.stage)
         return TrackOutcome(tracked.state.to_bytes(), self._stored(ground, tracked, Spot(photograph), form, timings_ms))
 
     def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackedPlans:
@@ -169,7 +154,7 @@ class SessionSearch:
             geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
             view=read_view(spot),
             timings_ms=TimingsAnswer(**totals),
-            model=ModelAnswer.of(self._bundle),
+            model=ModelAnswer.of(self._parts.bundle),
         )
         point = PathPoint(**{name: getattr(answer, name) for name in PathPoint.model_fields})
         return StoredPose(mode=pose.mode, pose=answer, path=[point])

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.photograph import Photograph
-from service.decoding.decoder import Decoder
 from service.query.answers import compose_answer, posterior_answer
-from service.query.executor import Executor, finish_with
+from service.query.executor import finish_with
 from service.query.ground import Ground
-from service.query.grounds import Grounds
-from service.query.photograph_reader import PhotographReader
 from service.query.queries import PhotographQuery, PictureRequest, Where
+from service.query.query_parts import QueryParts
 from service.query.spots import Spot
 from service.schemas import LocaliseAnswer
 from service.storage.records import PlanRecord
@@ -39,22 +35,8 @@ class _Outcome:
 class SingleSearch:
     """Search of the place of one photograph."""
 
-    def __init__(
-        self,
-        *,
-        bundle: Bundle,
-        encoder: PhotographEncoder,
-        decoder: Decoder,
-        reader: PhotographReader,
-        grounds: Grounds,
-        executor: Executor,
-    ) -> None:
-        self._bundle = bundle
-        self._encoder = encoder
-        self._decoder = decoder
-        self._reader = reader
-        self._grounds = grounds
-        self._executor = executor
+    def __init__(self, parts: QueryParts) -> None:
+        self._parts = parts
 
     async def answer(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
         """Localise a photograph; see `Localiser.localise` for the errors."""
@@ -67,23 +49,23 @@ class SingleSearch:
         outcome = await self._search(record, query)
         with query.context.clock.stage("draw"):
             picture = await self._draw(outcome, query, request)
-        self._executor.observe_stage(query.context, "draw")
+        self._parts.executor.observe_stage(query.context, "draw")
         return outcome.answer, picture
 
     async def _search(self, where: Where, query: PhotographQuery) -> _Outcome:
         form, context = query.form, query.context
-        site = await self._grounds.site(where, form, form)
+        site = await self._parts.grounds.site(where, form, form)
         # Decode first, so that an unreadable picture is refused without waiting for plans.
-        (photograph,) = await self._reader.decode([query.content], form.stated_camera, context)
-        known = self._reader.known_heading(form, site.north, photograph)
+        (photograph,) = await self._parts.reader.decode([query.content], form.stated_camera, context)
+        known = self._parts.reader.known_heading(form, site.north, photograph)
         await site.wait(context)
         spot = Spot(photograph)
-        (encoded,) = await self._reader.encode([spot], [known], [site.height], context)
+        (encoded,) = await self._parts.reader.encode([spot], [known], [site.height], context)
         ground = await site.ground([encoded], context)
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._encoder,
+            self._parts.encoder,
             encoded,
             refine=form.refine,
             top_k=form.top_k,
@@ -98,22 +80,22 @@ class SingleSearch:
                 ground,
                 spot,
                 known,
-                timings_ms=self._executor.observe(context, found.stage),
-                bundle=self._bundle,
+                timings_ms=self._parts.executor.observe(context, found.stage),
+                bundle=self._parts.bundle,
                 warnings=[*ground.hint_warnings(found), *ground.warnings],
             )
             return _Outcome(
                 answer.model_copy(update=self._extras(where, query, ground, found)), photograph, found, ground
             )
 
-        return await self._executor.run_search(finish_with(steps, compose), context)
+        return await self._parts.executor.run_search(finish_with(steps, compose), context)
 
     def _extras(self, where: Where, query: PhotographQuery, ground: Ground, found: Localisation) -> dict[str, object]:
         """Return fields of the answer that not every answer has."""
         if isinstance(where, PlanRecord):
             wanted = query.form.include == "posterior"
             return {"posterior": posterior_answer(ground, found.posterior)} if wanted else {}
-        model = self._bundle.manifest.confidence_for(view=found.query.is_view)
+        model = self._parts.bundle.manifest.confidence_for(view=found.query.is_view)
         confidence = found.confidence(model, ground.share(found))
         plans = ground.plan_probabilities(found, None if confidence is None else confidence.fit)
         return {"venue_id": where.id, "plans": plans[: query.form.top_k]}
@@ -123,7 +105,7 @@ class SingleSearch:
         if request.picture != "plan":
             assert not isinstance(query.content, Photograph)
             # Decode again, because the encoder's input is too small for a picture.
-            picture = await self._decoder.picture(
+            picture = await self._parts.decoder.picture(
                 query.content,
                 query.form.stated_camera,
                 context.deadline,
@@ -133,12 +115,12 @@ class SingleSearch:
             )
 
         def draw() -> str:
-            model = self._bundle.manifest.confidence_for(view=outcome.found.query.is_view)
+            model = self._parts.bundle.manifest.confidence_for(view=outcome.found.query.is_view)
             source = _SOURCES[outcome.answer.heading_source]
             drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, photograph=outcome.photograph)
             return draw_answer(drawn, picture, request.picture, rooms=request.rooms)
 
-        svg = await self._executor.compute(context, draw)
+        svg = await self._parts.executor.compute(context, draw)
         if request.as_png:
-            return await self._decoder.rasterise(svg, context.deadline, context.client)
+            return await self._parts.decoder.rasterise(svg, context.deadline, context.client)
         return svg.encode()

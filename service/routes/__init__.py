@@ -41,5 +41,3 @@ ROUTERS = tuple(
         pages,
     )
 )
-
-__all__ = ["ROUTERS"]

@@ -46,28 +46,3 @@ from service.schemas.sessions import (
     StoredPose,
     TrackedPoseAnswer,
 )
-
-__all__ = [
-    "CandidateAnswer",
-    "EarthPoint",
-    "GeoPose",
-    "GeoPoseAngles",
-    "GeoPosePosition",
-    "LocaliseAnswer",
-    "LocaliseForm",
-    "ModelAnswer",
-    "PathPoint",
-    "PhotographForm",
-    "PlanProbability",
-    "Position",
-    "PosteriorAnswer",
-    "RivalAnswer",
-    "SequenceAnswer",
-    "SequenceForm",
-    "SequencePoseAnswer",
-    "SessionDocument",
-    "StatedHeading",
-    "StoredPose",
-    "TimingsAnswer",
-    "TrackedPoseAnswer",
-]

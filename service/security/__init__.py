@@ -16,5 +16,3 @@ from service.security.access_control import AccessControl
 from service.security.audit import AuditTrail
 from service.security.exposure import check_address
 from service.security.permissions import Permission, caller_of
-
-__all__ = ["AccessControl", "AuditTrail", "Permission", "caller_of", "check_address"]

@@ -4,5 +4,3 @@ Begin with `settings.py`; `setting_groups.py` defines them in groups, of the typ
 """
 
 from service.settings.settings import PREFIX, SETTING_NAMES, Settings, settings_table, work_factor
-
-__all__ = ["PREFIX", "SETTING_NAMES", "Settings", "settings_table", "work_factor"]

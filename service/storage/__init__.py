@@ -21,5 +21,3 @@ is one statement. `migrations` creates the tables; `tables.py` describes their c
 
 from service.storage.plan_lookup import PlanLookup
 from service.storage.store import Store, open_store
-
-__all__ = ["PlanLookup", "Store", "open_store"]

@@ -7,5 +7,3 @@ Begin with `metrics.py`. `log_fields.py` holds the fields of a request's log lin
 from service.telemetry.log_fields import RequestLogFields, add_log_fields, request_id_of
 from service.telemetry.logs import LOGGER_NAME, configure_logging
 from service.telemetry.metrics import Telemetry
-
-__all__ = ["LOGGER_NAME", "RequestLogFields", "Telemetry", "add_log_fields", "configure_logging", "request_id_of"]

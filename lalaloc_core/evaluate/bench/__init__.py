@@ -4,5 +4,3 @@ Begin with `benchmarks.py`, which runs the groups of benchmarks.
 """
 
 from lalaloc_core.evaluate.bench.benchmarks import run_bench
-
-__all__ = ["run_bench"]

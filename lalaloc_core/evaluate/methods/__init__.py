@@ -5,5 +5,3 @@ Begin with `method.py`, the question and the answer. `lalaloc.py` is this projec
 """
 
 from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question
-
-__all__ = ["Answer", "Method", "Pose", "Question"]

@@ -6,5 +6,3 @@ rooms; `pictures.py` draws plans and panoramas for all of them, `charts.py` draw
 
 from lalaloc_core.evaluate.report.html import write_report
 from lalaloc_core.evaluate.report.worst import write_worst
-
-__all__ = ["write_report", "write_worst"]

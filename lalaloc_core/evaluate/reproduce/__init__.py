@@ -5,5 +5,3 @@ scores a table, `ablations.py` has the trained variants, `result.py` writes tabl
 """
 
 from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
-
-__all__ = ["TABLES"]

@@ -7,5 +7,3 @@ Only modules that load no network are re-exported.
 
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import score_run
-
-__all__ = ["Prediction", "RunFolder", "RunInfo", "score_run"]

@@ -7,5 +7,3 @@ of real rooms). `assembly.py` builds validated plans for the readers. Generated 
 
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset
-
-__all__ = ["Appearance", "Camera", "Dataset", "DatasetPhotograph", "Scene", "Split", "load_scenes", "open_dataset"]

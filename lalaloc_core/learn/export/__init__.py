@@ -6,5 +6,3 @@ compares them with torch.
 
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
 from lalaloc_core.learn.export.run_export import export_run
-
-__all__ = ["PARITY_TOLERANCE", "export_bundle", "export_run"]

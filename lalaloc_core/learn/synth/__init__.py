@@ -7,5 +7,3 @@ Only names that need no torch are re-exported, because data sets use plans witho
 """
 
 from lalaloc_core.learn.synth.homes import Home, Opening, generate_home
-
-__all__ = ["Home", "Opening", "generate_home"]

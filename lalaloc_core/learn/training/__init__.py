@@ -11,5 +11,3 @@ from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.training_data import TrainingData
-
-__all__ = ["PRESETS", "Checkpoint", "TrainConfig", "TrainingData", "train_stage"]

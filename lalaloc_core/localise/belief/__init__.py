@@ -22,33 +22,3 @@ from lalaloc_core.localise.belief.posterior import (
     weighted_places,
 )
 from lalaloc_core.localise.belief.ranking import HEADING_SEPARATION, distinct, photograph_heading, ranked, suppress
-
-__all__ = [
-    "CONFIDENT",
-    "HEADING_SEPARATION",
-    "HEADING_WITHIN",
-    "NEGLIGIBLE",
-    "RIGHT_WITHIN_M",
-    "Confidence",
-    "GridCosts",
-    "PoseUncertainty",
-    "Posterior",
-    "ProbabilityMap",
-    "Signals",
-    "Support",
-    "WeightedPlaces",
-    "advice_for",
-    "area_shares",
-    "confidence_of",
-    "distinct",
-    "information_bits",
-    "marginal_information",
-    "photograph_heading",
-    "pose_uncertainty",
-    "probability_map",
-    "ranked",
-    "signals_of",
-    "suppress",
-    "union_of_arcs",
-    "weighted_places",
-]

@@ -11,20 +11,3 @@ from lalaloc_core.localise.match.cohort import Cohort, cohort_of, cost_by_chance
 from lalaloc_core.localise.match.layouts import Layouts, layouts_at
 from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.match.pose_grid import PoseGrid, grid_candidate
-
-__all__ = [
-    "BinnedLayouts",
-    "Cohort",
-    "Layouts",
-    "LowestCosts",
-    "MatchingConfig",
-    "MatchingCost",
-    "PoseGrid",
-    "coarse_costs",
-    "cohort_of",
-    "cost_by_chance",
-    "grid_candidate",
-    "layouts_at",
-    "likeliest",
-    "log_cost_to_chance",
-]

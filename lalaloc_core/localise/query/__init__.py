@@ -31,28 +31,3 @@ from lalaloc_core.localise.query.stated_pose import (
     known_heading,
     stated_height,
 )
-
-__all__ = [
-    "DEFAULT_STD_M",
-    "NO_HINTS",
-    "RADIUS_RANGE_M",
-    "UNKNOWN_RANGE_M",
-    "CameraHeight",
-    "Candidate",
-    "HintName",
-    "Hints",
-    "KnownHeading",
-    "Near",
-    "NearInEach",
-    "PredictedCeiling",
-    "PredictedOpenings",
-    "PredictedProfile",
-    "PredictedRoomType",
-    "Query",
-    "RivalWall",
-    "known_heading",
-    "log_factor",
-    "rolled",
-    "rooms_named",
-    "stated_height",
-]

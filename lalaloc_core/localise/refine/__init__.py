@@ -9,5 +9,3 @@ package, so it exports plain values and the refiner on numpy alone.
 from lalaloc_core.localise.refine.descent_methods import refine_walls, refined_by_walls
 from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement_problem import LpoConfig, Problem
-
-__all__ = ["LpoConfig", "Problem", "RefinementJob", "RefinementResult", "refine_walls", "refined_by_walls"]

@@ -11,5 +11,3 @@ photographs from one spot.
 
 from lalaloc_core.localise.sequence.joint_refinement import SequenceJob, SequenceResult
 from lalaloc_core.localise.sequence.measured_motion import Motion
-
-__all__ = ["Motion", "SequenceJob", "SequenceResult"]

@@ -8,5 +8,3 @@ and refined by LPO at its modes (`belief_modes.py`). `track_state.py` has the st
 
 from lalaloc_core.localise.tracking.track_state import TrackState
 from lalaloc_core.localise.tracking.walk_motion import Odometry
-
-__all__ = ["Odometry", "TrackState"]

@@ -19,13 +19,3 @@ from service.http.middleware.framing import FramingMiddleware
 from service.http.middleware.head import HeadMiddleware
 from service.http.middleware.security_headers import SecurityHeadersMiddleware
 from service.http.middleware.telemetry import TelemetryMiddleware
-
-__all__ = [
-    "AdmissionMiddleware",
-    "AuthorisationMiddleware",
-    "CorsMiddleware",
-    "FramingMiddleware",
-    "HeadMiddleware",
-    "SecurityHeadersMiddleware",
-    "TelemetryMiddleware",
-]

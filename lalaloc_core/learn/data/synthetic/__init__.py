@@ -9,5 +9,3 @@ implements `lalaloc synth`.
 from lalaloc_core.learn.data.synthetic.altered_photographs import MismatchedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, training_plans
 from lalaloc_core.learn.data.synthetic.writing import Synthesis, synthesise
-
-__all__ = ["GeneratedScenes", "MismatchedScenes", "Synthesis", "synthesise", "training_plans"]

@@ -4,5 +4,3 @@ Begin with `develop.py`, which turns radiance into bytes; `exposure.py` defines 
 """
 
 from lalaloc_core.learn.synth.camera.exposure import Exposure
-
-__all__ = ["Exposure"]

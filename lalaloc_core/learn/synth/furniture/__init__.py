@@ -6,5 +6,3 @@ Needs no torch.
 """
 
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, furnish
-
-__all__ = ["FURNITURE_LEVELS", "FurnitureLevel", "furnish"]

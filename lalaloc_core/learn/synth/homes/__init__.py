@@ -6,5 +6,3 @@ Homes are numbered by split. Needs no torch.
 
 from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind
 from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
-
-__all__ = ["Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]

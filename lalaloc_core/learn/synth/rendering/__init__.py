@@ -5,5 +5,3 @@ Begin with `panorama.py`, the panorama renderer. `cast.py` and `prisms.py` cast 
 """
 
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
-
-__all__ = ["PanoramaRenderer"]

@@ -7,5 +7,3 @@ properties that make a shot hard.
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
-
-__all__ = ["MaterialLibrary", "RenderScene", "Shot", "sample_shots"]
