@@ -22,7 +22,7 @@ from fastapi import FastAPI
 from PIL import Image
 
 from service.app import create_app
-from service.http.server import BoundedSocket
+from service.http.socket_protocol import BoundedSocket
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from service.storage.statements import CHUNK_BYTES

@@ -16,8 +16,9 @@ import httpx
 import pytest
 from fastapi import FastAPI, Request
 
-from service.http import server
-from service.http.server import Server, bounded_protocol, server_config
+from service.http import http_protocol
+from service.http.http_protocol import bounded_protocol
+from service.http.server import Server, server_config
 from service.settings import Settings
 from tests.service.conftest import wait_for
 
@@ -49,7 +50,7 @@ def test_answer_body_is_not_delayed() -> None:
 
 
 @contextmanager
-def _served(app: FastAPI, settings: Settings) -> Iterator[int]:
+def served(app: FastAPI, settings: Settings) -> Iterator[int]:
     """Run an app as the command line does; gives its port."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         running = Server(server_config(app, settings), app, settings)
@@ -77,7 +78,7 @@ def test_idle_connections_make_room() -> None:
     settings = Settings(max_connections=1, max_reads=4, max_streams=4, max_pending_requests=11)
     # One more than all slots.
     most = 4 + 4 + 11 + 1
-    with _served(_app(), settings) as port, ExitStack() as stack:
+    with served(_app(), settings) as port, ExitStack() as stack:
         address = ("127.0.0.1", port)
         idle = [stack.enter_context(socket.create_connection(address, timeout=10.0)) for _ in range(3 * most)]
         for _ in range(3):
@@ -98,7 +99,7 @@ def test_busy_connection_is_not_closed() -> None:
         return "done"
 
     settings = Settings(max_connections=1, max_reads=1, max_streams=1, max_pending_requests=1)
-    with _served(app, settings) as port, ExitStack() as stack, ThreadPoolExecutor(1) as threads:
+    with served(app, settings) as port, ExitStack() as stack, ThreadPoolExecutor(1) as threads:
         answer = threads.submit(httpx.get, f"http://127.0.0.1:{port}/slow", timeout=30.0)
         time.sleep(0.3)
         for _ in range(20):
@@ -110,9 +111,9 @@ def test_busy_connection_is_not_closed() -> None:
 
 @pytest.mark.slow
 def test_refused_bodies_are_read_slowly_to_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "_DROPPING_S", 5e-8)
+    monkeypatch.setattr(http_protocol, "_DROPPING_S", 5e-8)
     body, clients = b"x" * (20 * 2**20), 3
-    with _served(_app(), Settings()) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
+    with served(_app(), Settings()) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
         begin = time.monotonic()
         with ThreadPoolExecutor(clients) as threads:
             answers = list(threads.map(lambda _: client.post("/who", content=body), range(clients)))
@@ -128,7 +129,7 @@ def test_only_named_proxies_are_trusted(monkeypatch: pytest.MonkeyPatch, proxies
     monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
     if proxies is not None:
         monkeypatch.setenv("FORWARDED_ALLOW_IPS", proxies)
-    with _served(_app(), Settings()) as port:
+    with served(_app(), Settings()) as port:
         answer = httpx.get(f"http://127.0.0.1:{port}/who", headers={"x-forwarded-for": "203.0.113.7"})
     assert answer.json() == client_host
 

@@ -1,0 +1,216 @@
+"""HTTP/1.1 protocol that bounds connections, heads of requests, events, and bodies of refused requests."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import h11
+from uvicorn.protocols.http.flow_control import FlowControl
+from uvicorn.protocols.http.h11_impl import STATUS_PHRASES, H11Protocol
+
+from service.http.paced_parsing import Pace, PacedParser
+
+# Heads of requests, and their lines; larger ones get a 431.
+MAX_HEAD_BYTES, _MAX_HEADERS = 16 * 1024, 100
+_TOO_LARGE = 431
+# Bodies in more chunks than this must have this many bytes per chunk on average.
+_MANY_CHUNKS, _MIN_CHUNK_BYTES = 1024, 64
+# Time (s) per byte at which bodies of refused requests arrive, of all connections together. They are dropped, so that
+# clients read the refusal; at the speed of a local network they would occupy the event loop.
+_DROPPING_S = 5e-9
+
+
+class _RefusedError(h11.RemoteProtocolError):
+    """Request that this service refuses, although it is valid HTTP."""
+
+
+class _CountedConnection(h11.Connection):
+    """Parser that handles a bounded number of events in a turn, and checks each of them."""
+
+    def __init__(self, parser: Callable[[], PacedParser]) -> None:
+        super().__init__(h11.SERVER, MAX_HEAD_BYTES)
+        self._parser = parser
+        self._chunks = self._body_bytes = 0
+        # Status and text of the answer to what was refused.
+        self.refusal: tuple[int, str] | None = None
+
+    def next_event(self) -> Any:
+        """Return the next event; none if those of this turn are used up."""
+        parser = self._parser()
+        if parser.events_left <= 0:
+            return h11.NEED_DATA
+        try:
+            event = super().next_event()
+            if event is not h11.NEED_DATA and event is not h11.PAUSED:
+                parser.events_left -= 1
+            if isinstance(event, h11.Request):
+                self._check_head(event)
+            elif isinstance(event, h11.Data):
+                self._check_chunks(event)
+        except _RefusedError as error:
+            self.refusal = (error.error_status_hint, str(error))
+            raise
+        except h11.RemoteProtocolError as error:
+            if error.error_status_hint == _TOO_LARGE:
+                self.refusal = (_TOO_LARGE, f"the limit of a request's head is {MAX_HEAD_BYTES} bytes")
+            raise
+        return event
+
+    def _check_head(self, request: h11.Request) -> None:
+        size = (
+            len(request.method)
+            + len(request.target)
+            + sum(len(name) + len(value) + 4 for name, value in request.headers)
+        )
+        if size > MAX_HEAD_BYTES:
+            raise _RefusedError(f"the head has {size} bytes; the limit is {MAX_HEAD_BYTES}", _TOO_LARGE)
+        if len(request.headers) > _MAX_HEADERS:
+            raise _RefusedError(f"the head has {len(request.headers)} lines; the limit is {_MAX_HEADERS}", _TOO_LARGE)
+        if request.http_version not in (b"1.0", b"1.1"):
+            raise _RefusedError("send HTTP/1.1 or HTTP/1.0", 505)
+        self._chunks = self._body_bytes = 0
+
+    def _check_chunks(self, data: h11.Data) -> None:
+        self._chunks += data.chunk_start
+        self._body_bytes += len(data.data)
+        if self._chunks > _MANY_CHUNKS and self._body_bytes < _MIN_CHUNK_BYTES * self._chunks:
+            raise _RefusedError(
+                f"the body has {self._chunks} chunks of {self._body_bytes / self._chunks:.0f} bytes on average; "
+                f"the minimum is {_MIN_CHUNK_BYTES}"
+            )
+
+
+class _Flow(FlowControl):
+    """Flow control that reads nothing while bytes wait to be parsed."""
+
+    def __init__(self, transport: asyncio.Transport, parser: PacedParser) -> None:
+        super().__init__(transport)
+        self._parser = parser
+
+    def resume_reading(self) -> None:
+        """Read again, now or when the waiting bytes are parsed."""
+        if self._parser.held:
+            self.read_paused = False
+        else:
+            super().resume_reading()
+
+
+def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[asyncio.Protocol]:
+    """Return an HTTP/1.1 protocol that bounds connections, heads, events and bodies of refused requests."""
+    dropping = Pace(_DROPPING_S)
+
+    class BoundedProtocol(H11Protocol):
+        """Protocol that ends connections without a request in progress after a while, and reads refused bodies slowly.
+
+        The server's own keep-alive timer stops at the first byte of a head; this one does not.
+        """
+
+        _limit: asyncio.TimerHandle | None = None
+        _pause: asyncio.TimerHandle | None = None
+        _idle_since = 0.0
+        _is_socket = False
+        _parser: PacedParser
+        conn: _CountedConnection
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+            super().connection_made(transport)
+            self.conn = _CountedConnection(lambda: self._parser)
+            self._parser = PacedParser(transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused)
+            self.flow = _Flow(transport, self._parser)
+            _send_at_once(transport)
+            self._idle_since = monotonic()
+            self._make_room()
+            self._watch()
+
+        def data_received(self, data: bytes) -> None:
+            self._unset_keepalive_if_required()
+            self._parser.feed(data)
+            if self.conn.our_state is h11.DONE and self.conn.their_state is h11.SEND_BODY:
+                self.transport.pause_reading()
+                self._pause = self.loop.call_later(dropping.wait_s(len(data)), self._parser.resume)
+            self._watch()
+
+        def send_400_response(self, msg: str) -> None:
+            """Refuse what the client sent, and close the connection."""
+            if self.cycle is not None and not self.cycle.response_complete:
+                # The application reads the body, and its answer would follow this one.
+                self.cycle.disconnected = True
+                self.cycle.message_event.set()
+            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+                status, text = self.conn.refusal or (400, msg)
+                headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"connection", b"close")]
+                for event in (
+                    h11.Response(status_code=status, headers=headers, reason=STATUS_PHRASES[status]),
+                    h11.Data(data=text.encode()),
+                    h11.EndOfMessage(),
+                ):
+                    self.transport.write(self.conn.send(event) or b"")
+            self.transport.close()
+
+        def handle_websocket_upgrade(self, event: h11.Request) -> None:
+            super().handle_websocket_upgrade(event)
+            self._parser.close()
+            self._is_socket = True
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            self._idle_since = monotonic()
+            # Requests that were sent with the last one are handled outside the feeder.
+            self._parser.settle()
+            self._watch()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            self._unwatch()
+            self._parser.close()
+            if self._pause is not None:
+                self._pause.cancel()
+
+        def _parse(self, piece: bytes) -> None:
+            if piece:
+                self.conn.receive_data(piece)
+            self.handle_events()
+
+        def _make_room(self) -> None:
+            """Close the connection that is idle the longest if there are too many."""
+            if len(self.connections) <= max_connections:
+                return
+            idle = [peer for peer in self.connections if isinstance(peer, BoundedProtocol) and not peer._in_work]
+            oldest = min(idle, key=lambda peer: peer._idle_since, default=self)
+            if oldest is not self:
+                # Removed now, because its end is only noted in the loop's next round.
+                self.connections.discard(oldest)
+                oldest.transport.abort()
+
+        @property
+        def _in_work(self) -> bool:
+            cycle: Any = self.cycle
+            return cycle is not None and not cycle.response_complete
+
+        def _watch(self) -> None:
+            if self._in_work or self._is_socket:
+                self._unwatch()
+            elif self._limit is None:
+                delay_s = self.timeout_keep_alive + head_deadline_s
+                self._limit = self.loop.call_later(delay_s, self.transport.abort)
+
+        def _unwatch(self) -> None:
+            if self._limit is not None:
+                self._limit.cancel()
+                self._limit = None
+
+    return BoundedProtocol
+
+
+def _send_at_once(transport: asyncio.Transport) -> None:
+    """Disable Nagle's algorithm, which delays bodies by up to 40 ms.
+
+    asyncio disables it only for listening sockets that it created itself.
+    """
+    connection = transport.get_extra_info("socket")
+    if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,0 +1,248 @@
+"""Connections that send many events in few bytes: chunks, frames, pings, header lines, pipelined requests."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import httpx
+import pytest
+from fastapi import FastAPI, Request, WebSocket, WebSocketDisconnect
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.sync.client import connect
+
+from service.http import paced_parsing
+from service.http.http_protocol import MAX_HEAD_BYTES
+from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
+from service.settings import Settings
+from tests.service.conftest import wait_for
+from tests.service.test_server import served
+
+HOST = b"Host: localhost\r\n"
+
+
+def _app(received: list[object]) -> FastAPI:
+    app = FastAPI()
+
+    @app.get("/who")
+    def who() -> str:
+        return "me"
+
+    @app.post("/body")
+    async def body(request: Request) -> int:
+        return len(await request.body())
+
+    @app.post("/refused", status_code=401)
+    async def refused() -> str:
+        return "no"
+
+    @app.websocket("/messages")
+    async def messages(socket: WebSocket) -> None:
+        await socket.accept()
+        try:
+            while True:
+                received.append(await socket.receive_bytes())
+        except WebSocketDisconnect:
+            received.append("closed")
+
+    return app
+
+
+@pytest.fixture
+def received() -> list[object]:
+    return []
+
+
+@pytest.fixture
+def port(received: list[object]) -> Iterator[int]:
+    with served(_app(received), Settings()) as port:
+        yield port
+
+
+@contextmanager
+def _connected(port: int) -> Iterator[socket.socket]:
+    with socket.create_connection(("127.0.0.1", port), timeout=30.0) as connection:
+        yield connection
+
+
+def _read_all(connection: socket.socket) -> bytes:
+    content = b""
+    try:
+        while part := connection.recv(65536):
+            content += part
+    except ConnectionResetError:
+        pass
+    return content
+
+
+def _chunked(path: str, chunk: bytes, count: int) -> bytes:
+    head = f"POST {path} HTTP/1.1\r\n".encode() + HOST + b"Transfer-Encoding: chunked\r\n\r\n"
+    return head + count * (f"{len(chunk):x}\r\n".encode() + chunk + b"\r\n")
+
+
+class _Transport(asyncio.Transport):
+    def __init__(self) -> None:
+        super().__init__()
+        self.reading = True
+
+    def pause_reading(self) -> None:
+        self.reading = False
+
+    def resume_reading(self) -> None:
+        self.reading = True
+
+    def is_closing(self) -> bool:
+        return False
+
+
+def test_turn_of_the_loop_handles_a_bounded_number_of_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paced_parsing, "EVENTS", paced_parsing.Pace(0.0))
+
+    async def parse_all() -> list[bytes]:
+        turns: list[bytes] = [b""]
+
+        def parse(piece: bytes) -> None:
+            turns[-1] += piece
+            parser.events_left -= len(piece)
+
+        transport = _Transport()
+        parser = PacedParser(transport, parse, 1, lambda: True)
+        parser.feed(bytes(1000))
+        assert not transport.reading
+        while parser.held:
+            turns.append(b"")
+            await asyncio.sleep(0)
+        assert transport.reading
+        return turns
+
+    turns = asyncio.run(parse_all())
+    assert sum(map(len, turns)) == 1000
+    assert max(map(len, turns)) == EVENTS_PER_TURN
+
+
+@pytest.mark.parametrize("path", ["/body", "/refused"])
+def test_body_in_tiny_chunks_is_refused(port: int, path: str) -> None:
+    with _connected(port) as flood:
+        sending = threading.Thread(target=_send_quietly, args=(flood, _chunked(path, b"x", 200_000)))
+        sending.start()
+        answer = _read_all(flood)
+        sending.join()
+    if path == "/body":
+        assert answer.startswith(b"HTTP/1.1 400 ")
+        assert b"the body has 1025 chunks of 1 bytes on average; the minimum is 64" in answer
+    else:
+        # The refusal was sent; then the connection is closed.
+        assert answer.startswith(b"HTTP/1.1 401 ")
+
+
+def _send_quietly(connection: socket.socket, content: bytes) -> None:
+    # The server may close the connection.
+    with suppress(OSError):
+        connection.sendall(content)
+
+
+def test_body_in_many_chunks_arrives_as_a_whole(port: int) -> None:
+    with _connected(port) as connection:
+        connection.sendall(
+            _chunked("/body", b"y" * 100, 3000) + b"0\r\n\r\nGET /who HTTP/1.1\r\nConnection: close\r\n" + HOST
+        )
+        connection.sendall(b"\r\n")
+        answers = _read_all(connection)
+    assert b"\r\n\r\n300000" in answers
+    assert answers.endswith(b'"me"')
+
+
+def test_pipelined_requests_are_all_answered(port: int) -> None:
+    request = b"GET /who HTTP/1.1\r\n" + HOST
+    with _connected(port) as connection:
+        connection.sendall(199 * (request + b"\r\n") + request + b"Connection: close\r\n\r\n")
+        assert _read_all(connection).count(b"HTTP/1.1 200 OK") == 200
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("size", [20_000, 108_000])
+def test_large_head_is_refused_in_any_number_of_segments(port: int, size: int, parts: int) -> None:
+    head = b"GET /who HTTP/1.1\r\n" + HOST + b"X-Large: " + size * b"x" + b"\r\n\r\n"
+    with _connected(port) as connection:
+        for part in range(parts):
+            connection.sendall(head[part * len(head) // parts : (part + 1) * len(head) // parts])
+        answer = _read_all(connection)
+    assert answer.startswith(b"HTTP/1.1 431 ")
+    assert str(MAX_HEAD_BYTES).encode() in answer
+
+
+def test_head_within_the_limits_passes(port: int) -> None:
+    headers = {"x-large": "x" * (MAX_HEAD_BYTES - 1000)} | {f"x-{number}": "" for number in range(50)}
+    assert httpx.get(f"http://127.0.0.1:{port}/who", headers=headers).status_code == 200
+    headers = {f"x-{number}": "" for number in range(200)}
+    assert httpx.get(f"http://127.0.0.1:{port}/who", headers=headers).status_code == 431
+
+
+def test_other_version_of_http_is_refused(port: int) -> None:
+    with _connected(port) as connection:
+        connection.sendall(b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n")
+        assert _read_all(connection).startswith(b"HTTP/1.1 505 ")
+
+
+def test_tiny_messages_arrive_in_order(port: int, received: list[object]) -> None:
+    with connect(f"ws://127.0.0.1:{port}/messages") as client:
+        for number in range(2000):
+            client.send(bytes([number % 256]))
+    wait_for(lambda: received[-1:] == ["closed"])
+    assert received[:-1] == [bytes([number % 256]) for number in range(2000)]
+
+
+def _handshake(connection: socket.socket) -> None:
+    connection.sendall(
+        b"GET /messages HTTP/1.1\r\n" + HOST + b"Connection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+    assert b"101" in connection.recv(4096)
+
+
+def test_answers_to_pings_that_nobody_reads_are_bounded(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    largest = [0]
+    handle_ping = WebSocketsSansIOProtocol.handle_ping
+
+    def watched(self: WebSocketsSansIOProtocol) -> None:
+        handle_ping(self)
+        largest[0] = max(largest[0], self.transport.get_write_buffer_size())
+
+    monkeypatch.setattr(WebSocketsSansIOProtocol, "handle_ping", watched)
+    monkeypatch.setattr(paced_parsing, "EVENTS", paced_parsing.Pace(0.0))
+    # Pings of 125 bytes, each answered with as many.
+    ping = b"\x89\xfd\0\0\0\0" + 125 * b"p"
+    with _connected(port) as flood:
+        _handshake(flood)
+        flood.settimeout(3.0)
+        with pytest.raises(TimeoutError):
+            # More than all buffers of the sockets hold.
+            flood.sendall(200_000 * ping)
+    assert 0 < largest[0] < 2**18
+    assert httpx.get(f"http://127.0.0.1:{port}/who").status_code == 200
+
+
+def test_all_pings_are_answered(port: int) -> None:
+    with _connected(port) as client:
+        _handshake(client)
+        client.sendall(1000 * b"\x89\x80\0\0\0\0")
+        answers = b""
+        while len(answers) < 2000:
+            answers += client.recv(4096)
+    assert answers == 1000 * b"\x8a\0"
+
+
+def test_text_that_is_not_utf_8_is_the_clients_error(
+    port: int, received: list[object], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR), _connected(port) as client:
+        _handshake(client)
+        client.sendall(b"\x81\x82\0\0\0\0\xff\xfe")
+        # A close frame with code 1007.
+        assert client.recv(4096)[2:4] == (1007).to_bytes(2, "big")
+        wait_for(lambda: received == ["closed"])
+    assert not caplog.records
