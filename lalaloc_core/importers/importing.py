@@ -43,7 +43,7 @@ def import_plans(
     content: bytes,
     options: ImportOptions = DEFAULT_OPTIONS,
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
-    clock: Callable[[], float] = time.monotonic,
+    clock: Callable[[], float] = time.process_time,
     *,
     building: str | None = None,
     trace: Trace | None = None,

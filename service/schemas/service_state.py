@@ -19,7 +19,7 @@ class LimitsAnswer(ResponseModel):
         description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
     )
     max_plan_pixels: int = Field(description="Pixels of a floor plan picture.")
-    max_import_s: float = Field(description="Timeout for reading a plan file.")
+    max_import_s: float = Field(description="CPU time limit for reading a plan file.")
     max_floorplans: int = Field(description="Stored floor plans per tenant.")
     max_rooms: int = Field(description="Rooms per floor plan.")
     max_vertices: int = Field(description="Vertices per room.")

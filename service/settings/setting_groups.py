@@ -390,7 +390,7 @@ class PlanSettings(SettingGroup):
     max_plan_pixels: Count = Field(default=_IMPORT.max_plan_pixels, description="Pixels of a floor plan picture.")
     max_import_s: Seconds = Field(
         default=_IMPORT.max_import_s,
-        description="Timeout for reading a plan file. The process is replaced 10 s later. Including the wait for a "
+        description="CPU time limit for reading a plan file. The process is replaced 10 s later. With the wait for a "
         "process, an upload can take twice this time.",
     )
     max_rooms: Count = Field(default=_PLAN.max_rooms, description="Rooms per floor plan.")
