@@ -55,9 +55,9 @@ def add_commands(commands: Any) -> None:
     photographs.add_argument(
         "--galleries",
         type=int,
-        choices=range(1, GALLERIES + 1),
+        choices=range(GALLERIES + 1),
         default=GALLERIES,
-        help="number of plans to locate every photograph in (default: %(default)s)",
+        help="number of plans to locate every photograph in; 0 measures walls and openings only (default: %(default)s)",
     )
     photographs.add_argument(
         "--view", type=positive, action="append", default=[], metavar="DEG", help="also views of this field; repeatable"

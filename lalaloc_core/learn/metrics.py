@@ -89,6 +89,11 @@ class AzimuthMeasures:
         return float(np.median(self.log_error))
 
     @property
+    def shape_error(self) -> float:
+        """Median of |Δ log d| that remains when the bias is removed: the error of the walls' shape."""
+        return float(np.median(np.abs(self.log_error - self.bias)))
+
+    @property
     def scale_ratio(self) -> float:
         """Median ratio of errors to their predicted scale; 1 for a calibrated prediction."""
         return float(np.median(self._normalised) / np.log(2.0))
@@ -126,6 +131,7 @@ class AzimuthSummary:
     Attributes:
         n: number of photographs.
         median_error: median over the photographs of their median |Δ log d|.
+        shape_error: median over the photographs.
         error_90: median over the photographs of their 90 % quantile of |Δ log d|.
         scale_ratio: median over the photographs.
         within: share of all azimuths within each predicted quantile.
@@ -134,6 +140,7 @@ class AzimuthSummary:
 
     n: int
     median_error: float
+    shape_error: float
     error_90: float
     scale_ratio: float
     within: Mapping[str, float]
@@ -171,6 +178,7 @@ def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[st
     return AzimuthSummary(
         n=len(measures),
         median_error=float(np.median([measure.median_error for measure in measures])),
+        shape_error=float(np.median([measure.shape_error for measure in measures])),
         error_90=float(np.median([measure.error_90 for measure in measures])),
         scale_ratio=float(np.median([measure.scale_ratio for measure in measures])),
         within={f"{quantile:g}": float(share) for quantile, share in zip(QUANTILES, within, strict=True)},

@@ -11,6 +11,7 @@ import pytest
 import shapely
 from PIL import Image, ImageColor
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.errors import DatasetError, InvalidInputError
@@ -25,7 +26,7 @@ from lalaloc_core.evaluate.report.photograph_report import (
 )
 from lalaloc_core.evaluate.report.report_tables import percent
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, foreign_plans, score_galleries
-from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
+from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs, read_views
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.learn.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
@@ -34,6 +35,7 @@ from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.render.layout import render_layout
 from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of
@@ -388,6 +390,57 @@ class TestEvaluating:
             true_m = [wall_profile(np.zeros((1, 2)), np.array([a]), walls, 1)[0, 0] for a in azimuth]
             assert np.allclose(read.measures.log_error, np.log(profile_m) - np.log(true_m), atol=1e-5)
 
+    def test_views_are_compared_at_the_azimuths_they_show(
+        self, root: Path, tiny_view_bundle: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # The grey level of a pixel is its azimuth, by which the encoder of views knows the walls and openings.
+        grey = np.broadcast_to(np.arange(WIDTH, dtype=np.uint8)[None, :, None], (WIDTH // 2, WIDTH, 3))
+        Image.fromarray(grey).save(root / "hall.png")
+        hall = read_annotation(root / "hall.json")
+        encoders = PhotographEncoder(Bundle.open(tiny_view_bundle), threads=1)
+        columns = encoders.manifest.profile_columns
+
+        def outputs(_: object, images: list[np.ndarray], camera_height_m: float) -> dict[str, np.ndarray]:
+            (image,) = images
+            view = present(encoders.manifest.view)
+            azimuths = np.linspace(0, image.shape[1] - 1, view.sectors * columns // encoders.manifest.ring_sectors)
+            shown = image[image.shape[0] // 3].astype(int)[azimuths.round().astype(int)]
+            log_m = np.log(0.9 * hall.profile_m(0, WIDTH))[shown[:, 0]]
+            modes = np.stack([log_m, log_m], axis=1)[None]
+            return {
+                "log_profile": modes,
+                "log_scale": np.full_like(modes, -3.0),
+                "log_share": np.full_like(modes, np.log(0.5)),
+                "seen": (shown[None, :, 3] > 0).astype(np.float32),
+                "opening_logits": 20.0 * np.eye(len(OPENING_CLASSES))[hall.classes(WIDTH)[shown[:, 0]]][None],
+                "log_ceiling": np.zeros(1),
+                "log_ceiling_scale": np.zeros(1),
+                "room_type_logits": np.zeros((1, len(present(view.room_type_prior)))),
+            }
+
+        monkeypatch.setattr(ViewEncoder, "outputs", outputs)
+        read = read_photographs(encoders, [hall])
+        by_reader = read_views(encoders, read, 80.0, 4)
+        view, constant = by_reader["view"], by_reader["constant"]
+        assert view.n == constant.n == by_reader["sphere"].n == 4
+        assert view.median_error == pytest.approx(-np.log(0.9), abs=0.03)
+        assert view.shape_error < 0.03 < constant.shape_error
+        assert present(view.classes).balanced_accuracy > 0.9
+        assert constant.classes is None
+        # At the azimuths of all four views, the reading of the sphere is that of the whole photograph.
+        assert by_reader["sphere"].median_error == pytest.approx(read[0].measures.median_error, rel=0.5)
+        results = PhotographResults(read=read, answers={}, read_views={"80": by_reader})
+        shape = f"{view.shape_error:.3f} (constant distance {constant.shape_error:.3f}, whole sphere "
+        assert f"| views of 80°: median error of the walls' shape | {shape}" in results.markdown()
+        assert results.figures()["read_views"]["80"]["view"]["shape_error"] == view.shape_error
+
+    def test_shape_error_ignores_scale(self) -> None:
+        true_m, errors = np.linspace(1.0, 3.0, 9), np.array([0.1, -0.2, 0.0, 0.3, -0.1, 0.2, 0.0, 0.1, -0.3])
+        measured = [measure_azimuths([true_m], np.log(true_m) + errors + scale, np.zeros(9)) for scale in (0.0, 0.7)]
+        assert measured[0].shape_error == pytest.approx(measured[1].shape_error)
+        assert measured[0].shape_error == pytest.approx(0.1)
+        assert measured[1].median_error == pytest.approx(0.7)
+
     def test_predicted_openings_are_reported_and_drawn(self, root: Path) -> None:
         hall = read_annotation(root / "hall.json")
         truth = hall.classes(128)
@@ -434,6 +487,11 @@ class TestEvaluating:
         assert "not evaluated" in printed
         with Image.open(out / SHEET_FILE) as sheet:
             assert sheet.width > 4 * 512
+        # Without galleries, walls and openings are the same.
+        assert main([*command[:-1], "0", "--out", str(tmp_path / "walls")]) == 0
+        walls = json.loads((tmp_path / "walls" / FIGURES_FILE).read_text())
+        assert walls["azimuths"] == figures["azimuths"]
+        assert walls["galleries"] == walls["foreign_plans"] == {}
         # A second run reuses the stored answers.
         assert main([*command, "--workers", "0", "--out", str(out)]) == 0
         assert json.loads((out / FIGURES_FILE).read_text()) == figures

@@ -36,12 +36,12 @@ from lalaloc_core.evaluate.runs.galleries import (
     foreign_plans,
     score_galleries,
 )
-from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
+from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs, read_views
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
-from lalaloc_core.learn.metrics import ClassScores, summarise_azimuths
+from lalaloc_core.learn.metrics import AzimuthSummary, ClassScores, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 _HEIGHT, _WIDTH = 256, 512
@@ -63,12 +63,12 @@ def draw_photographs(
 
 def _caption(read: ReadPhotograph, answers: Mapping[str, Sequence[GalleryAnswer]]) -> list[str]:
     measures, name = read.measures, read.photograph.name
-    located = (f"{heading} {describe_answers(results, name)}" for heading, results in answers.items())
+    located = ", ".join(f"{heading} {describe_answers(results, name)}" for heading, results in answers.items())
     return [
         f"{name} ({read.photograph.quality})",
         f"|Δ log d| {measures.median_error:.3f}, 90 % below {measures.error_90:.2f}, bias {measures.bias:+.3f}, "
         f"{measures.scale_ratio:.1f} times its scale",
-        "in galleries, heading " + ", ".join(located),
+        f"in galleries, heading {located}" if answers else "not located",
     ]
 
 
@@ -114,12 +114,14 @@ class PhotographResults:
     """Results of a model on annotated photographs.
 
     `read` are predictions of walls and openings; `answers` are by heading, "known" or "unknown", and `views` by field
-    of view (degrees) and heading. `foreign` are confidences in plans of other buildings, by heading.
+    of view (degrees) and heading. `read_views` are by field of view and what reads them, as of the function of that
+    name. `foreign` are confidences in plans of other buildings, by heading.
     """
 
     read: Sequence[ReadPhotograph]
     answers: Mapping[str, Sequence[GalleryAnswer]]
     views: Mapping[str, Mapping[str, Sequence[GalleryAnswer]]] = dataclasses.field(default_factory=dict)
+    read_views: Mapping[str, Mapping[str, AzimuthSummary]] = dataclasses.field(default_factory=dict)
     foreign: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
     def figures(self) -> dict[str, Any]:
@@ -132,6 +134,10 @@ class PhotographResults:
         return without_infinity(
             {
                 "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
+                "read_views": {
+                    field_deg: {reader: dataclasses.asdict(summary) for reader, summary in by_reader.items()}
+                    for field_deg, by_reader in self.read_views.items()
+                },
                 "galleries": scores,
                 "views": dict(zip(self.views, views, strict=True)),
                 "read_as": None if (shares := self._read_as()) is None else shares.tolist(),
@@ -187,6 +193,8 @@ class PhotographResults:
             ("error relative to the predicted scale", _number(azimuths.scale_ratio)),
             ("openings, balanced accuracy", _classes(azimuths.classes)),
         ]
+        for field_deg, by_reader in self.read_views.items():
+            rows += _view_rows(f"views of {field_deg}°", by_reader)
         for what, answers in (
             ("galleries", self.answers),
             *((f"views of {deg}°", of) for deg, of in self.views.items()),
@@ -222,13 +230,14 @@ def evaluate_photographs(
 ) -> PhotographResults:
     """Evaluate a model on annotated photographs and write the results to a folder; existing gallery runs resume.
 
-    `galleries` is the number of galleries of every photograph, for each heading; `views_deg` are fields of view in
-    which eight views of each photograph are localised in its galleries as well; `workers` is as in `run_evaluation`,
-    and `command` repeats the evaluation.
+    `galleries` is the number of galleries of every photograph, for each heading; 0 measures walls and openings only.
+    `views_deg` are fields of view in which eight views of each photograph are measured, and localised in its galleries
+    as well; `workers` is as in `run_evaluation`, and `command` repeats the evaluation.
 
     Raises:
         DatasetError: the photographs cannot be used.
         BundleError: the model is missing, or predicts no wall profile.
+        InvalidPhotographError: views are asked for, and the model has no encoder of views.
         RunError: `out` holds other runs.
         InvalidInputError: all photographs are of quality "poor".
     """
@@ -238,7 +247,10 @@ def evaluate_photographs(
             f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'; "
             "at least one must be 'fair' or 'good'"
         )
-    read = read_photographs(PhotographEncoder(Bundle.open(bundle), threads=1), dataset.photographs)
+    encoders = PhotographEncoder(Bundle.open(bundle), threads=1)
+    read = read_photographs(encoders, dataset.photographs)
+    counting = [item for item in read if item.photograph.counts]
+    readings = {f"{field_deg:g}": read_views(encoders, counting, field_deg, _VIEWS) for field_deg in views_deg}
 
     def located(field_deg: float | None, heading: str, known: bool) -> list[GalleryAnswer]:
         name = heading if field_deg is None else f"view-{field_deg:g}-{heading}"
@@ -258,22 +270,46 @@ def evaluate_photographs(
         predictions = run_evaluation(RunFolder(out / name), info, workers=workers)
         return answers_in_galleries(predictions, dataset.photographs)
 
+    headings = _HEADINGS if galleries else {}
     answers, *views = (
-        {heading: located(field_deg, heading, known) for heading, known in _HEADINGS.items()}
+        {heading: located(field_deg, heading, known) for heading, known in headings.items()}
         for field_deg in (None, *views_deg)
     )
-    by_field = {f"{field_deg:g}": of for field_deg, of in zip(views_deg, views, strict=True)}
-    opened, counting = Bundle.open(bundle), [photograph for photograph in dataset.photographs if photograph.counts]
-    plans = foreign_plans()
+    opened, plans = Bundle.open(bundle), foreign_plans() if galleries else []
     foreign = {
-        heading: foreign_confidences(opened, counting, plans, heading_known=known)
-        for heading, known in _HEADINGS.items()
+        heading: foreign_confidences(opened, [item.photograph for item in counting], plans, heading_known=known)
+        for heading, known in headings.items()
     }
-    results = PhotographResults(read=read, answers=answers, views=by_field, foreign=foreign)
+    results = PhotographResults(
+        read=read, answers=answers, views=dict(zip(readings, views, strict=True)), read_views=readings, foreign=foreign
+    )
     figures = {"command": command, "model": describe_model(bundle), **results.figures()}
+    out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
     draw_photographs(f"{len(read)} photographs, model {bundle}", read, answers).save(out / SHEET_FILE)
     return results
+
+
+def _view_rows(what: str, by_reader: Mapping[str, AzimuthSummary]) -> list[tuple[str, str]]:
+    """Return figures of the encoder of views; in brackets those of the readers that bound it."""
+    view, sphere, constant = (by_reader[reader] for reader in ("view", "sphere", "constant"))
+
+    def openings(summary: AzimuthSummary) -> str:
+        return "–" if summary.classes is None else percent(summary.classes.balanced_accuracy)
+
+    return [
+        (
+            f"{what}: median error of the walls' shape",
+            f"{_number(view.shape_error)} (constant distance {_number(constant.shape_error)}, "
+            f"whole sphere {_number(sphere.shape_error)})",
+        ),
+        (
+            "… of log distance",
+            f"{_number(view.median_error)} (constant distance {_number(constant.median_error)}, "
+            f"whole sphere {_number(sphere.median_error)})",
+        ),
+        ("… openings, balanced accuracy", f"{openings(view)} (whole sphere {openings(sphere)})"),
+    ]
 
 
 def _gallery_rows(what: str, scores: GalleryScores) -> list[tuple[str, str]]:

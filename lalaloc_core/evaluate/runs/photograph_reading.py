@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
-from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph
+from lalaloc_core.learn.metrics import AzimuthMeasures, AzimuthSummary, measure_azimuths, summarise_azimuths
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.query import CameraHeight, Query
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +55,50 @@ def read_photographs(encoders: PhotographEncoder, photographs: Sequence[Annotate
     return read
 
 
+def read_views(
+    encoders: PhotographEncoder, read: Sequence[ReadPhotograph], field_deg: float, per_photograph: int
+) -> dict[str, AzimuthSummary]:
+    """Compare level views of photographs, cut at equal angles, with their annotations, at the azimuths they show.
+
+    Returns:
+        summaries over all views by what reads them: "view" is the encoder of views. The others bound it: "sphere" is
+        the encoder of spheres with the whole photograph in sight, "constant" the median annotated distance everywhere.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+        DatasetError: a photograph cannot be read.
+        InvalidPhotographError: the model has no encoder of views.
+    """
+    size = patch_size(encoders.manifest)
+    annotated_m = [item.photograph.profile_m(0, len(item.profile_m)) for item in read]
+    constant = np.log(np.median(np.concatenate(annotated_m)))
+    measures: dict[str, list[AzimuthMeasures]] = {"view": [], "sphere": [], "constant": []}
+    for item in read:
+        photograph, sphere = item.photograph, CachedSphere(item.photograph.photograph)
+        width = len(item.profile_m)
+        profiles_m = [photograph.profile_m(outline, width) for outline in range(len(photograph.outlines))]
+        classes = photograph.classes(width)
+        for number in range(per_photograph):
+            azimuth = float(wrap_angle(TWO_PI * number / per_photograph))
+            view = ViewPhotograph(
+                sphere=sphere, azimuth=azimuth, field_deg=field_deg, pitch=0.0, roll=0.0, stated="tilt"
+            )
+            # With its azimuth as heading, a view is read in the frame of its sphere.
+            query = encoders.query(view.open(size), azimuth, CameraHeight(CAMERA_HEIGHT_M, 0.0))
+            log_m, log_scale, scores = _azimuths(query, encoders.manifest.name)
+            seen = np.isfinite(log_scale)
+            readings = {
+                "view": (log_m, log_scale, scores),
+                "sphere": (np.log(item.profile_m), item.measures.log_scale, item.class_scores),
+                "constant": (np.full(width, constant), np.zeros(width), None),
+            }
+            for reader, (walls, scale, kinds) in readings.items():
+                true_m = [profile_m[seen] for profile_m in profiles_m]
+                kinds = None if kinds is None else kinds[seen]
+                measures[reader].append(measure_azimuths(true_m, walls[seen], scale[seen], classes[seen], kinds))
+    return {reader: summarise_azimuths(of, OPENING_CLASSES) for reader, of in measures.items()}
+
+
 def read_azimuths(
     encoders: PhotographEncoder, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
 ) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
@@ -64,9 +110,14 @@ def read_azimuths(
     Raises:
         BundleError: the model predicts no wall profile.
     """
-    query = encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
+    return _azimuths(encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0)), encoders.manifest.name)
+
+
+def _azimuths(
+    query: Query, model: str
+) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
     if query.profile is None:
-        raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile; use another bundle")
+        raise BundleError(f"model '{model}' predicts no wall profile; use another bundle")
     # Relative to the shares of the classes, as in the matching cost, so that every class counts alike.
     openings = query.openings
     scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
