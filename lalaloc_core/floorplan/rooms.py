@@ -24,7 +24,7 @@ _SYNONYMS = {
     "bathroom": ("bath", "shower", "toilet", "wc", "restroom", "washroom"),
     "corridor": ("hall", "hallway", "passage", "landing"),
     "entrance": ("foyer", "entry", "vestibule", "lobby"),
-    "living": ("lounge", "family", "studio"),
+    "living": ("lounge", "family"),
     "office": ("den", "study", "workspace"),
     "closet": ("wardrobe",),
     "storage": ("pantry", "store", "basement", "attic"),

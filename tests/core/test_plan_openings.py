@@ -254,6 +254,7 @@ def test_room_types_round_trip() -> None:
 def test_room_type_from_label() -> None:
     expected = {"Living room 2": "living", "master bedroom": "bedroom", "WC": "bathroom", "store room": "storage"}
     expected |= {"study": "office", "hall": "corridor", "undefined": "unknown", "": "unknown"}
+    expected |= {"studio": "unknown", "photo studio": "unknown"}
     assert {label: room_type_from_label(label) for label in expected} == expected
 
 
