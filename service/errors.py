@@ -53,6 +53,8 @@ LaLaLocError
     ├── DeadlineExceededError       the request missed its deadline
     ├── FeaturesRequiredError       a photograph, where the service takes features only
     ├── UnknownModelFileError       no such file of the model for devices
+    ├── ChangedModelFileError       a file of the model was changed on the disk
+    ├── RangeError                  a range of bytes behind the end of the file
     └── StoppingError               the service is shutting down
 """
 
@@ -519,6 +521,25 @@ class UnknownModelFileError(ServiceError):
 
     def __init__(self, name: str, model: str) -> None:
         super().__init__(f"model '{model}' has no file '{name[:64]}' for devices")
+
+
+class ChangedModelFileError(ServiceError):
+    """A file of the model was changed or removed while the service runs."""
+
+    retry_after_s = 60
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"the model's file '{name}' was changed on the disk: restore the bundle, and restart the service"
+        )
+
+
+class RangeError(ServiceError):
+    """The range of bytes lies behind the end of the file."""
+
+    def __init__(self, size_bytes: int) -> None:
+        self.size_bytes = size_bytes
+        super().__init__(f"the file has {size_bytes} bytes; ask for a range within them")
 
 
 class StoppingError(ServiceError):

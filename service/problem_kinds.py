@@ -36,6 +36,8 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     core.ForeignFeaturesError: ProblemKind(409, "foreign-features", "Features of another model"),
     errors.FeaturesRequiredError: ProblemKind(403, "features-required", "Features required"),
     errors.UnknownModelFileError: ProblemKind(404, "unknown-model-file", "Unknown file of the model"),
+    errors.ChangedModelFileError: ProblemKind(503, "model-file-changed", "File of the model changed"),
+    errors.RangeError: ProblemKind(416, "range-not-satisfiable", "Range not satisfiable"),
     core.InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between photographs"),
     core.InvalidHintError: ProblemKind(422, "invalid-hint", "Invalid hint"),
     core.InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),

@@ -168,6 +168,7 @@ def start_runtime(
         telemetry.tracing = _closing(cleanup, Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
     store = _closing(cleanup, open_store(settings))
+    telemetry.gauge("lalaloc_database_up", "1 while the database answers.", lambda: float(store.state == "answers"))
     access_control = _closing(cleanup, AccessControl(store.keys, settings))
     audit_trail = _closing(cleanup, AuditTrail(store.audit_log))
     audit_trail.start()

@@ -17,13 +17,14 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from lalaloc_core import __version__
-from service.errors import InvalidRequestError, RevisionMismatchError
+from service.errors import InvalidRequestError, RangeError, RevisionMismatchError
 from service.http.piecewise import Part, Parts, PartsResponse
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}
 _TAG = re.compile(r'[ \t,]*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"[ \t]*(?:,[ \t,]*|\Z)')
 _DIGITS = 32
+_RANGE = re.compile(r"bytes=[ \t]*([0-9]{0,18})-([0-9]{0,18})[ \t]*")
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,27 @@ def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None 
     return None
 
 
+def byte_range(request: Request, etag: str, size_bytes: int) -> range | None:
+    """Return the bytes that the client asks for; None for the whole representation, also if it asks for several ranges.
+
+    Raises:
+        RangeError: there are no such bytes.
+    """
+    values = request.headers.getlist("Range")
+    found = _RANGE.fullmatch(values[0]) if len(values) == 1 else None
+    if found is None or not any(found.groups()) or request.headers.get("If-Range", etag) != etag:
+        return None
+    first, last = (int(text) if text else None for text in found.groups())
+    if first is None:
+        # The last bytes.
+        first, last = max(size_bytes - (last or 0), 0), None
+    elif last is not None and last < first:
+        return None
+    if first >= size_bytes:
+        raise RangeError(size_bytes)
+    return range(first, size_bytes if last is None else min(last + 1, size_bytes))
+
+
 def tagged_answer(
     parts: Sequence[Part], media_type: str, etag: str, headers: Mapping[str, str] | None = None
 ) -> Response:
@@ -77,10 +99,15 @@ def tagged_answer(
 
 
 def tagged_stream(
-    parts: Parts, size_bytes: int, media_type: str, etag: str, headers: Mapping[str, str] | None = None
+    parts: Parts,
+    size_bytes: int,
+    media_type: str,
+    etag: str,
+    headers: Mapping[str, str] | None = None,
+    status: int = 200,
 ) -> Response:
     """Return a representation of known size, whose parts can be made while it is sent, with its tag."""
-    return PartsResponse(parts, size_bytes, media_type, {"ETag": etag, **_CACHED, **(headers or {})})
+    return PartsResponse(parts, size_bytes, media_type, {"ETag": etag, **_CACHED, **(headers or {})}, status)
 
 
 def expected_revision(request: Request, resource_id: str, revision_id: str, *, what: str = "floor plan") -> str | None:

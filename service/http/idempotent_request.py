@@ -89,16 +89,18 @@ class IdempotentRequest:
                 raise
             return refusal
 
-    async def run_async(self, parts: Parts, work: Callable[[], Awaitable[Response]], reads: BoundedReads) -> Response:
-        """Execute the request as `run` does, for work without side effects that is cancelled if the client leaves.
+    async def run_async(
+        self, parts: Parts, work: Callable[[str], Awaitable[Response]], reads: BoundedReads
+    ) -> Response:
+        """Execute the request as `run` does, for work that is cancelled if the client leaves.
 
         Args:
             parts: content of the request.
-            work: makes the answer.
+            work: makes the answer from the token.
             reads: threads for database access, with a timeout.
         """
         if self._key is None:
-            return await work()
+            return await work(uuid.uuid4().hex)
         tenant, waiting = self._place[0], _Waiting()
         try:
             token = await reads.run(tenant, self._begin_for, waiting, parts)
@@ -110,7 +112,7 @@ class IdempotentRequest:
         if isinstance(token, Response):
             return token
         try:
-            answer = await work()
+            answer = await work(token)
         except BaseException as error:
             refusal = None
             with suppress(errors.StoreUnavailableError):

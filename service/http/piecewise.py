@@ -24,10 +24,13 @@ class PartsResponse(Response):
         size_bytes: length of the body.
         media_type: media type of the body.
         headers: headers of the answer, without the length.
+        status: HTTP status.
     """
 
-    def __init__(self, parts: Parts, size_bytes: int, media_type: str, headers: Mapping[str, str]) -> None:
-        super().__init__(None, 200, {**headers, "Content-Length": str(size_bytes)}, media_type)
+    def __init__(
+        self, parts: Parts, size_bytes: int, media_type: str, headers: Mapping[str, str], status: int = 200
+    ) -> None:
+        super().__init__(None, status, {**headers, "Content-Length": str(size_bytes)}, media_type)
         self._parts = parts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError, SeveralLevelsError
 from service.errors import (
     InvalidRequestError,
+    RangeError,
     ServiceError,
     UnauthenticatedError,
     UnsupportedEncodingError,
@@ -81,6 +82,8 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
     headers = {}
     if isinstance(error, ServiceError) and error.retry_after_s is not None:
         headers["Retry-After"] = str(error.retry_after_s)
+    if isinstance(error, RangeError):
+        headers["Content-Range"] = f"bytes */{error.size_bytes}"
     if isinstance(error, UnauthenticatedError):
         headers["WWW-Authenticate"] = "Bearer"
     if isinstance(error, UnsupportedEncodingError):

@@ -14,6 +14,7 @@ import uuid
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
 
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -28,6 +29,8 @@ _SCOPE_KEYS = ("asgi", "client", "http_version", "root_path", "server")
 _FIELD = re.compile(r"[a-z_]{1,40}")
 _MAX_HEAD = 16 * 1024
 _SIZE = "bytes"
+# Far above every limit of uploads; larger numbers are no sizes.
+_MAX_STATED_BYTES = 2**50
 
 
 class SocketProtocolError(Exception):
@@ -68,7 +71,7 @@ class FileHead:
         except (ValueError, RecursionError) as error:
             raise SocketProtocolError("a text message is not JSON; send an object with bytes and fields") from error
         size = values.pop(_SIZE, None) if isinstance(values, dict) else None
-        if type(size) is not int or size < 1:
+        if type(size) is not int or not 1 <= size <= _MAX_STATED_BYTES:
             raise SocketProtocolError(f"{_SIZE} is {str(size)[:20]}; send the size of the photograph's file")
         if unknown := next((name for name in values if not _FIELD.fullmatch(name)), None):
             raise SocketProtocolError(f"'{unknown[:20]}' is no name of a field; fields are those of the HTTP route")
@@ -162,7 +165,7 @@ class SocketRequests:
             "scheme": "https" if socket.get("scheme") == "wss" else "http",
             "method": method,
             "path": path,
-            "raw_path": path.encode("ascii"),
+            "raw_path": quote(path).encode("ascii"),
             "query_string": b"",
             "headers": [*repeated, *((name.encode(), value.encode()) for name, value in own.items())],
             "state": dict(socket.get("state", {})),

@@ -170,14 +170,17 @@ async def read_parts(
         InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
     """
     stated = request.headers.get("content-type", "")
-    charset = parse_options_header(stated)[1].get(b"charset", _UTF_8)
+    options = parse_options_header(stated)[1]
+    charset = options.get(b"charset", _UTF_8)
     if charset.lower() != _UTF_8:
         raise errors.UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
+    # One more than allowed, so that the error states the limit.
+    max_files = max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS
+    chunks = _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES)
     parser = MultiPartParser(
         request.headers,
-        _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES),
-        # One more than allowed, so that the error states the limit.
-        max_files=max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS,
+        _within_parts(chunks, options.get(b"boundary", b""), max_files + _MAX_PARTS),
+        max_files=max_files,
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
     )
@@ -320,6 +323,26 @@ async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: in
         received += len(chunk)
         if received > max_bytes:
             raise errors.UploadTooLargeError(limits.name, limits.max_bytes)
+        yield chunk
+
+
+async def _within_parts(
+    chunks: AsyncGenerator[bytes, None], boundary: bytes, limit: int
+) -> AsyncGenerator[bytes, None]:
+    """Yield a multipart body whose boundary occurs a bounded number of times.
+
+    A boundary costs the parser as much as hundreds of bytes, also if the next bytes show that it is none.
+
+    Raises:
+        MalformedRequestError: the boundary occurs in the content of the parts.
+    """
+    found = 0
+    async for chunk in chunks:
+        found += chunk.count(b"--" + boundary)
+        if found > limit + 1:
+            raise errors.MalformedRequestError(
+                f"the boundary occurs more than {limit} times; choose one that does not occur in the parts"
+            )
         yield chunk
 
 

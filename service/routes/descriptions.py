@@ -70,6 +70,7 @@ QUERY_ERRORS: Errors = (
     errors.DeadlineExceededError,
 )
 
+PARTIAL_CONTENT: Responses = {206: {"description": "The bytes that the request asks for."}}
 NOT_MODIFIED: Responses = {304: {"description": "The client has this representation already."}}
 PLAN_RESPONSES = problem_responses(errors.UnknownFloorPlanError, *READ_ERRORS)
 REVISION_RESPONSES = NOT_MODIFIED | problem_responses(
@@ -102,6 +103,13 @@ IDEMPOTENCY_KEY = _header(
 CONDITIONAL = {
     "parameters": [
         _header("If-None-Match", "Entity tags that the client has, or `*`; if one matches, the answer is 304.")
+    ]
+}
+PARTIAL = {
+    "parameters": [
+        *CONDITIONAL["parameters"],
+        _header("Range", "Bytes of the file, such as `bytes=1048576-`; several ranges are answered with all bytes."),
+        _header("If-Range", "Entity tag of the part that the client has; all bytes are sent if it is another one."),
     ]
 }
 UNLESS_CHANGED = [

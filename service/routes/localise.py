@@ -95,7 +95,7 @@ async def localise(
             raise InvalidRequestError([("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")])
         picture = None if picture is None and media in (JSON, GEOJSON) else "plan"
 
-    async def respond() -> Response:
+    async def respond(_token: str) -> Response:
         query = PhotographQuery(form, content, context)
         place = await call.place(form.floorplan_id, form.venue_id)
         check_anchor(place, media)

@@ -19,7 +19,7 @@ from service.http.problems import problem_document, problem_responses
 from service.http.uploads import Repeats
 from service.query import Content, PhotographQuery, QueryContext
 from service.routes.dependencies import ApiCall, Call
-from service.routes.descriptions import IDEMPOTENCY_ERRORS, QUERY_ERRORS
+from service.routes.descriptions import QUERY_ERRORS
 from service.routes.query_request import FEATURES, PHOTO, body_schema, keep_answer, photographs_of, read_query
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.schemas.localise_answer import BatchLine
@@ -56,15 +56,10 @@ _MAX_NAME = 255
     status_code=200,
     response_class=LinesResponse,
     response_model=BatchLine,
-    openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA),
+    openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA, idempotent=False),
     responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
     | problem_responses(
-        InvalidHintError,
-        errors.RateLimitedError,
-        errors.UnknownVenueError,
-        errors.UnknownFloorPlanError,
-        *QUERY_ERRORS,
-        *IDEMPOTENCY_ERRORS,
+        InvalidHintError, errors.RateLimitedError, errors.UnknownVenueError, errors.UnknownFloorPlanError, *QUERY_ERRORS
     ),
 )
 async def localise_batch(call: Call) -> Response:

@@ -57,7 +57,7 @@ async def localise_sequence(call: Call) -> Response:
     photographs = _photographs(parts, form, call)
     query = SequenceQuery(form, photographs, context.for_photographs(len(photographs)))
 
-    async def respond() -> Response:
+    async def respond(_token: str) -> Response:
         place = await call.place(form.floorplan_id, form.venue_id)
         check_anchor(place, media)
         found = await call.runtime.localiser.localise_sequence(place, query)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import AsyncIterator
 from hashlib import sha256
 from pathlib import Path
+from typing import BinaryIO
 
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.bundle import MANIFEST_NAME
 from lalaloc_core.localise.encode.features import DEVICE_FILES, device_manifest
-from service.errors import InvalidRequestError, UnknownModelFileError
-from service.http.conditional import digest_etag, not_modified, tagged_answer, tagged_stream
+from service.errors import ChangedModelFileError, InvalidRequestError, RangeError, UnknownModelFileError
+from service.http.conditional import byte_range, digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
+from service.http.request_end import on_request_end
 from service.http.uploads import JSON
 from service.routes.dependencies import ApiCall, Call
-from service.routes.descriptions import CONDITIONAL, file_response
+from service.routes.descriptions import PARTIAL, PARTIAL_CONTENT, file_response
 
 router = APIRouter(prefix="/model", tags=["localisation"])
 _BINARY = "application/octet-stream"
@@ -27,13 +30,16 @@ _CHUNK_BYTES = 2**20
     "/{file}",
     summary="Get a file of the image encoder",
     response_class=Response,
-    openapi_extra=CONDITIONAL,
-    responses=file_response("*/*") | problem_responses(UnknownModelFileError, InvalidRequestError),
+    openapi_extra=PARTIAL,
+    responses=file_response("*/*")
+    | PARTIAL_CONTENT
+    | problem_responses(UnknownModelFileError, InvalidRequestError, RangeError, ChangedModelFileError),
 )
 async def get_model_file(file: str, call: Call) -> Response:
     """Return a file with which a device computes features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`.
 
-    The manifest has sizes and digests of the files, and no more of the model than its image encoder needs.
+    The manifest has sizes and digests of the files, and no more of the model than its image encoder needs. `Range`
+    resumes the download of a file.
     """
     bundle = call.runtime.bundle
     manifest = bundle.manifest
@@ -47,16 +53,50 @@ async def get_model_file(file: str, call: Call) -> Response:
     etag = digest_etag(entry.sha256)
     if (answer := not_modified(call.request, etag)) is not None:
         return answer
-    chunks = _chunks(bundle.folder / file, call)
-    return tagged_stream(chunks, entry.bytes, _BINARY, etag)
+    wanted = byte_range(call.request, etag, entry.bytes)
+    async with call.reading():
+        opened = await run_in_threadpool(_open, bundle.folder / file, entry.bytes)
+    on_request_end(call.request.scope, opened.close)
+    headers, status = {"Accept-Ranges": "bytes"}, 200
+    if wanted is None:
+        wanted = range(entry.bytes)
+    else:
+        headers["Content-Range"], status = f"bytes {wanted.start}-{wanted.stop - 1}/{entry.bytes}", 206
+    return tagged_stream(_chunks(opened, wanted, call), len(wanted), _BINARY, etag, headers, status)
 
 
-async def _chunks(path: Path, call: ApiCall) -> AsyncIterator[bytes]:
-    """Yield a file until the client has gone. Clients check the digest, so an altered file is noticed there."""
-    with path.open("rb") as opened:
-        while not await call.request.is_disconnected():
-            async with call.reading():
-                chunk = await run_in_threadpool(opened.read, _CHUNK_BYTES)
-            if not chunk:
-                return
-            yield chunk
+def _open(path: Path, size_bytes: int) -> BinaryIO:
+    """Open a file of the model.
+
+    Raises:
+        ChangedModelFileError: it is missing, or has another size.
+    """
+    try:
+        opened = path.open("rb")
+    except OSError as error:
+        raise ChangedModelFileError(path.name) from error
+    if os.fstat(opened.fileno()).st_size != size_bytes:
+        opened.close()
+        raise ChangedModelFileError(path.name)
+    return opened
+
+
+async def _chunks(opened: BinaryIO, wanted: range, call: ApiCall) -> AsyncIterator[bytes]:
+    """Yield bytes of a file until the client has gone. Clients check the digest, so an altered file is noticed there.
+
+    Raises:
+        ChangedModelFileError: the file ends too soon. The answer is then incomplete, and its connection is closed.
+    """
+    position = wanted.start
+    while position < wanted.stop and not await call.request.is_disconnected():
+        async with call.reading():
+            chunk = await run_in_threadpool(_read, opened, position, min(_CHUNK_BYTES, wanted.stop - position))
+        if not chunk:
+            raise ChangedModelFileError(os.path.basename(opened.name))
+        position += len(chunk)
+        yield chunk
+
+
+def _read(opened: BinaryIO, position: int, size_bytes: int) -> bytes:
+    opened.seek(position)
+    return opened.read(size_bytes)

@@ -86,7 +86,7 @@ async def geopose(
             raise UploadTooLargeError(limits.name, max_bytes, len(content))
         return without_picture(parsed), content
 
-    async def respond() -> Response:
+    async def respond(_token: str) -> Response:
         parsed, content = await call.upload(read)
         found, warnings = await _Query(call, parsed, content, context).localise(floorplan_id, venue_id)
         call.log(plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)

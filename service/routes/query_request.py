@@ -43,8 +43,14 @@ Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
 Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 
 
-def body_schema(form: type[BaseModel], photo: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the description of a query's body, given its form and the schema of its photographs."""
+def body_schema(form: type[BaseModel], photo: Mapping[str, Any], *, idempotent: bool = True) -> dict[str, Any]:
+    """Return the description of a query's body, and of its idempotency key.
+
+    Args:
+        form: fields of the body.
+        photo: schema of its photographs.
+        idempotent: tells whether the route takes an idempotency key.
+    """
     schema = form.model_json_schema(ref_template="#/components/schemas/{model}")
     # `http.api_description` adds these schemas.
     schema.pop("$defs", None)
@@ -59,7 +65,7 @@ def body_schema(form: type[BaseModel], photo: Mapping[str, Any]) -> dict[str, An
     # One of the three is needed. None is described as required, because of alternatives generated clients make a union
     # of types.
     body = {"required": True, "content": {MULTIPART: {"schema": schema}}}
-    return {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]}
+    return {"requestBody": body} | ({"parameters": [IDEMPOTENCY_KEY]} if idempotent else {})
 
 
 async def read_query(

@@ -117,6 +117,7 @@ def delete_session(session_id: str, call: Call) -> None:
         errors.VenueUnsearchableError,
         errors.VenueNotReadyError,
         *QUERY_ERRORS,
+        *IDEMPOTENCY_ERRORS,
     ),
 )
 async def add_photograph(session_id: str, call: Call) -> Response:
@@ -124,8 +125,9 @@ async def add_photograph(session_id: str, call: Call) -> Response:
 
     One photograph of a session is computed at a time: another one gets 409 meanwhile. With `number`, a photograph that
     is sent twice, as after a lost answer, gets 409 instead of moving the camera twice; `GET /sessions/{session_id}`
-    then has the answer.
+    then has the answer. With an idempotency key, it gets the same answer again.
     """
+    idempotent = call.idempotent()
     media_type(call.request, (MULTIPART,))
     sessions = call.store.sessions
     await call.read(sessions.get, call.tenant, _id(session_id))
@@ -133,27 +135,34 @@ async def add_photograph(session_id: str, call: Call) -> Response:
     # Checked before the session is claimed.
     _ = form.odometry
     (content,) = photographs_of(parts, form, call)
-    session = await call.read(sessions.claim, call.tenant, session_id, form.number)
-    try:
-        document = SessionDocument.model_validate_json(session.options)
-        place = await call.place(document.floorplan_id, document.venue_id)
-        if place.revision_id != session.revision_id:
-            changed = f"floor plan '{place.id}' was replaced"
-            if session.plan_id is None:
-                changed = f"venue '{place.id}' was changed"
-            raise errors.SessionOutdatedError(session.id, changed)
-        call.log(plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
-        query = TrackQuery(session.id, document, session.state, form, content, context)
-        outcome = await call.runtime.localiser.track(place, query)
-        stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
-        finish = partial(sessions.finish, ttl_s=call.settings.storage.session_ttl_s)
-        after = await call.read(finish, session, outcome.state, stored)
-    except BaseException:
-        # Also if the client leaves; the claim would expire by itself.
-        with suppress(errors.StoreUnavailableError):
-            await call.read(sessions.release, session)
-        raise
-    return Response(_answer(after), media_type=JSON)
+
+    async def follow(token: str) -> Response:
+        session = await call.read(sessions.claim, call.tenant, session_id, form.number, token)
+        if session.claim == token:
+            # An earlier attempt moved the camera, but its answer was not kept.
+            return Response(_answer(session), media_type=JSON)
+        try:
+            document = SessionDocument.model_validate_json(session.options)
+            place = await call.place(document.floorplan_id, document.venue_id)
+            if place.revision_id != session.revision_id:
+                changed = f"floor plan '{place.id}' was replaced"
+                if session.plan_id is None:
+                    changed = f"venue '{place.id}' was changed"
+                raise errors.SessionOutdatedError(session.id, changed)
+            call.log(plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
+            query = TrackQuery(session.id, document, session.state, form, content, context)
+            outcome = await call.runtime.localiser.track(place, query)
+            stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
+            finish = partial(sessions.finish, ttl_s=call.settings.storage.session_ttl_s)
+            after = await call.read(finish, session, token, outcome.state, stored)
+        except BaseException:
+            # Also if the client leaves; the claim would expire by itself.
+            with suppress(errors.StoreUnavailableError):
+                await call.read(sessions.release, session)
+            raise
+        return Response(_answer(after), media_type=JSON)
+
+    return await idempotent.run_async(parts, follow, call.runtime.reads)
 
 
 def _check_size(record: PlanRecord, call: ApiCall) -> None:

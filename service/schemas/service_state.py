@@ -118,4 +118,7 @@ class ReadyAnswer(ResponseModel):
     lpo_pool: PoolAnswer
     decode_pool: PoolAnswer
     import_pool: PoolAnswer = Field(description="Processes that read plan files; they start on first use.")
+    database: Literal["answers", "unavailable", "damaged"] = Field(
+        description="Without the database, the service is ready and answers queries in plans that it has in memory."
+    )
     plans_preparing: int = Field(description="Plans whose pose grid is not computed yet.")

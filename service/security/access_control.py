@@ -145,9 +145,7 @@ class AccessControl:
         presented = parse_authorization(values)
         try:
             if presented is not None:
-                # Clients can share an address, so valid keys are not affected by invalid ones.
-                if not self._keys.remembers(presented):
-                    await self._rates.check_refused(client)
+                # Looked up first: clients can share an address, so valid keys are not affected by invalid ones.
                 identity = await self._holder_of_key(request, presented)
                 if identity is None:
                     raise errors.UnauthenticatedError(_REFUSED)

@@ -54,10 +54,6 @@ class KeyCache:
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lalaloc-keys")
         self._breaker = CircuitBreaker(clock)
 
-    def remembers(self, presented: PresentedKey) -> bool:
-        """Return True if the key was valid recently."""
-        return self._known.get(presented.hash) is not None
-
     async def find(self, presented: PresentedKey) -> ApiKey | None:
         """Return the key; None if it is unknown or revoked.
 

@@ -16,7 +16,7 @@ from service.settings import Settings
 # Client addresses share a fixed number of counters, which bounds memory. A collision only affects addresses that send
 # invalid keys.
 _ADDRESS_COUNTERS = 1024
-# Invalid API keys per minute of a client address; further ones are rejected without a look-up.
+# Invalid API keys per minute of a client address; further ones get a 429. Valid keys are not affected.
 REFUSED_KEYS_PER_MINUTE = 60
 # Bytes of an answer that cost as much as a request.
 BYTES_PER_REQUEST = 256 * 1024
@@ -71,16 +71,8 @@ class RateLimits:
             TooManyRefusedKeysError: the limit is exceeded.
         """
         if not await self._limiter.hit(self._refused, _counter_of(client)):
-            raise await self._too_many_refused(client)
-
-    async def check_refused(self, client: str) -> None:
-        """Refuse a client address that exceeded its limit of invalid keys.
-
-        Raises:
-            TooManyRefusedKeysError: the limit is exceeded.
-        """
-        if not await self._limiter.test(self._refused, _counter_of(client)):
-            raise await self._too_many_refused(client)
+            retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
+            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s)
 
     def _limit_of(self, caller: Identity) -> RateLimitItem | None:
         per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
@@ -89,10 +81,6 @@ class RateLimits:
     async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
         if not await self._limiter.hit(limit, key_id, cost=cost):
             raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
-
-    async def _too_many_refused(self, client: str) -> TooManyRefusedKeysError:
-        retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
-        return TooManyRefusedKeysError(self._refused.amount, retry_after_s)
 
     async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
         """Return the whole seconds until the count drops."""

@@ -12,7 +12,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from sqlalchemy import (
     Column,
@@ -40,6 +40,7 @@ from service.storage.disk_reserve import LOG_BYTES, DiskReserve
 from service.telemetry import LOGGER_NAME
 
 Result = TypeVar("Result")
+State = Literal["answers", "unavailable", "damaged"]
 # Steps of `give_back` per call, and the pause (s) after each, longer than the interval at which SQLite polls its lock.
 _MAX_STEPS, _PAUSE_S = 40, 0.12
 _WRITER = "lalaloc_writer"
@@ -51,6 +52,9 @@ _STATEMENT_MS, _LOCK_MS, _IDLE_MS = 30_000, 10_000, 60_000
 _CLOCK_SLACK_S = 10.0
 # SQLSTATE of PostgreSQL for a full disk.
 _DISK_FULL = "53100"
+# Beginnings of the names of SQLite's errors for a damaged file, and what to do about it.
+_DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
+_RESTORE = "stop the service, and restore a backup (lalaloc-service restore)"
 # Silence (ms) after which a connection counts as broken.
 _SILENCE_MS = 5000
 
@@ -94,7 +98,15 @@ class Database:
         # Reads in one transaction see one snapshot; on SQLite they do so anyway.
         snapshot = {"isolation_level": "REPEATABLE READ"} if self.is_postgresql else {}
         self._engine_for_reading: Engine = self._engine.execution_options(**snapshot)
-        self._answered_s = -float("inf")
+        self._answered_s = self._failed_s = -float("inf")
+        self._is_damaged = False
+
+    @property
+    def state(self) -> State:
+        """Outcome of the last transaction; `damaged` stays, because only a restored file, and a restart, end it."""
+        if self._is_damaged:
+            return "damaged"
+        return "unavailable" if self._failed_s > self._answered_s else "answers"
 
     def close(self) -> None:
         """Close all connections."""
@@ -213,8 +225,10 @@ class Database:
         with closing(self._engine.raw_connection()) as raw:
             try:
                 yield raw.cursor()
-            except sqlite3.OperationalError as error:
-                raise _unavailable(error) from error
+            except sqlite3.DatabaseError as error:
+                if not isinstance(error, sqlite3.OperationalError) and not _tells_damage(error):
+                    raise
+                raise self._unavailable(error) from error
 
     def _note_file(self, _connection: Any, _record: Any) -> None:
         self._file = self._file or _identity(self._path)
@@ -227,6 +241,7 @@ class Database:
         """
         if self._file is not None and _identity(self._path) != self._file:
             logging.getLogger(LOGGER_NAME).error("the database file is gone", extra={"fields": {"file": self._path}})
+            self._failed_s = time.monotonic()
             raise StoreUnavailableError("the database file was removed or replaced: restart the service")
 
     @contextmanager
@@ -241,13 +256,33 @@ class Database:
             # Busy if the database answered another caller meanwhile; else unavailable.
             if self.answered_since(begin_s):
                 raise StoreBusyError() from error
-            raise _unavailable(error) from error
+            raise self._unavailable(error) from error
         except (OperationalError, InterfaceError) as error:
-            raise _unavailable(error) from error
+            raise self._unavailable(error) from error
         except DBAPIError as error:
-            if error.connection_invalidated:
-                raise _unavailable(error) from error
+            if error.connection_invalidated or _tells_damage(error.orig):
+                raise self._unavailable(error) from error
             raise
+
+    def _unavailable(self, error: Exception) -> StoreUnavailableError:
+        """Log a failure, and return its error."""
+        cause = getattr(error, "orig", None) or error
+        reason = {"reason": str(cause).strip()[:300]}
+        log = logging.getLogger(LOGGER_NAME)
+        if _tells_damage(cause):
+            # Once: every request fails from now on.
+            if not self._is_damaged:
+                fields = {**reason, "file": self._path, "remedy": _RESTORE}
+                log.error("the database file is damaged", extra={"fields": fields})
+            self._is_damaged = True
+            return StoreUnavailableError(f"the database file is damaged: {_RESTORE}")
+        is_full = getattr(cause, "sqlite_errorname", None) == "SQLITE_FULL"
+        if is_full or getattr(cause, "sqlstate", None) == _DISK_FULL:
+            log.warning("database full", extra={"fields": reason})
+            return StoreFullError()
+        self._failed_s = time.monotonic()
+        log.warning("database unavailable", extra={"fields": reason})
+        return StoreUnavailableError()
 
 
 def _parsed(url: str) -> URL:
@@ -330,11 +365,6 @@ def _identity(path: str | None) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _unavailable(error: Exception) -> StoreUnavailableError:
-    cause = getattr(error, "orig", None) or error
-    full = getattr(cause, "sqlite_errorname", None) == "SQLITE_FULL" or getattr(cause, "sqlstate", None) == _DISK_FULL
-    fields = {"reason": str(cause).strip()[:300]}
-    logging.getLogger(LOGGER_NAME).warning(
-        "database full" if full else "database unavailable", extra={"fields": fields}
-    )
-    return StoreFullError() if full else StoreUnavailableError()
+def _tells_damage(error: BaseException | None) -> bool:
+    """Return True for an error of SQLite about the file itself."""
+    return (getattr(error, "sqlite_errorname", None) or "").startswith(_DAMAGED)

@@ -40,7 +40,7 @@ class SessionRecord:
         photographs: number of photographs so far.
         state: state of the filter; None before the first photograph.
         pose: pose of the last photograph as JSON; None before the first.
-        claim: token of the claim, for `finish` and `release`; empty without one.
+        claim: token of the claim, for `finish` and `release`; without one, token of the request that was answered last.
     """
 
     id: str
@@ -118,13 +118,17 @@ class Sessions:
         with self._database.reading() as connection:
             return _record(self._find(connection, tenant, session_id))
 
-    def claim(self, tenant: str, session_id: str, number: int | None) -> SessionRecord:
+    def claim(self, tenant: str, session_id: str, number: int | None, token: str) -> SessionRecord:
         """Claim a session for its next photograph; the caller then calls `finish` or `release`.
 
         Args:
             tenant: owner of the session.
             session_id: its id.
             number: number of the photograph, from 1; None for the next one.
+            token: token of the request, the same for all attempts.
+
+        Returns:
+            The session; with `token` as its claim if the request was the last one to be answered, and nothing is to do.
 
         Raises:
             UnknownSessionError: no such session, or it has expired.
@@ -138,7 +142,10 @@ class Sessions:
             "claimed_until_s": self._database.now_s() + self._claim_s,
             "claim_s": self._claim_s,
         }
+        answered = select(SESSIONS).where(*own, free, _COLUMNS.claim == token).with_for_update()
         with self._database.writing() as connection:
+            if (row := connection.execute(answered).one_or_none()) is not None:
+                return _record(row)
             taken = connection.execute(update(SESSIONS).where(*own, free).values(**values).returning(SESSIONS))
             row = taken.one_or_none()
             if row is None:
@@ -149,8 +156,8 @@ class Sessions:
                 raise PhotographOutOfOrderError(session_id, number, row.photographs + 1)
             return _record(row)
 
-    def finish(self, record: SessionRecord, state: bytes, pose: str, *, ttl_s: float) -> SessionRecord:
-        """Store the state after a photograph, and end the claim.
+    def finish(self, record: SessionRecord, token: str, state: bytes, pose: str, *, ttl_s: float) -> SessionRecord:
+        """Store the state after the photograph of the request with a token, and end the claim.
 
         Raises:
             SessionOutdatedError: the claim has expired, and another photograph took its place.
@@ -170,7 +177,7 @@ class Sessions:
                 "pose": pose,
                 "photographs": record.photographs + 1,
                 "expires_at": datetime.now(UTC) + timedelta(seconds=ttl_s),
-                "claim": "",
+                "claim": token,
                 "claimed_until_s": 0.0,
                 "stored_bytes": size,
             }

@@ -19,7 +19,7 @@ from lalaloc_core.errors import ConfigError
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.audit_log import AuditLog
-from service.storage.database import Database
+from service.storage.database import Database, State
 from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.kept_answers import KeptAnswers
 from service.storage.originals import Originals
@@ -119,6 +119,11 @@ class Store:
         self.sessions = Sessions(database, self.quota, claim_s)
         self.tenants = Tenants(database)
         self.tenant_limits = TenantLimits(self.tenants)
+
+    @property
+    def state(self) -> State:
+        """Outcome of the last transaction; the sweeper makes one every `sweep_s`."""
+        return self._database.state
 
     def answered_since(self, moment_s: float) -> bool:
         """Tell whether the database completed a transaction after a moment (`monotonic`)."""

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
+import random
 import shutil
 import sqlite3
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from service.storage import database
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload
+from service.telemetry import LOGGER_NAME
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
 pytestmark = pytest.mark.one_replica
 
@@ -71,3 +77,56 @@ def test_full_disk_is_a_507_and_reads_continue(
         assert_problem(answer, 507, "store-full")
         assert answer.headers["retry-after"] == "60"
         assert client.get(f"/floorplans/{plan_id}").status_code == 200
+
+
+def _truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def _overwrite(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(random.Random(5).randbytes(path.stat().st_size - 4096))
+
+
+def _zero_header(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.write(bytes(4096))
+
+
+@pytest.mark.parametrize("damage", [_truncate, _overwrite, _zero_header])
+def test_file_that_is_damaged_while_the_service_runs_is_store_unavailable(
+    start_app: StartApp,
+    tmp_path: Path,
+    panorama: bytes,
+    damage: Callable[[Path], None],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    # It does not pass its records on to the root logger.
+    logger = logging.getLogger(LOGGER_NAME)
+    with start_app(tmp_path, sweep_s=0.2) as client, ExitStack() as stack:
+        logger.addHandler(caplog.handler)
+        stack.callback(logger.removeHandler, caplog.handler)
+        plan_id = upload(client)
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert client.get("/readyz").json()["database"] == "answers"
+        assert "lalaloc_database_up 1.0" in client.get("/metrics").text
+        path = _sqlite(tmp_path)
+        with sqlite3.connect(path) as raw:
+            raw.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        raw.close()
+        damage(path)
+        wait_for(lambda: client.post("/floorplans", json=FLAT).status_code != 201)
+        problem = assert_problem(client.post("/floorplans", json=FLAT), 503, "store-unavailable")
+        assert "restore a backup" in problem["detail"]
+        wait_for(lambda: client.get("/readyz").json()["database"] == "damaged")
+        for _ in range(3):
+            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        for url in ("/floorplans", "/usage", "/venues"):
+            assert client.get(url).status_code in (200, 503)
+        assert client.get("/readyz").status_code == 200
+        assert "lalaloc_database_up 0.0" in client.get("/metrics").text
+    logged = [record for record in caplog.records if record.getMessage() == "the database file is damaged"]
+    assert len(logged) == 1
+    assert "restore" in getattr(logged[0], "fields")["remedy"]  # noqa: B009
+    assert not [record for record in caplog.records if record.exc_info]

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import random
+import shutil
 import signal
 import struct
 import threading
@@ -24,6 +25,7 @@ from lalaloc_core.localise.encode.features import MAX_BYTES, FeatureEncoder, rea
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import Photograph, open_photograph
+from service.routes import model_files
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp, assert_problem, upload, wait_for
 from tests.service.test_oscp import ANCHOR, NORTH_DEG, oscp_request
@@ -315,3 +317,59 @@ def _check_absent(mark: bytes, folder: Path, traces: list[bytes]) -> None:
     forms += [base64.b64encode(mark[skip : skip + 24]) for skip in range(3)]
     for name, content in [*((str(path), path.read_bytes()) for path in files), *(("trace", trace) for trace in traces)]:
         assert not any(form in content for form in forms), name
+
+
+@pytest.fixture
+def own_bundle(tmp_path: Path) -> Path:
+    folder = tmp_path / "bundle"
+    shutil.copytree(default_bundle(), folder)
+    return folder
+
+
+def test_range_of_a_file_of_the_model_resumes_it(client: httpx.Client) -> None:
+    url = "/model/view_encoder.onnx"
+    whole = client.get(url)
+    size, etag = len(whole.content), whole.headers["etag"]
+    assert whole.headers["accept-ranges"] == "bytes"
+
+    def ranged(text: str, **headers: str) -> httpx.Response:
+        return client.get(url, headers={"Range": text, **headers})
+
+    for text, first, last in (
+        (f"bytes={size - 1000}-", size - 1000, size - 1),
+        ("bytes=5-9", 5, 9),
+        ("bytes=-7", size - 7, size - 1),
+        (f"bytes=5-{10 * size}", 5, size - 1),
+    ):
+        part = ranged(text, **{"If-Range": etag})
+        assert (part.status_code, part.content) == (206, whole.content[first : last + 1])
+        assert part.headers["content-range"] == f"bytes {first}-{last}/{size}"
+    for text in ("bytes=9-5", "bytes=-", "lines=1-2", "bytes=0-1,4-5"):
+        assert ranged(text).status_code == 200
+    assert ranged("bytes=5-9", **{"If-Range": '"other"'}).content == whole.content
+    beyond = ranged(f"bytes={size}-")
+    assert_problem(beyond, 416, "range-not-satisfiable")
+    assert beyond.headers["content-range"] == f"bytes */{size}"
+    assert ranged("bytes=-0").status_code == 416
+
+
+def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path, own_bundle: Path) -> None:
+    with start_app(tmp_path, bundle=own_bundle, request_deadline_s=90.0) as client:
+        path = own_bundle / "view_encoder.onnx"
+        os.truncate(path, path.stat().st_size // 2)
+        problem = assert_problem(client.get("/model/view_encoder.onnx"), 503, "model-file-changed")
+        assert "view_encoder.onnx" in problem["detail"]
+        assert str(tmp_path) not in problem["detail"]
+        path.unlink()
+        assert_problem(client.get("/model/view_encoder.onnx"), 503, "model-file-changed")
+
+
+def test_file_of_the_model_that_ends_too_soon_closes_the_connection(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = model_files._read
+    monkeypatch.setattr(
+        model_files, "_read", lambda opened, position, size: read(opened, position, size)[: 2**20 - position]
+    )
+    with pytest.raises(httpx.RemoteProtocolError):
+        client.get("/model/view_encoder.onnx", timeout=20.0)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 import psutil
@@ -333,3 +334,18 @@ class TestProcess:
             with socket.create_connection(("127.0.0.1", service.port), timeout=20.0) as plain:
                 plain.sendall(f"GET /sessions/{'0' * 32}/stream HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
                 assert plain.recv(4096).startswith(b"HTTP/1.1 404 ")
+
+
+@pytest.mark.parametrize("session_id", ["\u00e9", "%C3%A9", "%00", "a b", "%F0%9F%98%80"])
+def test_session_of_any_name_is_unknown(client: httpx.Client, session_id: str) -> None:
+    problem = refusal(client, quote(session_id, safe="%")).json()
+    assert (problem["status"], problem["type"]) == (404, "urn:lalaloc:problem:unknown-session")
+
+
+@pytest.mark.parametrize("size", ["9" * 4300, "9" * 5000, "-1", "1e3", "1e999", "true", str(2**60)])
+def test_size_that_is_none_ends_the_connection(client: httpx.Client, plan_id: str, size: str) -> None:
+    with stream(client, begin(client, plan_id)) as connection:
+        connection.send(f'{{"bytes": {size}}}')
+        code, reason = closing(connection)
+    assert code == 1003
+    assert "send" in reason

@@ -12,8 +12,12 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import update
 
+from service.errors import StoreUnavailableError
+from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.store import Store
+from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
 
@@ -202,7 +206,7 @@ def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: Datab
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
         store = Store(database_of(tmp_path), claim_s=2.0)
-        store.sessions.claim("default", session_id, None)
+        store.sessions.claim("default", session_id, None, "0" * 32)
         picture = encode_picture(512, 256, "JPEG")
         busy = send(client, session_id, picture)
         assert_problem(busy, 409, "session-busy")
@@ -296,13 +300,13 @@ def test_session_of_an_earlier_version_goes_on(
         session_id = begin(client, upload(client))
         before = send(client, session_id, panorama).json()
         store = Store(database_of(tmp_path))
-        record = store.sessions.claim("default", session_id, None)
+        record = store.sessions.claim("default", session_id, None, "0" * 32)
         assert record.state is not None
         assert record.pose is not None
         pose = json.loads(record.pose)
         for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
             del place["floorplan_id"], place["level"]
-        store.sessions.finish(record, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
+        store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
         store.close()
         after = send(client, session_id, panorama, forward_m=0, turn_deg=0)
         assert after.status_code == 200, after.text
@@ -338,3 +342,52 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
         assert max(stored[200:]) < max(stored[:200]) + 2000
         assert max(answers[200:]) < max(answers[:200]) + 2000
         assert max(stored) < 200_000
+
+
+def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    session_id = begin(client, plan_id)
+
+    def keyed(key: str, picture: bytes = panorama, **fields: str) -> httpx.Response:
+        url, files = f"/sessions/{session_id}/photographs", {"photo": ("p.jpg", picture, "image/jpeg")}
+        return client.post(url, data=fields, files=files, headers={"Idempotency-Key": key})
+
+    first, again = keyed("first"), keyed("first")
+    assert first.status_code == again.status_code == 200, first.text
+    assert again.json() == first.json()
+    assert "idempotency-replayed" not in first.headers
+    assert again.headers["idempotency-replayed"] == "true"
+    assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
+    assert_problem(keyed("first", number="1"), 422, "idempotency-key-reused")
+    assert keyed("second").json()["photographs"] == 2
+    # A broken picture gets the same answer again.
+    for _ in range(2):
+        assert keyed("third", b"broken").status_code == 422
+    assert keyed("fourth", number="3").json()["photographs"] == 3
+
+
+@pytest.mark.one_replica
+def test_request_whose_answer_was_not_kept_moves_the_camera_once(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_arguments: object) -> None:
+        raise StoreUnavailableError()
+
+    with start_app(tmp_path) as client:
+        session_id = begin(client, upload(client))
+
+        def photograph() -> httpx.Response:
+            files = {"photo": ("p.jpg", panorama, "image/jpeg")}
+            return client.post(f"/sessions/{session_id}/photographs", files=files, headers={"Idempotency-Key": "key"})
+
+        with monkeypatch.context() as patch:
+            patch.setattr(IdempotencyKeys, "finish", fail)
+            first = photograph()
+        assert first.status_code == 200
+        assert_problem(photograph(), 409, "idempotency-in-progress")
+        store = Store(database_of(tmp_path))
+        with store._database.writing() as connection:
+            connection.execute(update(IDEMPOTENCY).values(lease_until_s=0.0))
+        store.close()
+        assert photograph().json() == first.json()
+        assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
+        assert send(client, session_id, panorama).json()["photographs"] == 2

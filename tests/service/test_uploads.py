@@ -118,3 +118,10 @@ def test_body_without_a_length_stops_at_the_limit(
         response = client.post(path, content=endless(), headers={"content-type": media})
         problem = assert_problem(response, 413, "upload-too-large")
         assert f"the limit is 100000 bytes (LALALOC_{name.upper()})" in problem["detail"]
+
+
+def test_boundary_that_occurs_in_a_part_is_refused(client: httpx.Client) -> None:
+    body = b'--B\r\nContent-Disposition: form-data; name="photo"; filename="f"\r\n\r\n' + 200_000 * b"\r\n--BX"
+    headers = {"Content-Type": "multipart/form-data; boundary=B"}
+    problem = assert_problem(client.post("/localise", content=body, headers=headers), 400, "malformed-request")
+    assert "the boundary occurs more than 40 times" in problem["detail"]
