@@ -235,14 +235,17 @@ def _read_opening(raw: Any, where: str, room_ids: set[str], limits: PlanLimits) 
 
 def read_camera_height(value: Any, rooms: Sequence[Room], limits: PlanLimits) -> float:
     """Read the camera height (m), which must be below every ceiling."""
-    lowest_ceiling_m = min(room.ceiling_height_m for room in rooms)
+    lowest = min(rooms, key=lambda room: room.ceiling_height_m)
     height_m = read_number(DEFAULT_CAMERA_HEIGHT_M if value is None else value, "camera_height_m", above=0.0)
     if height_m < limits.min_camera_height_m:
         raise InvalidFloorPlanError(
             f"camera_height_m is {height_m:g} m; it must be at least {limits.min_camera_height_m:g} m"
         )
-    if height_m >= lowest_ceiling_m:
+    if height_m >= lowest.ceiling_height_m:
+        source = " (the default)" if value is None else ""
         raise InvalidFloorPlanError(
-            f"camera_height_m is {height_m:g} m; it must be below the lowest ceiling ({lowest_ceiling_m:g} m)"
+            f"camera_height_m is {height_m:g} m{source}; it must be below the lowest ceiling, "
+            f"{lowest.ceiling_height_m:g} m of room '{lowest.name}'; correct its ceiling_height_m, remove the room, or "
+            "set camera_height_m"
         )
     return height_m

@@ -106,7 +106,7 @@ def ifc_house() -> _Model:
 def test_levels_without_a_room_are_left_out():
     plans = import_plans(ifc_house().content(), building="Haus")
     assert [plan.plan().name for plan in plans] == ["Haus – EG", "Haus – Obergeschoss"]
-    assert "level 'Dach' has no room and was left out" in plans[0].report.notes
+    assert any(line.startswith("level 'Dach' was left out: ") for line in plans[0].report.warnings)
 
 
 def test_ifc_elements_give_rooms_openings_and_holes():
@@ -207,3 +207,34 @@ def test_nested_mapped_items_are_refused():
     assert len(content) < 10_000
     with pytest.raises(InvalidFloorPlanError, match="IfcSpace '' has more than 300000 entities"):
         import_plan(content)
+
+
+def test_parts_of_a_high_curtain_wall_belong_to_the_storey_at_their_height():
+    model = ifc_house()
+    wall = model.file.create_entity("IfcCurtainWall", ifcopenshell.guid.new())
+    windows = [
+        model.prism("IfcWindow", _box(1000, -100, 2500, 0), low, 1500, Name=name)
+        for low, name in ((900, "below"), (3900, "above"))
+    ]
+    model.file.create_entity("IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=wall, RelatedObjects=windows)
+    ground, upper = import_plans(model.content())
+    assert [opening.get("name") for opening in ground.document["openings"] if opening["kind"] == "window"] == [
+        None,
+        "below",
+    ]
+    assert [opening["name"] for opening in upper.document["openings"]] == ["above"]
+
+
+def test_crawl_spaces_are_left_out_and_named():
+    model = ifc_flat()
+    model.spaces(model.prism("IfcSpace", _box(0, 3100, 4000, 5000), 0, 800, LongName="Kriechkeller"))
+    plan = import_plan(model.content())
+    assert [room["name"] for room in plan.document["rooms"]] == ["Küche", "Wohnen"]
+    assert any("room 'Kriechkeller' (7.6 m²" in line and "0.80 m high" in line for line in plan.report.warnings)
+
+
+def test_building_of_low_spaces_alone_is_refused():
+    model = _Model()
+    model.spaces(model.prism("IfcSpace", _box(0, 0, 4000, 5000), 0, 1300, LongName="Eaves"))
+    with pytest.raises(InvalidFloorPlanError, match=r"no room is higher than a camera, 1.5 m: room 'Eaves'"):
+        import_plan(model.content())

@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import ImportLimits
 from lalaloc_core.importers.common.import_options import ImportOptions
@@ -86,6 +87,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
             + (f" (tried: {'; '.join(builder.notes[:_MAX_NAMED])})" if builder.notes else "")
             + "; check layers, level and the scale"
         )
+    rooms = _without_low_rooms(rooms, builder)
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shift_opening(opening, shift) for opening in sketch.openings]
     placed = place_openings(openings, [room.shape for room in rooms])
@@ -152,8 +154,10 @@ def assemble_levels(
             raise InvalidFloorPlanError(f"level '{level.name}': {error}") from error
     if not plans:
         raise next(iter(empty.values()))
-    notes = tuple(f"level '{name}' has no room and was left out" for name in list(empty)[:_MAX_NAMED])
-    return tuple(replace(plan, report=replace(plan.report, notes=(*plan.report.notes, *notes))) for plan in plans)
+    left_out = tuple(f"level '{name}' was left out: {reason}" for name, reason in list(empty.items())[:_MAX_NAMED])
+    return tuple(
+        replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *left_out))) for plan in plans
+    )
 
 
 def clean_name(name: str | None) -> str | None:
@@ -167,7 +171,7 @@ def clean_name(name: str | None) -> str | None:
 def _clean(
     room: SketchedRoom, obstacles: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder
 ) -> list[SketchedRoom]:
-    label = f"room '{room.name}'" if room.name else "a room without a name"
+    label = _label(room)
     shape = room.shape
     for obstacle in obstacles.geometries[np.sort(obstacles.query(shape))]:
         if obstacle.intersects(shape):
@@ -195,6 +199,36 @@ def _clean(
         kind = room.type or room_type_from_name(name)
         cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
     return cleaned
+
+
+def _without_low_rooms(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
+    """Leave out rooms that no camera stands in, such as a cupboard under stairs, and say so.
+
+    Raises:
+        NoRoomError: all rooms are as low.
+    """
+    low = [room for room in rooms if (room.ceiling_height_m or math.inf) <= DEFAULT_CAMERA_HEIGHT_M]
+    total_m2 = sum(room.shape.area for room in rooms)
+    lines = [
+        f"{_label(room)} ({room.shape.area:.1f} m², {100.0 * room.shape.area / total_m2:.0f} % of the floor) is "
+        f"{room.ceiling_height_m:.2f} m high"
+        for room in low
+    ]
+    if low and len(low) == len(rooms):
+        raise NoRoomError(
+            f"no room is higher than a camera, {DEFAULT_CAMERA_HEIGHT_M:g} m: {'; '.join(lines[:_MAX_NAMED])}; correct "
+            "the heights in the file if the rooms are higher"
+        )
+    builder.warnings += [
+        f"{line} and was left out: a camera stands at {DEFAULT_CAMERA_HEIGHT_M:g} m; correct the height in the file if "
+        "the room is higher"
+        for line in lines
+    ]
+    return [room for room in rooms if room not in low]
+
+
+def _label(room: SketchedRoom) -> str:
+    return f"room '{room.name}'" if room.name else "a room without a name"
 
 
 def _simplify(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: ReportBuilder) -> BaseGeometry:

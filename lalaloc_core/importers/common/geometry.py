@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
 
@@ -104,3 +104,12 @@ class MapFrame:
         rows, columns = self.size
         x, y = np.arange(columns), np.full(columns, rows - 1 - row)
         return self.to_map((np.column_stack([x, y]) + 0.5) * self.resolution_m)
+
+    def cells_at(self, points_m: Float[np.ndarray, "n 2"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Return rows from the top and columns of the cells at points of the map frame, the nearest for others."""
+        x, y, yaw = self.origin
+        c, s = math.cos(yaw), math.sin(yaw)
+        along = (points_m - np.array([x, y])) @ np.array([[c, -s], [s, c]]) / self.resolution_m
+        rows, columns = self.size
+        column, row = np.floor(along).astype(int).T
+        return np.clip(rows - 1 - row, 0, rows - 1), np.clip(column, 0, columns - 1)

@@ -17,6 +17,8 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]
 T = TypeVar("T")
+# Heights of rooms that are believed (m). No camera stands in the lowest of them: `assemble` leaves these out.
+ROOM_HEIGHT_M = (0.5, 20.0)
 _MAX_NAMED_LEVELS = 12
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 

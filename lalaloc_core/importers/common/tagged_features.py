@@ -17,7 +17,6 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
@@ -25,7 +24,15 @@ from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, Import
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.map_projection import projection
 from lalaloc_core.importers.common.opening_placement import WallLines
-from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import (
+    ROOM_HEIGHT_M,
+    Level,
+    OpeningKind,
+    Point,
+    Sketch,
+    SketchedOpening,
+    SketchedRoom,
+)
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
 
 _FEATURE_TYPES: Mapping[str, Role] = {
@@ -246,7 +253,7 @@ class _Drawer:
         name = _name(properties)
         kind = _room_type(properties, name)
         ceiling_m = _number(properties, "ceiling_height_m", "ceiling_height", "height")
-        lowest_m, highest_m = DEFAULT_LIMITS.min_ceiling_height_m, DEFAULT_LIMITS.max_ceiling_height_m
+        lowest_m, highest_m = ROOM_HEIGHT_M
         if ceiling_m is not None and not lowest_m <= ceiling_m <= highest_m:
             self._builder.warnings.append(
                 f"the height of '{name}' is {ceiling_m:g} m and was ignored; it must be between {lowest_m:g} and "

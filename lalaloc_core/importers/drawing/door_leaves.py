@@ -33,17 +33,18 @@ class Leaves:
     swings: list[Swing]
 
 
-def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing]) -> Leaves:
+def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing], areas: Sequence[Area] = ()) -> Leaves:
     """Separate door leaves and their arcs from the lines that could be walls, in metres.
 
-    A leaf is a line as long as a door is wide with one free end, whose other end is the hinge: it is slanted against
-    most lines, or an arc turns about its hinge.
+    A leaf is a line as long as a door is wide with one free end, whose other end is the hinge, at a line or a wall that
+    is drawn as an area: it is slanted against most lines, or an arc turns about its hinge.
     """
     arcs = {index: arc for index, stroke in enumerate(strokes) if (arc := _arc(stroke)) is not None}
     others = [stroke for index, stroke in enumerate(strokes) if index not in arcs]
     turning = [*swings, *arcs.values()]
-    tree = shapely.STRtree([stroke.line for stroke in others])
-    axis = _axis(others)
+    walls = [area.shape for area in areas if area.is_dark or area.role == "wall"]
+    tree = shapely.STRtree([*(stroke.line for stroke in others), *walls])
+    axis = _axis([*(stroke.line for stroke in others), *(wall.exterior for wall in walls)])
     kept, leaves = [], list(arcs.values())
     for index, stroke in enumerate(others):
         leaf = _leaf(stroke, index, tree, axis, turning)
@@ -92,9 +93,9 @@ def _arc(stroke: Stroke) -> Swing | None:
     return swing if swing is not None and LEAF_M[0] <= swing.radius <= LEAF_M[1] else None
 
 
-def _axis(strokes: Sequence[Stroke]) -> float:
+def _axis(lines: Sequence[shapely.LineString]) -> float:
     """Return the direction (radians, modulo a quarter turn) of most lines."""
-    steps = [np.subtract(b, a) for stroke in strokes for a, b in pairwise(shapely.get_coordinates(stroke.line))]
+    steps = [np.subtract(b, a) for line in lines for a, b in pairwise(shapely.get_coordinates(line))]
     if not steps:
         return 0.0
     x, y = np.array(steps).T

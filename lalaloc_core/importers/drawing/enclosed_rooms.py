@@ -22,6 +22,9 @@ from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geome
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
 # Largest offset between two jambs (m).
 _OUT_OF_LINE_M = 0.35
+# Share of the lines' length without a second face from which walls can be single lines, and smallest room that counts
+# in a comparison of readings (m²).
+_MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,7 @@ class Gap:
         start, end: middle line along the wall.
         is_sure: the walls alone identify an opening. False if a jamb is a short nib or the jambs are not in line.
         is_between_ends: both sides are ends of walls, not an end and the face of another wall.
+        is_painted, is_bluish: a light area hides the wall here, and has the colour of glass.
     """
 
     shape: shapely.Polygon
@@ -66,6 +70,8 @@ class Gap:
     end: tuple[float, float]
     is_sure: bool = True
     is_between_ends: bool = False
+    is_painted: bool = False
+    is_bluish: bool = False
 
     @property
     def width(self) -> float:
@@ -106,11 +112,27 @@ def enclose(
     solid = shapely.unary_union([*bodies, *thin]) if bodies or thin else shapely.Polygon()
     if solid.area < 0.05:
         return _from_single_lines(lines, closers, config, check_time)
-    unpaired = [line for line in loose if not solid.buffer(0.02).covers(line) and line.length >= config.nib]
+    around = solid.buffer(0.02)
+    shapely.prepare(around)
+    unpaired = [line for line in loose if not around.covers(line) and line.length >= config.nib]
     blocked = shapely.unary_union([solid, *closers, *(line.buffer(0.01, cap_style="flat") for line in unpaired)])
     check_time()
     gaps = find_gaps(blocked, config, check_time, rank)
-    return Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config), gaps, solid)
+    paired = Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config), gaps, solid)
+    # Pillars, stairs or one thick wall beside single lines are no reason to look for the other face of every line.
+    drawn_m = sum(line.length for line in lines)
+    if bodies or sum(line.length for line in lines if not around.covers(line)) < _MOSTLY_SINGLE * drawn_m:
+        return paired
+    single = _from_single_lines(lines, closers, config, check_time)
+    return max(paired, single, key=lambda found: explained(found.rooms))
+
+
+def explained(rooms: Sequence[shapely.Polygon]) -> float:
+    """Return how much of a drawing rooms explain: a sum of the roots of their areas, so that two count more than one.
+
+    Rooms too small for a person count nothing.
+    """
+    return sum((math.sqrt(room.area) for room in rooms if room.area >= _SMALLEST_COUNTED_M2), 0.0)
 
 
 def find_gaps(

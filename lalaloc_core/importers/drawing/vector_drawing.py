@@ -18,6 +18,8 @@ from lalaloc_core.importers.common.vocabulary import Role
 
 # Fills of lower luminance (of 255) can be walls.
 _DARK = 110.0
+# Glass is bluer than red by this.
+_BLUER = 20.0
 # Straight pieces per curve.
 CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
@@ -34,6 +36,8 @@ class Area:
         role: role by the name of the layer.
         kind: words about the use of a room, such as the class of an SVG element.
         is_dark: dark enough to be a wall; None if the drawing has no fills.
+        width: width of the pen that draws the outline, 0 if unknown.
+        order: place in the order of painting.
     """
 
     shape: shapely.Polygon
@@ -42,16 +46,28 @@ class Area:
     name: str | None = None
     kind: str | None = None
     is_dark: bool | None = None
+    width: float = 0.0
+    order: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """Polyline with the width of its pen, 0 if unknown."""
+    """Polyline with the width of its pen, 0 if unknown, and its place in the order of painting."""
 
     line: shapely.LineString
     layer: str
     role: Role | None = None
     width: float = 0.0
+    order: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Opaque light area, which hides the walls that were painted before it; glass is `bluish`."""
+
+    shape: shapely.Polygon
+    order: int
+    is_bluish: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,6 +103,12 @@ class Drawing:
     strokes: list[Stroke] = field(default_factory=list)
     swings: list[Swing] = field(default_factory=list)
     letterings: list[Lettering] = field(default_factory=list)
+    patches: list[Patch] = field(default_factory=list)
+
+    @property
+    def next_order(self) -> int:
+        """Place of the next shape in the order of painting."""
+        return len(self.areas) + len(self.strokes) + len(self.patches)
 
     @property
     def shapes(self) -> list[BaseGeometry]:
@@ -110,10 +132,11 @@ class Drawing:
             return shapely.transform(geometry, lambda points: points * factors)
 
         return Drawing(
-            [replace(area, shape=shape(area.shape)) for area in self.areas],
+            [replace(area, shape=shape(area.shape), width=area.width * factor) for area in self.areas],
             [replace(s, line=shape(s.line), width=s.width * factor) for s in self.strokes],
             [replace(s, hinge=point(s.hinge), first=point(s.first), last=point(s.last)) for s in self.swings],
             [replace(t, position=point(t.position), height=t.height * factor) for t in self.letterings],
+            [replace(patch, shape=shape(patch.shape)) for patch in self.patches],
         )
 
 
@@ -145,3 +168,8 @@ def fit_swing(
 def is_dark(red: float, green: float, blue: float) -> bool:
     """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
     return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK
+
+
+def is_bluish(red: float, green: float, blue: float) -> bool:
+    """Return whether a fill is the colour of glass in drawings, by its channels, 0 to 255."""
+    return blue > red + _BLUER

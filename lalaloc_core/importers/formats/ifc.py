@@ -6,7 +6,9 @@ ifcopenshell (extra `ifc`) reads the model and computes its geometry in metres.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -18,24 +20,29 @@ from pyproj.exceptions import ProjError
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
+from lalaloc_core.importers.common.floors import find_floor, join_faces, report_floor
+from lalaloc_core.importers.common.geometry import opening_line
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import (
+    ROOM_HEIGHT_M,
+    Level,
+    OpeningKind,
+    Sketch,
+    SketchedOpening,
+    SketchedRoom,
+)
 from lalaloc_core.importers.common.vocabulary import role_from_name
 
-# Faces up to this height above the lowest point of a space are its floor.
-_FLOOR_M = 0.05
-_HEIGHT_M = (1.0, 20.0)
-# Rounding gaps between the triangles of a space that are closed.
-_SEAM_M = 1e-4
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
 # End of a complete file; some tools append white space or comments.
 _END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
+# Heights of storeys nearer than this are of one storey (m).
+_SAME_STOREY_M = 1.5
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
 
 
@@ -56,6 +63,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
     anchor = _anchor(model)
     meshes = _Meshes(budget)
+    elements = _elements(model, storeys, meshes)
 
     def make(level: Level, content: tuple[Any, list[Any]]) -> ImportedPlan:
         storey, spaces = content
@@ -63,7 +71,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
         floor_m = _add_spaces(spaces, sketch, builder, meshes)
-        _add_elements(storey, floor_m, sketch, builder, meshes)
+        _add_elements(elements.by_storey[str(storey.id())], floor_m, sketch, builder, meshes)
+        for name, count in elements.lost.items():
+            builder.use(name, "ignored (not in a storey with spaces)", count)
         if not sketch.rooms:
             raise NoRoomError(
                 f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
@@ -140,45 +150,117 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
     floors = []
     for space in spaces:
         mesh = meshes.of(space)
+        name = str(space.LongName or space.Name or "")
         if mesh is None:
             builder.use("IfcSpace", "ignored (no geometry)")
+            builder.warnings.append(f"space '{name}' ({space.GlobalId}) has no geometry and was left out")
             continue
         vertices, triangles = mesh
         low, high = float(vertices[:, 2].min()), float(vertices[:, 2].max())
-        parts = _footprint(vertices, triangles, low)
-        name = str(space.LongName or space.Name or "")
+        floor = find_floor(vertices[triangles], meshes.check_time)
+        parts = floor.parts if floor is not None else _projection(vertices, triangles)
         if role_from_name(name) == "obstacle":
             sketch.obstacles += parts
             builder.use("IfcSpace", "holes (shafts)")
             continue
         height = high - low
-        ceiling = height if _HEIGHT_M[0] <= height <= _HEIGHT_M[1] else None
+        ceiling = height if ROOM_HEIGHT_M[0] <= height <= ROOM_HEIGHT_M[1] else None
         if ceiling is None:
             builder.warnings.append(
-                f"space '{name}' is {height:.2f} m high, outside {_HEIGHT_M[0]:g} to {_HEIGHT_M[1]:g} m; "
+                f"space '{name}' is {height:.2f} m high, outside {ROOM_HEIGHT_M[0]:g} to {ROOM_HEIGHT_M[1]:g} m; "
                 "the usual ceiling height is used"
             )
+        if floor is not None:
+            report_floor(f"space '{name}'", floor, builder)
         sketch.rooms += [SketchedRoom(part, name or None, None, ceiling) for part in parts]
         floors.append(low)
         builder.use("IfcSpace", "rooms")
     return float(np.median(floors)) if floors else 0.0
 
 
-def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes) -> None:
+@dataclass(frozen=True)
+class _Elements:
+    """Doors, windows and columns by the id of their storey, and the number of those of no storey by their kind."""
+
+    by_storey: dict[str, list[Any]]
+    lost: Counter[str] = field(default_factory=Counter)
+
+
+def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Meshes) -> _Elements:
+    """Return the doors, windows and columns of the storeys with spaces.
+
+    An element belongs to the storey that contains it or its space. Parts of curtain walls, elements that only fill an
+    opening, and elements of storeys without spaces belong to the storey at their height.
+    """
+    unit = _unit(model)
+    heights = sorted(
+        (_elevation_m(storey, unit), str(storey.id()) in storeys, str(storey.id()))
+        for storey in model.by_type("IfcBuildingStorey")
+    )
+    found = _Elements({key: [] for key in storeys})
+    for name in (*_KINDS, "IfcColumn"):
+        for element in model.by_type(name):
+            key = _container(element)
+            if key not in storeys:
+                key = _storey_at(_shape(element, meshes), heights)
+            if key is None:
+                found.lost[name] += 1
+            else:
+                found.by_storey[key].append(element)
+    return found
+
+
+def _container(element: Any) -> str | None:
+    """Return the id of the storey that contains an element, also in a space; None if nothing contains it."""
+    for relation in getattr(element, "ContainedInStructure", None) or ():
+        place = relation.RelatingStructure
+        storey = place if place.is_a("IfcBuildingStorey") else _storey_of(place)
+        if storey is not None:
+            return str(storey.id())
+    return None
+
+
+def _storey_at(mesh: tuple[Float[np.ndarray, "n 3"], Any] | None, heights: list[tuple[float, bool, str]]) -> str | None:
+    """Return the id of the storey that a shape stands in; None without a shape, or if that storey has no spaces."""
+    if mesh is None:
+        return None
+    middle_m = float(np.mean([mesh[0][:, 2].min(), mesh[0][:, 2].max()]))
+    below = [(height, has_spaces, key) for height, has_spaces, key in heights if height <= middle_m]
+    with_spaces = [(height, key) for height, has_spaces, key in below if has_spaces]
+    # Files can have a storey for rooms and one for structure, with slightly different heights.
+    if not with_spaces or below[-1][0] - with_spaces[-1][0] > _SAME_STOREY_M:
+        return None
+    return with_spaces[-1][1]
+
+
+def _elevation_m(storey: Any, unit: float) -> float:
+    from ifcopenshell.util.placement import get_local_placement
+
+    if storey.ObjectPlacement is not None:
+        return float(np.asarray(get_local_placement(storey.ObjectPlacement))[2, 3]) * unit
+    return float(storey.Elevation or 0.0) * unit
+
+
+def _add_elements(
+    elements: Iterable[Any], floor_m: float, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes
+) -> None:
     """Add the doors, windows and columns of a storey."""
-    for relation in getattr(storey, "ContainsElements", None) or ():
-        for element in relation.RelatedElements:
-            kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
-            if kind is not None:
-                opening = _opening(element, kind, floor_m, meshes)  # type: ignore[arg-type]
-                builder.use(element.is_a(), kind if opening is not None else "ignored (no geometry)")
-                if opening is not None:
-                    sketch.openings.append(opening)
-            elif element.is_a("IfcColumn"):
-                mesh = meshes.of(element)
-                builder.use("IfcColumn", "holes" if mesh is not None else "ignored (no geometry)")
-                if mesh is not None:
-                    sketch.obstacles += _projection(*mesh)
+    for element in elements:
+        mesh = _shape(element, meshes)
+        kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
+        opening = None if mesh is None or kind is None else _opening(element, kind, mesh[0], floor_m)  # type: ignore[arg-type]
+        if opening is not None:
+            sketch.openings.append(opening)
+        elif kind is None and mesh is not None:
+            sketch.obstacles += _projection(*mesh)
+        else:
+            builder.use(element.is_a(), "ignored (no geometry)")
+            builder.warnings.append(
+                f"{element.is_a()} '{str(element.Tag or element.Name or '')[:50]}' ({element.GlobalId}) has no "
+                "geometry and was left out"
+            )
+            continue
+        builder.use(element.is_a(), kind or "holes")
 
 
 def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
@@ -199,13 +281,16 @@ def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
                     builder.use("IfcSpace", "passages between touching spaces")
 
 
-def _opening(element: Any, kind: OpeningKind, floor_m: float, meshes: _Meshes) -> SketchedOpening | None:
-    """Locate a door or window by the void that it fills; without a void, by its own shape."""
+def _shape(element: Any, meshes: _Meshes) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+    """Return the mesh of the void that an element fills; without a void, its own."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
-    mesh = next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
-    if mesh is None:
-        return None
-    vertices, _ = mesh
+    return next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
+
+
+def _opening(
+    element: Any, kind: OpeningKind, vertices: Float[np.ndarray, "n 3"], floor_m: float
+) -> SketchedOpening | None:
+    """Return a door or window with this shape."""
     ends = opening_line(shapely.MultiPoint(vertices[:, :2]).convex_hull)
     if ends is None:
         return None
@@ -224,6 +309,11 @@ class _Meshes:
     def __init__(self, budget: Budget) -> None:
         self._budget = budget
         self._sizes: dict[int, float] = {}
+
+    @property
+    def check_time(self) -> Callable[[], None]:
+        """Function that raises an exception if the time is over."""
+        return self._budget.check_time
 
     def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
         """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
@@ -267,23 +357,12 @@ class _Meshes:
         return self._sizes[key]
 
 
-def _footprint(vertices: Float[np.ndarray, "n 3"], triangles: Any, low: float) -> list[shapely.Polygon]:
-    """Return the floor of a space: its bottom faces, or its whole projection if the bottom is not level."""
-    at_bottom = (vertices[triangles][:, :, 2] <= low + _FLOOR_M).all(axis=1)
-    floor = _projection(vertices, triangles[at_bottom]) if at_bottom.any() else []
-    return floor or _projection(vertices, triangles)
-
-
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:
     """Return the area that triangles cover, seen from above."""
     corners = vertices[triangles][:, :, :2]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
-    if not flat.any():
-        return []
-    seamed = [shapely.Polygon(triangle).buffer(_SEAM_M, join_style="mitre") for triangle in corners[flat]]
-    union = shapely.unary_union(seamed)
-    return polygons_from_geometry(union.buffer(-_SEAM_M, join_style="mitre"))
+    return join_faces([shapely.Polygon(triangle) for triangle in corners[flat]]) if flat.any() else []
 
 
 def _anchor(model: Any) -> Anchor | None:

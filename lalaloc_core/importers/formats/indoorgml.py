@@ -18,32 +18,32 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import opening_line, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.floors import Floor, find_floor, report_floor
+from lalaloc_core.importers.common.geometry import opening_line, point_xy
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.safe_xml import local_name, read_xml
-from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 # Kinds of cells: of the core, and of the module for navigation. Doors can be cells as well.
 _CELLS = {"CellSpace", "NavigableSpace", "GeneralSpace", "TransferSpace", "TransitionSpace"}
 _DOOR_CELLS = {"ConnectionSpace", "AnchorSpace"}
 _BOUNDARIES = {"CellSpaceBoundary", "NavigableBoundary", "TransferBoundary", "ConnectionBoundary", "AnchorBoundary"}
-# Faces up to this height above the lowest point of a solid are its floor; floors farther apart are levels (m).
-_FLOOR_M, _STOREY_M = 0.1, 1.5
-_HEIGHT_M = (1.0, 20.0)
+# Floors farther apart are levels (m), and solids are higher than this.
+_STOREY_M, _FLAT_M = 1.5, 0.1
 _USUAL_DOOR_M = 0.9
+_MAX_NAMED = 5
 _SRS_UNITS = re.compile(r"4326|4979|CRS84", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cell:
-    """Cell with its outline, the height of its floor, and that of its ceiling over it if it has a solid."""
+    """Cell with its floor, and the height of its ceiling over it if it has a solid."""
 
-    shape: BaseGeometry
-    floor: float
+    floor: Floor
     height: float | None
     name: str | None
     kind: str | None
@@ -76,11 +76,13 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
     factor = METRES_PER_UNIT[options.units or "m"]
     elements = list(root.iter())
-    cells = [cell for element in elements for cell in _cells(element, factor, budget)]
+    read_cells = [(element, _cell(element, factor, budget)) for element in elements if local_name(element) in _CELLS]
+    cells = [cell for _, cell in read_cells if cell is not None]
+    without = [_text(element, "name") or _key(element) or "?" for element, cell in read_cells if cell is None]
     if not cells:
         raise InvalidFloorPlanError(
-            "no CellSpace of the IndoorGML file has a geometry; export cells with cellSpaceGeometry (a surface or a "
-            "solid)"
+            "no CellSpace of the IndoorGML file has a geometry with a floor; export cells with cellSpaceGeometry (a "
+            "surface or a solid)"
         )
     doors = list(_doors(elements, factor, budget))
     levels = _levels(cells)
@@ -88,13 +90,19 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     def make(level: Level, members: list[_Cell]) -> ImportedPlan:
         builder = ReportBuilder("indoorgml", factor, "the option units" if options.units else "the format: metres")
         sketch = Sketch(level=level if len(levels) > 1 else None, name=level.name if len(levels) > 1 else None)
+        if without:
+            builder.use("CellSpace", "ignored (no floor)", len(without))
+            named = ", ".join(f"'{name}'" for name in without[:_MAX_NAMED])
+            builder.warnings.append(f"{len(without)} cells have no geometry with a floor and were left out: {named}")
         for cell in members:
             builder.use(cell.kind or "CellSpace", "rooms")
-            height_m = cell.height if cell.height is not None and _HEIGHT_M[0] <= cell.height <= _HEIGHT_M[1] else None
+            is_usual = cell.height is not None and ROOM_HEIGHT_M[0] <= cell.height <= ROOM_HEIGHT_M[1]
+            height_m = cell.height if is_usual else None
             sketch.rooms += [
                 SketchedRoom(part, cell.name, room_type_from_name(cell.name), height_m, cell.key)
-                for part in polygons_from_geometry(cell.shape)
+                for part in cell.floor.parts
             ]
+            report_floor(f"cell '{cell.name or cell.key}'", cell.floor, builder)
         lowest = level.elevation_m or 0.0
         on_level = [door for door in doors if lowest - _STOREY_M < door.low < lowest + _STOREY_M]
         _add_doors(on_level, lowest, sketch, builder, budget)
@@ -104,22 +112,15 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     return assemble_levels(levels, options, budget.limits, make)
 
 
-def _cells(element: Element, factor: float, budget: Budget) -> Iterator[_Cell]:
-    kind = local_name(element)
-    if kind not in _CELLS:
-        return
+def _cell(element: Element, factor: float, budget: Budget) -> _Cell | None:
     rings = [ring * factor for ring in _rings(element, "cellSpaceGeometry", budget)]
-    if not rings:
-        return
-    low = min(float(ring[:, 2].min()) for ring in rings)
+    floor = find_floor(rings, budget.check_time)
+    if floor is None or not floor.parts:
+        return None
     high = max(float(ring[:, 2].max()) for ring in rings)
-    floors = [ring for ring in rings if len(ring) >= 4 and float(ring[:, 2].max()) <= low + _FLOOR_M]
-    shape = shapely.union_all(
-        [part for ring in floors for part in polygons_from_geometry(shapely.Polygon(ring[:, :2]))]
-    )
-    if shape.area > 0.0:
-        height = high - low if high > low + _FLOOR_M else None
-        yield _Cell(shape, low, height, _text(element, "name"), _text(element, "class") or kind, _key(element))
+    height = high - floor.low_m if high > floor.low_m + floor.rise_m + _FLAT_M else None
+    kind = _text(element, "class") or local_name(element)
+    return _Cell(floor, height, _text(element, "name"), kind, _key(element))
 
 
 def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_Door]:
@@ -183,13 +184,13 @@ def _add_doors(doors: list[_Door], floor: float, sketch: Sketch, builder: Report
 def _levels(cells: list[_Cell]) -> Mapping[str, tuple[Level, list[_Cell]]]:
     """Return the cells by storey; the ground floor is the storey nearest to zero."""
     storeys: list[list[_Cell]] = []
-    for cell in sorted(cells, key=lambda cell: cell.floor):
-        if not storeys or cell.floor > storeys[-1][0].floor + _STOREY_M:
+    for cell in sorted(cells, key=lambda cell: cell.floor.low_m):
+        if not storeys or cell.floor.low_m > storeys[-1][0].floor.low_m + _STOREY_M:
             storeys.append([])
         storeys[-1].append(cell)
-    ground = min(range(len(storeys)), key=lambda index: abs(storeys[index][0].floor))
+    ground = min(range(len(storeys)), key=lambda index: abs(storeys[index][0].floor.low_m))
     return {
-        str(index): (Level(f"{index - ground}", float(index - ground), members[0].floor), members)
+        str(index): (Level(f"{index - ground}", float(index - ground), members[0].floor.low_m), members)
         for index, members in enumerate(storeys)
     }
 

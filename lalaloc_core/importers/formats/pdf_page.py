@@ -21,12 +21,16 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     Area,
     Drawing,
     Lettering,
+    Patch,
     Stroke,
     fit_swing,
+    is_bluish,
     is_dark,
 )
 
 _MAX_FORM_DEPTH = 8
+# Opacity (of 255) of fills that can be walls, and of fills that hide what is below them.
+_OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -116,7 +120,8 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return
     is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
-    is_wall = is_filled and _has_dark_fill(item)
+    fill_colour = _fill(item) if is_filled else None
+    is_wall = fill_colour is not None and is_dark(*fill_colour[:3])
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
     pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
@@ -132,10 +137,13 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
         elif len(points) >= 3 and (subpath.is_closed or is_filled):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
-            drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen))
-    if is_filled and not is_wall and not is_stroked:
-        return  # A coloured floor or a white background has no drawn outline.
-    drawing.areas += [Area(part, "", None, is_dark=is_wall) for part in even_odd_polygons(shells)]
+            drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen, drawing.next_order))
+    parts, order = even_odd_polygons(shells), drawing.next_order
+    if fill_colour is not None and not is_wall and fill_colour[3] >= _HIDING:
+        drawing.patches += [Patch(part, order, is_bluish(*fill_colour[:3])) for part in parts]
+    # A coloured floor or a white background has no drawn outline.
+    if is_wall or is_stroked:
+        drawing.areas += [Area(part, "", None, is_dark=is_wall, width=pen, order=order) for part in parts]
 
 
 def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
@@ -183,10 +191,13 @@ def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarra
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _has_dark_fill(item: Any) -> bool:
+def _fill(item: Any) -> tuple[float, float, float, float] | None:
+    """Return the channels and the opacity of a fill, 0 to 255; None for one that shows most of what is below it."""
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
-    is_opaque = pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) and alpha.value >= 60
-    return bool(is_opaque) and is_dark(float(red.value), float(green.value), float(blue.value))
+    is_opaque = pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) and alpha.value >= _OPAQUE
+    if not is_opaque:
+        return None
+    return float(red.value), float(green.value), float(blue.value), float(alpha.value)
 
 
 def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:

@@ -33,8 +33,10 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     Area,
     Drawing,
     Lettering,
+    Patch,
     Stroke,
     fit_swing,
+    is_bluish,
     is_dark,
 )
 
@@ -49,6 +51,8 @@ _AUTOMATIC = re.compile(
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
 _BYTES_PER_ENTITY = 12
+# Fills that are less opaque do not hide what is below them.
+_OPAQUE = 0.9
 # Elements without a shape, and elements that are drawn only where they are used.
 _IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker")
 # Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
@@ -259,10 +263,15 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
-            drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, context.role, float(width or 0.0)))
+            line, order = shapely.LineString(points), drawing.next_order
+            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
+    order = drawing.next_order
     for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall))
+        if fill is not None and is_filled and not is_wall and context.role is None and fill.opacity > _OPAQUE:
+            drawing.patches.append(Patch(shape, order, is_bluish(float(fill.red), float(fill.green), float(fill.blue))))
+        pen = float(width or 0.0)
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, pen, order))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
 
 

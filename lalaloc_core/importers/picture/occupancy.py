@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,11 @@ _FREE_SHARE = 0.5
 _SPECK_M = 0.6
 # Largest turn that aligns the walls with the picture, and the threshold of half a cell.
 _MAX_TURN_DEG, _HALF = 45.0, 127
+# Share of a room's outline that has a seen wall within so many cells, if unknown cells close the rest; rooms that
+# share more with others than the last are these.
+_SEEN_SHARE, _BESIDE_CELLS, _OLD = 0.6, 3.0, 0.5
+# A smaller share of the free cells in rooms gives a warning.
+_USED_SHARE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +42,59 @@ class OccupancyGrid:
 
 
 def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> Sketch:
-    """Return the rooms and gaps that the picture importer finds, in the map frame."""
+    """Return the rooms and gaps that the picture importer finds, in the map frame.
+
+    Unknown cells beside free ones close a room if most of its walls were seen: scanners do not see glass.
+    """
+    cells = _without_specks(grid.occupied, grid.frame)
+    if not cells.any():
+        return Sketch()
+    sketch, report = _read_walls(cells, grid, budget)
+    beside_free = cv2.dilate(grid.free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    unseen = _without_specks(beside_free & ~grid.free & ~grid.occupied, grid.frame)
+    if unseen.any():
+        guess, guess_report = _read_walls(cells | unseen, grid, budget)
+        seen_m = _Distance(grid, cells > 0)
+        known = shapely.union_all([room.shape for room in sketch.rooms])
+        shared_m2 = [shapely.intersection(room.shape, known).area for room in guess.rooms]
+        is_old = [area > _OLD * room.shape.area for room, area in zip(guess.rooms, shared_m2, strict=True)]
+        shares = [seen_m.share_near(room.shape) for room in guess.rooms]
+        judged = zip(guess.rooms, is_old, shares, strict=True)
+        kept = [room for room, old, share in judged if old or share >= _SEEN_SHARE]
+        if len(kept) > sum(is_old) >= len(sketch.rooms):
+            sketch, report = replace(guess, rooms=kept), guess_report
+            for room, old, share in zip(guess.rooms, is_old, shares, strict=True):
+                if room in kept and not old:
+                    place = room.shape.representative_point()
+                    builder.unsure.append(
+                        f"{(1.0 - share) * room.shape.exterior.length:.1f} m of the walls around ({place.x:.1f}, "
+                        f"{place.y:.1f}) were never seen (unknown cells, as behind glass) and are a guess"
+                    )
+    builder.no_room = report.no_room
+    if builder.no_room:
+        area_m2 = sum(area.area for area in builder.no_room)
+        builder.warnings.append(
+            f"{area_m2:.0f} m² inside the walls became no room (no_room); close the walls in the picture"
+        )
+    _report_free_cells(sketch, grid, builder)
+    if sketch.openings:
+        builder.unsure.append(
+            f"{len(sketch.openings)} gaps in walls are taken for passages or doors; set opening_kinds to the kinds "
+            "that are complete"
+        )
+    return sketch
+
+
+def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Budget) -> tuple[Sketch, ReportBuilder]:
+    """Return what the picture importer finds between walls (1), in the map frame."""
     frame = grid.frame
     rows, columns = frame.size
     parts = max(1, math.ceil(frame.resolution_m / _FINE_M - 1e-9))
     if rows * columns * parts**2 > budget.limits.max_plan_pixels:
         parts = max(1, math.isqrt(budget.limits.max_plan_pixels // (rows * columns)))
-    cells = 255 * _without_specks(grid)
-    if not cells.any():
-        return Sketch()
     fine_m = frame.resolution_m / parts
-    gray = cv2.resize(cells, (columns * parts, rows * parts), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
+    size = columns * parts, rows * parts
+    gray = cv2.resize(255 * cells, size, interpolation=cv2.INTER_LINEAR).astype(np.uint8)
     skew_deg = find_skew(gray > _HALF, _MAX_TURN_DEG)
     if skew_deg:
         gray = rotate_picture(gray, skew_deg, fill=0.0)
@@ -67,12 +114,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     # Its report gives places in the picture.
     inner = ReportBuilder()
     sketch = sketch_picture(np.where(walls > 0, 0, 255).astype(np.uint8), fine_m, inner, budget, straighten=False)
-    builder.no_room = [shapely.transform(area, to_map) for area in inner.no_room]
-    if builder.no_room:
-        area_m2 = sum(area.area for area in builder.no_room)
-        builder.warnings.append(
-            f"{area_m2:.0f} m² inside the walls became no room (no_room); close the walls in the picture"
-        )
+    inner.no_room = [shapely.transform(area, to_map) for area in inner.no_room]
     rooms = []
     for room in sketch.rooms:
         for part in polygons_from_geometry(room.shape.buffer(grown * fine_m, join_style="mitre")):
@@ -83,19 +125,42 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     for opening in sketch.openings:
         start, end = to_map(np.array([opening.start, opening.end]))
         openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
-    if openings:
-        builder.unsure.append(
-            f"{len(openings)} gaps in walls are taken for passages or doors; set opening_kinds to the kinds that are "
-            "complete"
+    return Sketch(rooms=rooms, openings=openings, opening_kinds=()), inner
+
+
+class _Distance:
+    """Distances from the cells of a grid to the nearest wall that was seen."""
+
+    def __init__(self, grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> None:
+        self._frame = grid.frame
+        cells = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)
+        self._distance_m = np.asarray(cells) * grid.frame.resolution_m
+
+    def share_near(self, room: shapely.Polygon) -> float:
+        """Return the share of a room's outline (map frame) that has a seen wall beside it."""
+        reach_m = _BESIDE_CELLS * self._frame.resolution_m
+        count = max(8, math.ceil(room.exterior.length / self._frame.resolution_m))
+        points = room.exterior.interpolate(np.linspace(0.0, 1.0, count), normalized=True)
+        row, column = self._frame.cells_at(shapely.get_coordinates(points))
+        return float((self._distance_m[row, column] <= reach_m).mean())
+
+
+def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuilder) -> None:
+    """Warn about floor that the robot saw and that is in no room."""
+    free_m2 = float(grid.free.sum()) * grid.frame.resolution_m**2
+    used_m2 = sum(room.shape.area for room in sketch.rooms)
+    if sketch.rooms and free_m2 > 0.0 and used_m2 < _USED_SHARE * free_m2:
+        builder.warnings.append(
+            f"{free_m2 - used_m2:.0f} m² of free cells ({1.0 - used_m2 / free_m2:.0%} of all) are in no room; close "
+            "the walls around them in the picture if they are rooms"
         )
-    return Sketch(rooms=rooms, openings=openings, opening_kinds=())
 
 
-def _without_specks(grid: OccupancyGrid) -> UInt8[np.ndarray, "h w"]:
-    """Return the occupied cells without those that are too few for a wall."""
-    _, found, stats, _ = cv2.connectedComponentsWithStats(grid.occupied.astype(np.uint8), connectivity=8)
+def _without_specks(cells: Bool[np.ndarray, "h w"], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
+    """Return cells, as 1, without those that are too few for a wall."""
+    _, found, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
     longest = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-    is_wall = longest * grid.frame.resolution_m >= _SPECK_M
+    is_wall = longest * frame.resolution_m >= _SPECK_M
     is_wall[0] = False
     return is_wall.astype(np.uint8)[np.asarray(found, dtype=np.int32)]
 

@@ -1,0 +1,148 @@
+"""Variants of the traits in `test_fault_files.py`: other formats, languages, units and places."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from ezdxf.filemanagement import new as new_dxf
+from scipy import ndimage
+
+from lalaloc_core.importers import ImportedPlan, import_plan
+from lalaloc_core.importers.common.floors import find_floor
+from tests.importers.conftest import dxf_file, lines, shapes, zip_file
+from tests.importers.test_ros_maps import SETTINGS, _picture
+
+_SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1200 900" data-metres-per-unit="0.01">{}</svg>'
+
+
+def _svg(*elements: str) -> ImportedPlan:
+    return import_plan(_SVG.format("".join(elements)).encode())
+
+
+def _areas(plan: ImportedPlan) -> list[float]:
+    return sorted((round(shape.area, 1) for shape in shapes(plan.document)), reverse=True)
+
+
+@pytest.mark.parametrize(
+    "layers",
+    [
+        ("Zimmer", "Küche", "Bäder", "Büros"),
+        ("A-AREA-ROOM", "Cuisine", "Salles de bain", "Bureaux"),
+        ("部屋", "台所", "浴室", "事務室"),
+        ("Rum", "Kök", "Badrum", "Kontor"),
+        ("Pokoje", "Kuchnia", "Łazienka", "Biuro"),
+    ],
+)
+def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...]):
+    document: Any = new_dxf("R2010", units=4)
+    for index, layer in enumerate(layers):
+        x = 4200.0 * index
+        ring = [(x, 0.0), (x + 4000.0, 0.0), (x + 4000.0, 3000.0), (x, 3000.0)]
+        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [12.0] * 4
+    assert {"kitchen", "bathroom", "office"} <= {room.get("type") for room in plan.document["rooms"]}
+
+
+def test_unused_outlines_are_reported_with_layer_and_share():
+    rooms = [f'<rect id="room-{x}" x="{x}" y="0" width="500" height="400"/>' for x in (0, 515)]
+    plan = _svg(*rooms, '<rect id="Spielecke" x="0" y="415" width="500" height="400"/>')
+    assert _areas(plan) == [20.0, 20.0]
+    (warning,) = [line for line in plan.report.warnings if "not used" in line]
+    assert "1 closed outlines" in warning
+    assert "33 % of the outlined area: 1 on 'Spielecke' (20.0 m²)" in warning
+
+
+def test_kitchen_units_inside_a_room_are_no_rooms():
+    plan = _svg(
+        '<rect id="room-1" x="0" y="0" width="500" height="400"/>',
+        '<rect id="kitchen" x="0" y="0" width="300" height="70"/>',
+    )
+    assert _areas(plan) == [20.0]
+
+
+_WALLS = (
+    '<g fill="#222"><rect x="0" y="0" width="1000" height="20"/><rect x="0" y="580" width="1000" height="20"/>'
+    '<rect x="0" y="0" width="20" height="600"/><rect x="980" y="0" width="20" height="600"/>'
+    '<rect x="490" y="0" width="20" height="600"/></g>'
+)
+
+
+def test_openings_painted_over_walls_of_an_svg_are_found():
+    plan = _svg(
+        _WALLS,
+        '<rect x="100" y="0" width="150" height="20" fill="#8cf"/>',
+        '<rect x="490" y="200" width="20" height="90" fill="white"/>',
+        '<path d="M500,200 L580,241" fill="none" stroke="#000"/>',
+        '<rect x="490" y="400" width="20" height="100" fill="#fff"/>',
+    )
+    assert _areas(plan) == [26.3, 26.3]
+    assert [len(lines(plan.document, kind)) for kind in ("door", "window", "passage")] == [1, 1, 1]
+
+
+def test_floors_painted_over_the_edges_of_walls_are_no_openings():
+    floors = [f'<rect x="{x}" y="10" width="485" height="580" fill="#eee"/>' for x in (10, 505)]
+    plan = _svg(_WALLS, *floors)
+    assert len(shapes(plan.document)) == 2
+    assert "openings" not in plan.document
+
+
+@pytest.mark.parametrize("x", [30, 250, 505])
+def test_dark_pillars_beside_single_lines_are_no_walls(x: int):
+    plan = _svg(
+        '<path fill="none" stroke="#000" stroke-width="1" d="M0,0 H1000 V600 H0 Z"/>',
+        '<path fill="none" stroke="#000" stroke-width="1" d="M500,0 V250 M500,340 V600"/>',
+        f'<rect x="{x}" y="400" width="50" height="50" fill="#000"/>',
+    )
+    assert len(shapes(plan.document)) == 2
+    assert sum(_areas(plan)) == pytest.approx(60.0 - 0.25, abs=0.15)
+
+
+def test_chimney_in_a_hatched_wall_of_a_dxf():
+    document: Any = new_dxf("R2010", units=6)
+    hatch = document.modelspace().add_hatch()
+    outer = [(0, 0), (9, 0), (9, 6), (0, 6)]
+    left = [(0.2, 0.2), (4.4, 0.2), (4.4, 5.8), (1.3, 5.8), (1.3, 4.7), (0.2, 4.7)]
+    right = [(4.6, 0.2), (8.8, 0.2), (8.8, 5.8), (4.6, 5.8)]
+    for ring in (outer, left, right):
+        hatch.paths.add_polyline_path(ring, is_closed=True)
+    assert _areas(import_plan(dxf_file(document))) == [23.5, 22.3]
+
+
+def _box(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
+    return np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], float)
+
+
+def test_gallery_over_a_neighbour_is_no_floor():
+    # The upper half of a room reaches over its neighbour, 2.6 m above the floor.
+    faces = [_box(0, 0, 4, 3, 0), _box(4, 0, 6, 3, 2.6), _box(0, 0, 6, 3, 5)]
+    floor = find_floor(faces, lambda: None)
+    assert floor is not None
+    assert sum(part.area for part in floor.parts) == pytest.approx(12.0)
+    assert floor.higher_m2 == pytest.approx(6.0)
+
+
+def test_steep_rows_of_seats_are_one_floor():
+    faces = [_box(0, float(row), 10, row + 1.0, 0.4 * row) for row in range(8)] + [_box(0, 0, 10, 8, 9)]
+    floor = find_floor(faces, lambda: None)
+    assert floor is not None
+    assert sum(part.area for part in floor.parts) == pytest.approx(80.0)
+    assert floor.rise_m == pytest.approx(2.8)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 17.0])
+@pytest.mark.parametrize("rows", [(20, 80), (60, 130)])
+def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple[int, int]):
+    cells = np.full((260, 380), 205, np.uint8)
+    cells[60:201, 60:321] = 0
+    cells[62:199, 62:319] = 254
+    cells[62:199, 180:182] = 0
+    cells[100:118, 180:182] = 254
+    cells[60 + rows[0] : 60 + rows[1], 319:321] = 205
+    turned = ndimage.rotate(cells, turn_deg, order=0, cval=205, reshape=False)
+    plan = import_plan(zip_file({"map.yaml": yaml.safe_dump(SETTINGS), "map.pgm": _picture(turned)}))
+    assert len(shapes(plan.document)) == 2
+    assert any("never seen" in line for line in plan.report.unsure)
