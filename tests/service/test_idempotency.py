@@ -312,7 +312,7 @@ def test_only_errors_of_the_request_are_kept(store: Store, refusal: Exception, k
 
 @pytest.mark.parametrize("leaves", [True, False], ids=["disconnects", "retries later"])
 def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
-    async def never() -> Response:
+    async def never(_token: str) -> Response:
         raise AssertionError("it has not begun")
 
     async def ask() -> None:
