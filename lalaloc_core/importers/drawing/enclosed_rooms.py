@@ -124,11 +124,11 @@ def enclose(
     if bodies or sum(line.length for line in lines if not around.covers(line)) < _MOSTLY_SINGLE * drawn_m:
         return paired
     single = _from_single_lines(lines, closers, config, check_time)
-    return max(paired, single, key=lambda found: explained(found.rooms))
+    return max(paired, single, key=lambda found: explained_size(found.rooms))
 
 
-def explained(rooms: Sequence[shapely.Polygon]) -> float:
-    """Return how much of a drawing rooms explain: a sum of the roots of their areas, so that two count more than one.
+def explained_size(rooms: Sequence[shapely.Polygon]) -> float:
+    """Return a measure of the drawing that rooms explain: the sum of the roots of their areas.
 
     Rooms too small for a person count nothing.
     """

@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.geometry import polygons_from_geometry, side_
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Enclosed, Gap, enclose, explained
+from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Enclosed, Gap, enclose, explained_size
 from lalaloc_core.importers.drawing.painted_openings import cut_painted
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Swing
 
@@ -76,10 +76,10 @@ class Reading:
 
     @property
     def explained(self) -> float:
-        """How much of the drawing the reading explains."""
+        """Measure of the drawing that the reading explains, see `explained_size`; names and doors add to it."""
         shapes = [room.shape for room in self.rooms]
         named = 1.0 + (_NAMED - 1.0) * self.named / max(len(shapes), 1)
-        return named * explained(shapes) + _DOOR * self.doors
+        return named * explained_size(shapes) + _DOOR * self.doors
 
     def __str__(self) -> str:
         return (
@@ -105,7 +105,9 @@ def choose_reading(
     """
     readings: list[Reading] = []
     if marked:
-        readings.append(_judged(Reading("the areas that the file marks as rooms", marked), drawing, leaves))
+        readings.append(
+            _count_doors_and_names(Reading("the areas that the file marks as rooms", marked), drawing, leaves)
+        )
     # Rooms that layers mark by a word for rooms are complete, unless they are a small part of the drawing.
     is_by_word = any(area.role == "room" for area in marked)
     box_m2 = shapely.box(*shapely.total_bounds(drawing.shapes)).area if drawing.shapes else 0.0
@@ -121,7 +123,7 @@ def choose_reading(
             if found is not None:
                 shapes = [Area(shape, "", "room") for shape in found.rooms]
                 reading = Reading(f"the areas enclosed by {source}", shapes, found.gaps, found.walls)
-                readings.append(_judged(reading, drawing, leaves))
+                readings.append(_count_doors_and_names(reading, drawing, leaves))
         if refused is not None and not any(reading.rooms for reading in readings):
             raise refused
     best = readings[0] if readings else Reading("the areas enclosed by all lines", [], walls=shapely.Polygon())
@@ -145,7 +147,7 @@ def _is_better(reading: Reading, best: Reading) -> bool:
     return (ratio >= _BETTER and larger >= _LARGER) or (ratio >= _MUCH_BETTER and larger >= _NOT_SMALLER)
 
 
-def _judged(reading: Reading, drawing: Drawing, leaves: Sequence[Swing]) -> Reading:
+def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[Swing]) -> Reading:
     """Return a reading with its doors and names counted."""
     closed = {index for leaf in leaves if (index := gap_of(leaf, reading.gaps)) is not None}
     names = [t.position for t in drawing.letterings if room_type_from_name(t.text) is not None]
