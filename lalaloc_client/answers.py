@@ -150,6 +150,15 @@ class ReadView:
 
 
 @dataclass(frozen=True)
+class SeenObject:
+    """Object that a photograph shows; `azimuth_deg` is relative to the photograph's centre."""
+
+    name: str
+    probability: float
+    azimuth_deg: float
+
+
+@dataclass(frozen=True)
 class View(ReadView):
     """Assumptions about a photograph, and how much it could tell. See `ReadView` as well.
 
@@ -157,11 +166,16 @@ class View(ReadView):
         information_bits: information about the place.
         ruled_out: share of the searched area that this rules out.
         advice: how to photograph the place for a sure answer; None where it is sure.
+        room_types: probability of each type of room by recognised objects; None for full spheres, and for services and
+            models without objects.
+        objects: recognised objects that tell the type of room, the most probable first; None as `room_types`.
     """
 
     information_bits: float
     ruled_out: float
     advice: str | None
+    room_types: Mapping[str, float] | None = None
+    objects: tuple[SeenObject, ...] | None = None
 
 
 @dataclass(frozen=True)

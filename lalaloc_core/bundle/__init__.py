@@ -16,9 +16,11 @@ from lalaloc_core.bundle.manifest import (
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
     MANIFEST_NAME,
+    OBJECTS_ONNX,
     VIEW_ONNX,
     VIEW_WEIGHTS,
     Manifest,
+    ObjectsManifest,
     ViewManifest,
 )
 from lalaloc_core.bundle.prediction_errors import PredictionErrors

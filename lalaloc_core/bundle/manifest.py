@@ -11,6 +11,7 @@ from typing import Any
 from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, MatchingWeights
 from lalaloc_core.bundle.prediction_errors import PredictionErrors
 from lalaloc_core.configuration import build_config
+from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 
 MANIFEST_NAME = "manifest.json"
@@ -27,6 +28,8 @@ DECODER_WEIGHTS = "decoder.safetensors"
 # Encoder of views, photographs that show a part of the horizon; not every bundle has one.
 VIEW_ONNX = "view_encoder.onnx"
 VIEW_WEIGHTS = "view_encoder.safetensors"
+# Classifier of objects in photographs; not every bundle has one.
+OBJECTS_ONNX = "objects.onnx"
 # Made by calibration, not by export.
 COHORT = "cohort.npz"
 BUNDLE_FILES = (
@@ -38,6 +41,7 @@ BUNDLE_FILES = (
     DECODER_WEIGHTS,
     VIEW_ONNX,
     VIEW_WEIGHTS,
+    OBJECTS_ONNX,
 )
 
 
@@ -75,6 +79,28 @@ class ViewManifest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ObjectsManifest:
+    """Classifier of objects, which tells types of rooms.
+
+    Attributes:
+        names: names of the objects, in the order of the network's outputs.
+        shares: (objects, room types) share of each object that a room of each type accounts for.
+        floor: probability that is added to that of every type, since most photographs show none of the objects.
+    """
+
+    names: list[str]
+    shares: list[list[float]]
+    floor: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Check the shape of `shares`."""
+        if len(self.shares) != len(self.names) or any(len(row) != len(ROOM_TYPES) for row in self.shares):
+            raise ConfigError(
+                f"objects.shares must have a row for each of {len(self.names)} names and {len(ROOM_TYPES)} columns"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Manifest:
     """Manifest of a bundle: architecture, inputs and outputs, calibration, and provenance.
 
@@ -90,6 +116,7 @@ class Manifest:
         opening_prior: frequencies of the classes that its probabilities presume.
         room_types: room types that it predicts; `room_type_prior` are their frequencies in the training data.
         view: encoder of views; None if the bundle has none.
+        objects: classifier of objects; None if the bundle has none.
         confidence: models of the confidence; None leaves answers without one.
         evidence: weights of the matching cost.
         errors: measured errors of the predictions; None if they were not measured.
@@ -114,6 +141,7 @@ class Manifest:
     room_types: list[str] = field(default_factory=list)
     room_type_prior: list[float] = field(default_factory=list)
     view: ViewManifest | None = None
+    objects: ObjectsManifest | None = None
     confidence: ConfidenceModel | None = None
     evidence: MatchingWeights = field(default_factory=MatchingWeights)
     errors: PredictionErrors | None = None

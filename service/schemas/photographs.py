@@ -136,6 +136,14 @@ class ReadView(ResponseModel):
     warnings: list[str] = Field(description="Metadata that were ignored, and estimates to check.")
 
 
+class SeenObjectAnswer(ResponseModel):
+    """Object that the photograph shows."""
+
+    name: str = Field(description="Object, such as `stove`.")
+    probability: Share
+    azimuth_deg: SignedDegrees = Field(description="Direction relative to the photograph's centre, clockwise.")
+
+
 class ViewAnswer(ReadView):
     """Assumptions about the photograph, the azimuths it shows, and how much it could tell."""
 
@@ -147,4 +155,11 @@ class ViewAnswer(ReadView):
     advice: str | None = Field(
         description="How to photograph the place for a sure answer, such as `turn around`; null where it is sure, or "
         "where more of the surroundings would not help."
+    )
+    room_types: dict[str, Share] | None = Field(
+        description="Probability of each type of room, the most probable first, by recognised objects; types "
+        "below 0.05 are left out. Null for full spheres, and for features or models without objects."
+    )
+    objects: list[SeenObjectAnswer] | None = Field(
+        description="Recognised objects that tell the type of room, the most probable first; null as `room_types`."
     )

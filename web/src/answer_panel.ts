@@ -8,6 +8,7 @@ import {
   headingWords,
   milliseconds,
   percent,
+  roomWords,
   seenWords,
   STAGES,
   viewWords,
@@ -100,6 +101,7 @@ function planOf(answer: Answer, place: { floorplan_id: string; level: number | n
 function remarks(answer: Answer): HTMLElement[] {
   const { view, together } = answer,
     advice = adviceWords(answer),
+    looks = view == null ? null : roomWords(view),
     elsewhere = answer.probability_elsewhere ?? 0;
   const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) =>
     h("p", { class: "warning" }, plainWords(warning)),
@@ -128,6 +130,7 @@ function remarks(answer: Answer): HTMLElement[] {
             "no place of this plan: another floor or building, or rooms that have changed.",
           ),
         ]),
+    ...(looks === null ? [] : [h("p", { class: "assumed" }, looks)]),
     ...(view == null ? [] : [h("p", { class: "assumed" }, viewWords(view))]),
     ...warnings,
   ];

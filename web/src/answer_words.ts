@@ -52,6 +52,16 @@ export function seenWords(view: ViewAnswer): string {
   return `${seenDeg(view).toFixed(0)}° of 360° of the surroundings are seen; that rules out ${percent(view.ruled_out)} of the area.`;
 }
 
+/** Describe the room by recognised objects, as in "Looks like a kitchen: stove, refrigerator"; null if nothing tells. */
+export function roomWords({ room_types: types, objects }: ViewAnswer): string | null {
+  const [likeliest] = Object.entries(types ?? {});
+  if (likeliest === undefined || likeliest[1] < TELLING) return null;
+  const [type, share] = likeliest;
+  const names = (objects ?? []).slice(0, 3).map(({ name }) => name);
+  const shown = names.length === 0 ? "" : `: ${names.join(", ")}`;
+  return `Looks like ${ROOM_WORDS[type] ?? `a ${type}`} (${percent(share)})${shown}.`;
+}
+
 /** Return advice how to photograph the place for a sure answer; null if there is none. */
 export function adviceWords(answer: Answer): string | null {
   const { view, together } = answer;
@@ -74,6 +84,20 @@ function angleWords(value: number, deviation: number): string {
 function directed({ value_deg, std_deg }: ViewAnswer["pitch"], positive: string, negative: string): string {
   return `${value_deg < -0.5 ? negative : positive} by ${angleWords(Math.abs(value_deg), std_deg)}`;
 }
+
+// A photograph that shows no telling object has about the same probability for all types.
+const TELLING = 0.25;
+
+const ROOM_WORDS: Record<string, string> = {
+  living: "a living room",
+  dining: "a dining room",
+  entrance: "an entrance",
+  storage: "a storage room",
+  laundry: "a laundry room",
+  stairs: "stairs",
+  office: "an office",
+  meeting: "a meeting room",
+};
 
 const PROJECTIONS: Record<ViewAnswer["projection"], string> = {
   equirectangular: "a 360° photograph",

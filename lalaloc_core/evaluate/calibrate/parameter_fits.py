@@ -127,7 +127,7 @@ def _choice(prediction: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     if not right.any() or right.all():
         return None
     terms = np.array([[candidate.terms[name] for name in _TERMS] for candidate in candidates])
-    return terms, np.array([candidate.terms["height"] for candidate in candidates]), right
+    return terms, np.array([candidate.terms["objects"] + candidate.terms["height"] for candidate in candidates]), right
 
 
 def _is_right(pose: Pose, prediction: Prediction) -> bool:

@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,23 +31,28 @@ from lalaloc_core.bundle import (
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
     MANIFEST_NAME,
+    OBJECTS_ONNX,
     VIEW_ONNX,
     VIEW_WEIGHTS,
     Bundle,
     Manifest,
+    ObjectsManifest,
     ViewManifest,
     write_manifest,
 )
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
+from lalaloc_core.learn.export.object_table import OBJECTS, shares_by_type
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
+from lalaloc_core.nets.object_network import ObjectNetwork
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets.trunk import TAP_STRIDES
 from lalaloc_core.nets.view_network import ViewNetwork
 
 PARITY_TOLERANCE = 1e-4
@@ -131,6 +136,27 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     )
     training = {**bundle.manifest.training, "view": training}
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
+
+
+def add_object_network(bundle: Bundle) -> Bundle:
+    """Add the classifier of objects to a bundle, or replace it; no other network changes.
+
+    Raises:
+        ConfigError: the package of the pretrained weights is not installed.
+        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
+    """
+    network = ObjectNetwork([number for _, number, _ in OBJECTS])
+    _freeze(network)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (_PARITY_BATCH, 256, 320, 3), dtype=torch.uint8, generator=generator)
+    # Both sides are multiples of the stride.
+    sides = {
+        axis: TAP_STRIDES[-1] * torch.export.Dim(name, min=1, max=64) for axis, name in ((1, "rows"), (2, "columns"))
+    }
+    with _new_files(bundle.folder) as work:
+        _export(work / OBJECTS_ONNX, network, {"image": image}, ["probability", "by_column"], sides)
+    objects = ObjectsManifest(names=[name for name, _, _ in OBJECTS], shares=shares_by_type().round(3).tolist())
+    return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, objects=objects))
 
 
 def replace_image_encoder(
@@ -229,8 +255,13 @@ class _ViewOutputs(nn.Module):
         return (*vars(features.walls).values(), features.seen, *vars(features.structure).values())
 
 
-def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
-    """Export one network with a dynamic batch, store it compactly, and return its largest difference from torch."""
+def _export(
+    path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], sides: Mapping[int, Any] | None = None
+) -> float:
+    """Export one network with a dynamic batch, store it compactly, and return its largest difference from torch.
+
+    `sides` are further dynamic axes of the inputs.
+    """
     with warnings.catch_warnings():
         # The exporter warns about its own internals.
         warnings.simplefilter("ignore")
@@ -240,7 +271,7 @@ def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: l
             tuple(inputs.values()),
             input_names=list(inputs),
             output_names=outputs,
-            dynamic_shapes=tuple({0: torch.export.Dim("batch", min=1, max=4096)} for _ in inputs),
+            dynamic_shapes=tuple({0: torch.export.Dim("batch", min=1, max=4096), **(sides or {})} for _ in inputs),
             dynamo=True,
             # onnxruntime optimises on loading; unoptimised weights remain recognisable for half-precision storage.
             optimize=False,

@@ -2,7 +2,8 @@
 
 A file has 4 bytes "LLFT", the version (uint16) and the length of the header (uint32), the header in JSON, and the
 arrays of `_layout` in float32; all numbers are little-endian. docs/reference/features.md describes it. Lengths in
-metres are for a camera height of 1 m, because most outputs scale with it; `at_height` scales them.
+metres are for a camera height of 1 m, because most outputs scale with it; `at_height` scales them. Version 2 adds the
+objects in photographs that are no spheres; version 1 can still be read.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, VIEW_ONNX, Bundle, Manifest, MatchingWeights
+from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, OBJECTS_ONNX, VIEW_ONNX, Bundle, Manifest, MatchingWeights
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI
 from lalaloc_core.errors import (
@@ -27,6 +28,7 @@ from lalaloc_core.errors import (
     InvalidPhotographError,
 )
 from lalaloc_core.localise.encode.exported_network import PROFILE_OUTPUTS, SHARE_OUTPUT
+from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.photograph import Assumed, Intrinsics, Photograph, PhotographFeatures, StatedCamera
@@ -36,8 +38,8 @@ from lalaloc_core.photograph.stated_camera import Projection, camera_of_intrinsi
 
 MAX_BYTES = 2**18
 # Files of a bundle that `FeatureEncoder` reads, those that it has.
-DEVICE_FILES = (MANIFEST_NAME, IMAGE_ONNX, VIEW_ONNX)
-_MAGIC, _VERSION, _PREFIX = b"LLFT", 1, struct.Struct("<4sHI")
+DEVICE_FILES = (MANIFEST_NAME, IMAGE_ONNX, VIEW_ONNX, OBJECTS_ONNX)
+_MAGIC, _VERSION, _PREFIX = b"LLFT", 2, struct.Struct("<4sHI")
 _MAX_HEADER_BYTES, _MAX_PATCHES, _MAX_SIDE = 2**14, 16, 2**16
 _MAX_WARNINGS, _MAX_WARNING_CHARACTERS = 8, 300
 # Camera heights (m) of the rings. The ring is the only output that depends on the height other than by its log.
@@ -47,7 +49,14 @@ _VIEW_MODES = 2
 _WALLS = (*PROFILE_OUTPUTS, SHARE_OUTPUT)
 # Ranges of the values, far beyond those of real ones; logs of lengths and of scales, then unbounded outputs.
 _LOGS, _OUTPUTS = (-12.0, 12.0), (-1e4, 1e4)
-_RANGES = {"log_share": (-1e4, 1e-3), "seen": (-1e-3, 1.0 + 1e-3), "ring": _OUTPUTS}
+_SHARE = (-1e-3, 1.0 + 1e-3)
+_RANGES = {
+    "log_share": (-1e4, 1e-3),
+    "seen": _SHARE,
+    "ring": _OUTPUTS,
+    "object_probability": _SHARE,
+    "object_azimuth": (-math.pi - 1e-3, math.pi + 1e-3),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +134,7 @@ class FeatureEncoder:
         self._bundle = bundle
         self._spheres = SphereEncoder(bundle, threads=threads, outputs_only=True)
         self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
+        self._objects = None if bundle.manifest.objects is None else ObjectEncoder(bundle, threads=threads)
 
     def features(self, photograph: Photograph) -> bytes:
         """Return the features of a decoded photograph as a file.
@@ -138,13 +148,15 @@ class FeatureEncoder:
             outputs = by_height[_RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
         elif photograph.sphere is None and self._views is not None:
             outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0)
+            if self._objects is not None:
+                outputs |= self._objects.outputs(photograph)
         else:
             raise InvalidPhotographError(
                 f"the photograph is {photograph.projection}, of which model '{manifest.name}' gives no features; send "
                 "the photograph itself"
             )
         text = json.dumps(dataclasses.asdict(_header_of(photograph, self._bundle)), allow_nan=False).encode()
-        shapes = _layout(manifest, len(photograph.patches))
+        shapes = _layout(manifest, len(photograph.patches), _VERSION)
         arrays = (np.asarray(outputs[name], "<f4").reshape(shape).tobytes() for name, shape in shapes.items())
         return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + b"".join(arrays)
 
@@ -174,12 +186,12 @@ def read_features(content: bytes, bundle: Bundle) -> Photograph:
         InvalidFeaturesError: the file is damaged, truncated or too large, or a value is out of range.
         ForeignFeaturesError: the features are another model's.
     """
-    header, body = _split(content)
+    version, header, body = _split(content)
     manifest = bundle.manifest
     if header.model != bundle.sha256:
         raise ForeignFeaturesError(header.model[:64], manifest.name, bundle.sha256)
     photograph = _photograph_of(header, manifest)
-    shapes = _layout(manifest, len(header.patches))
+    shapes = _layout(manifest, len(header.patches), version)
     expected = 4 * sum(math.prod(shape) for shape in shapes.values())
     if len(body) != expected:
         raise InvalidFeaturesError(
@@ -213,7 +225,7 @@ def _ring_at(rings: Float[np.ndarray, "h c s"], camera_height_m: float) -> Float
     return np.tensordot(np.array(weights, np.float32), rings, 1)
 
 
-def _layout(manifest: Manifest, patches: int) -> dict[str, tuple[int, ...]]:
+def _layout(manifest: Manifest, patches: int, version: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays, in the order of the file, of a full sphere or of some patches."""
     columns = manifest.profile_columns
     if not patches:
@@ -225,7 +237,9 @@ def _layout(manifest: Manifest, patches: int) -> dict[str, tuple[int, ...]]:
     assert manifest.view is not None
     columns = manifest.view.sectors * columns // manifest.ring_sectors
     walls = dict.fromkeys(_WALLS, (patches, columns, _VIEW_MODES))
-    return {**walls, "seen": (patches, columns), **_structure((patches,), columns)}
+    names = [] if manifest.objects is None or version < _VERSION else manifest.objects.names
+    objects = dict.fromkeys(OBJECT_OUTPUTS if names else (), (len(names),))
+    return {**walls, "seen": (patches, columns), **_structure((patches,), columns), **objects}
 
 
 def _structure(patches: tuple[int, ...], columns: int) -> dict[str, tuple[int, ...]]:
@@ -237,15 +251,15 @@ def _structure(patches: tuple[int, ...], columns: int) -> dict[str, tuple[int, .
     }
 
 
-def _split(content: bytes) -> tuple[_Header, memoryview]:
-    """Return the header, and the bytes of the arrays."""
+def _split(content: bytes) -> tuple[int, _Header, memoryview]:
+    """Return the version, the header, and the bytes of the arrays."""
     if len(content) > MAX_BYTES:
         raise InvalidFeaturesError(f"the file has {len(content)} bytes; the limit is {MAX_BYTES}")
     if len(content) < _PREFIX.size or not is_features(content):
         raise InvalidFeaturesError("the file does not begin as features do; make it with `lalaloc encode`")
     _, version, length = _PREFIX.unpack_from(content)
-    if version != _VERSION:
-        raise InvalidFeaturesError(f"the features have version {version}; this version reads {_VERSION}")
+    if not 1 <= version <= _VERSION:
+        raise InvalidFeaturesError(f"the features have version {version}; this version reads 1 to {_VERSION}")
     if length > min(_MAX_HEADER_BYTES, len(content) - _PREFIX.size):
         raise InvalidFeaturesError(
             f"the header has {length} bytes; the limit is {_MAX_HEADER_BYTES}, and the rest of the file"
@@ -255,7 +269,7 @@ def _split(content: bytes) -> tuple[_Header, memoryview]:
         header = build_config(_Header, json.loads(content[_PREFIX.size : end]), path="header")
     except (ConfigError, ValueError, RecursionError) as error:
         raise InvalidFeaturesError(f"not a valid header: {str(error)[:300]}") from error
-    return header, memoryview(content)[end:]
+    return version, header, memoryview(content)[end:]
 
 
 def _header_of(photograph: Photograph, bundle: Bundle) -> _Header:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.features import at_height
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
+from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder, seen_objects
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
-from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects
 from lalaloc_core.photograph import PatchSize, Photograph
 
 
@@ -39,6 +41,7 @@ class PhotographEncoder(LayoutEncoder):
         super().__init__(bundle, threads=threads)
         self.spheres = SphereEncoder(bundle, threads=threads)
         self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
+        self._objects = None if bundle.manifest.objects is None else ObjectEncoder(bundle, threads=threads)
 
     @property
     def predicts_profile(self) -> bool:
@@ -86,9 +89,26 @@ class PhotographEncoder(LayoutEncoder):
             parts = [at_height(view.features, height_m) for view, _ in turned if view.features]
             outputs = {name: np.concatenate([part[name] for part in parts]) for name in VIEW_OUTPUTS}
         placed = [(azimuth + turn, view.tilt_sd(azimuth)) for view, turn in turned for azimuth in view.patch_azimuths]
-        return self._views.query_of_outputs(
+        query = self._views.query_of_outputs(
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
+        objects = self._seen_objects(turned)
+        searched = None if query.searched is None else replace(query.searched, objects=objects)
+        return replace(query, objects=objects, searched=searched)
+
+    def _seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
+        """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
+        if self._objects is None:
+            return None
+        assert self.manifest.objects is not None
+        views = []
+        for view, turn in turned:
+            outputs = self._objects.outputs(view) if view.features is None else view.features.outputs
+            # Features of earlier versions have no objects.
+            if not outputs.keys() >= set(OBJECT_OUTPUTS):
+                return None
+            views.append((outputs["object_probability"], outputs["object_azimuth"] + turn))
+        return seen_objects(self.manifest.objects, views)
 
     def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.
@@ -115,6 +135,8 @@ class PhotographEncoder(LayoutEncoder):
             size = patch_size(manifest)
             outputs = self._views.outputs([np.zeros((size.height, size.width, 4), np.uint8)], height.height_m)
             self._views.query_of_outputs(outputs, [(0.0, 0.0)], None, height)
+        if self._objects is not None:
+            self._objects.warm_up()
 
 
 def sphere_size(manifest: Manifest) -> tuple[int, int]:

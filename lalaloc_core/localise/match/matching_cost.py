@@ -4,7 +4,7 @@ Every term is a negative log likelihood per azimuth, up to constants, and close 
 neighbouring azimuths are correlated, so each term has a weight in units of the walls', fitted on validation queries
 (`lalaloc_core.evaluate.calibrate`):
 
-    cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
+    cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + (objects + penalty(δ)) / T
 
 * **Walls.** The image encoder predicts a log wall profile μ and a scale b for every azimuth w. The term has the heavy
   tails of a Cauchy distribution: `mean_w log(1 + r_w²)`, with `r_w = (log d_w - μ_w - δ) / (κ s_w)` and `s_w² = b_w² +
@@ -21,6 +21,8 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   wall.
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
 * **Room type.** As openings, once per room.
+* **Objects.** As the room type, by the objects that a classifier of photographs recognises. It replaces the room type,
+  because encoders that learnt from renderings do not recognise real rooms, and is an unweighted log likelihood.
 
 `MatchingConfig.latent_weight` adds a latent distance. Models that predict no wall profile use latent distance alone.
 """
@@ -47,7 +49,7 @@ from lalaloc_core.localise.match.cost_terms import (
     smoothed,
 )
 from lalaloc_core.localise.match.layouts import Layouts
-from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.query import PredictedRoomType, Query
 
 # Pairs compared at a time, few enough to stay in the processor's cache.
 _CHUNK = 512
@@ -87,12 +89,16 @@ class MatchingConfig:
 
 
 class Terms(NamedTuple):
-    """Unweighted terms of the cost of some poses, each (n,); `height` is δ's penalty."""
+    """Unweighted terms of the cost of some poses, each (n,); `height` is δ's penalty.
+
+    `objects` and `height` are log likelihoods, the others by azimuth.
+    """
 
     walls: Float[np.ndarray, "n"]
     openings: Float[np.ndarray, "n"]
     ceiling: Float[np.ndarray, "n"]
     room_type: Float[np.ndarray, "n"]
+    objects: Float[np.ndarray, "n"]
     height: Float[np.ndarray, "n"]
 
     def total(self, weights: MatchingWeights) -> Float[np.ndarray, "n"]:
@@ -102,7 +108,7 @@ class Terms(NamedTuple):
             + weights.openings * self.openings
             + weights.ceiling * self.ceiling
             + weights.room_type * self.room_type
-            + self.height / weights.temperature
+            + (self.objects + self.height) / weights.temperature
         )
 
 
@@ -183,6 +189,7 @@ class MatchingCost:
             openings=self._openings(gathered, hypothesis).astype(np.float64),
             ceiling=self._ceilings(offset)[every, layouts.room_index],
             room_type=self._room_types[layouts.room_index],
+            objects=self._objects[layouts.room_index],
             height=self._query.camera_height.penalty(offset),
         )
 
@@ -230,8 +237,9 @@ class MatchingCost:
 
     @cached_property
     def room_costs(self) -> Float[np.ndarray, "j r"]:
-        """Cost of each δ in each room alone: the height's penalty, the ceiling and the room type."""
-        penalty = self._query.camera_height.penalty(self.offsets)[:, None] / self._weights.temperature
+        """Cost of each δ in each room alone: the height's penalty, the ceiling, the room type and objects."""
+        penalty = self._query.camera_height.penalty(self.offsets)[:, None] + self._objects
+        penalty = penalty / self._weights.temperature
         types = self._weights.room_type * self._room_types
         return (penalty + self._weights.ceiling * self._ceilings(self.offsets) + types).astype(np.float32)
 
@@ -336,8 +344,15 @@ class MatchingCost:
 
     @cached_property
     def _room_types(self) -> Float[np.ndarray, "r"]:
-        """Cost of the type of every room."""
-        predicted = self._query.room_type
+        """Cost of the type of every room by the encoder of photographs."""
+        return self._by_room(self._query.room_type if self._query.objects is None else None)
+
+    @cached_property
+    def _objects(self) -> Float[np.ndarray, "r"]:
+        """Cost of the type of every room by recognised objects."""
+        return self._by_room(None if self._query.objects is None else self._query.objects.room_type)
+
+    def _by_room(self, predicted: PredictedRoomType | None) -> Float[np.ndarray, "r"]:
         if predicted is None or not self._config.use_room_type:
             return np.zeros(len(self._plan.rooms))
         losses = room_type_losses(predicted, self._config.floor)

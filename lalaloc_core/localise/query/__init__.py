@@ -20,6 +20,8 @@ from lalaloc_core.localise.query.predictions import (
     PredictedProfile,
     PredictedRoomType,
     RivalWall,
+    SeenObject,
+    SeenObjects,
     rolled,
 )
 from lalaloc_core.localise.query.query import Candidate, Query

@@ -8,6 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.conventions import ROOM_TYPES
+
+# Types of rooms that are less probable are not named.
+_MIN_PROBABILITY = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class RivalWall:
@@ -110,3 +115,30 @@ class PredictedRoomType:
 
     log_probability: Float[np.ndarray, "t"]
     prior: Float[np.ndarray, "t"]
+
+    def shares(self) -> dict[str, float]:
+        """Return the probabilities of the types that are not negligible, the most probable first."""
+        share = np.exp(self.log_probability)
+        return {ROOM_TYPES[k]: float(share[k]) for k in np.argsort(-share) if share[k] >= _MIN_PROBABILITY}
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """Object in a photograph: its name, probability, and azimuth (radians) relative to the photograph's centre."""
+
+    name: str
+    probability: float
+    azimuth: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeenObjects:
+    """Objects that a photograph, or several of one spot, show, and the type of room that they suggest.
+
+    Attributes:
+        room_type: its probabilities presume that all types are equally frequent.
+        objects: the most probable first.
+    """
+
+    room_type: PredictedRoomType
+    objects: tuple[SeenObject, ...]

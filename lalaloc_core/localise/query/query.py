@@ -12,6 +12,7 @@ from lalaloc_core.localise.query.predictions import (
     PredictedOpenings,
     PredictedProfile,
     PredictedRoomType,
+    SeenObjects,
 )
 from lalaloc_core.localise.query.stated_pose import CameraHeight
 
@@ -32,6 +33,7 @@ class Query:
         camera_height: stated camera height, which predictions in metres refer to.
         profile: predicted wall profile; None if the image encoder predicts none.
         openings, ceiling, room_type: other predictions; None if the image encoder does not make them.
+        objects: recognised objects, whose room type replaces `room_type`; None if the model recognises none.
         searched: the same photograph with an unknown heading, to doubt a given one; None if the heading is unknown.
         is_view: whether the encoder of views read it, which has matching weights and confidence of its own.
     """
@@ -45,6 +47,7 @@ class Query:
     openings: PredictedOpenings | None = None
     ceiling: PredictedCeiling | None = None
     room_type: PredictedRoomType | None = None
+    objects: SeenObjects | None = None
     searched: Query | None = None
     is_view: bool = False
 

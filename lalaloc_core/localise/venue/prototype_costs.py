@@ -138,10 +138,14 @@ class PrototypeCosts:
 
     @cached_property
     def room_types(self) -> Float[np.ndarray, "t"]:
-        """Cost of each room type."""
-        if self._query.room_type is None or not self._config.use_room_type:
+        """Cost of each room type, by recognised objects if the query has some."""
+        objects, predicted = self._query.objects, self._query.room_type
+        weight = self._weights.room_type
+        if objects is not None:
+            predicted, weight = objects.room_type, 1.0 / self._weights.temperature
+        if predicted is None or not self._config.use_room_type:
             return np.zeros(len(ROOM_TYPES))
-        return self._weights.room_type * room_type_losses(self._query.room_type, self._config.floor)
+        return weight * room_type_losses(predicted, self._config.floor)
 
     def room_costs(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the cost of each prototype's room type and ceiling, and the penalty of its height hypothesis."""
