@@ -14,11 +14,11 @@ from lalaloc_core.errors import ConfigError
 class LogisticModel:
     """Probability that a picture fits its plan, a logistic function of the signals of `localise.belief.confidence`.
 
-    The class is here because its weights are part of the manifest; `confidence.confidence_of` is the only function that
-    computes the confidence of an answer from it.
+    The class is here because its weights are part of the manifest; `confidence.confidence_of` computes the confidence
+    of an answer from it.
 
     Weights of signals that a model was not fitted with are 0: `answer_to_chance` and, without a cohort,
-    `cost_to_chance` in models of earlier versions; `cost_to_chance` and `log_odds` in models that are fitted now.
+    `cost_to_chance` in models of earlier versions; `log_odds` in models that are fitted now.
     """
 
     bias: float

@@ -2,7 +2,7 @@
 
 A floor plan is an extrusion, so one 2-D ray per azimuth column against the room's wall segments determines the whole
 bare layout, and layout depth follows from the wall profile. The code uses the array API: it runs on numpy arrays
-(service) and on torch tensors (training and LPO), where the result is differentiable in position and heading almost
+(service) and on torch tensors (training), where the result is differentiable in position and heading almost
 everywhere.
 """
 

@@ -1,7 +1,7 @@
 """Admission control: slots for each kind of request, and immediate refusal when all are in use.
 
-Every request, except for health and metrics, holds a slot from its first byte to its last. An uploaded query needs a
-second slot to be computed, and waits for it in a short queue. All queues are bounded.
+Every request, except for health and metrics, holds a slot from the end of its head to the end of its answer. An
+uploaded query needs a second slot to be computed, and waits for it in a short queue. All queues are bounded.
 """
 
 from __future__ import annotations

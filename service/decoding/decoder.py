@@ -116,7 +116,7 @@ class Decoder:
         is_sphere: bool,
         max_size: tuple[int, int],
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """Decode a photograph to be shown: upright within `max_size` (width, height), a full sphere level and of it.
+        """Decode a photograph to be shown: upright within `max_size` (width, height), a sphere level and of that size.
 
         Raises:
             LaLaLocError: as `decode`.

@@ -1,9 +1,11 @@
 """HTTP layer between the socket and the routes: uploads, idempotency, events, errors, headers.
 
-Begin with `uploads.py`, and `middleware/`, which every request passes.
-Routes read bodies with `fields.py`, handle headers and cursors with `accept.py`, `conditional.py`,
-`cursors.py` and `idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors. `server.py` runs
-the app, `api_description.py` describes it.
+`http_protocol.py` and `socket_protocol.py` parse the bytes of a connection, paced by `paced_parsing.py`; `server.py`
+runs them.
+Begin with `uploads.py`, which reads bodies, and `middleware/`, which every request passes.
+Routes check form fields with `fields.py`, handle headers and cursors with `accept.py`, `conditional.py`,
+`cursors.py` and `idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors,
+`api_description.py` describes the app.
 """
 
 from service.http.events import PlanEvents

@@ -1,4 +1,4 @@
-"""Localisation in stored plans and venues: each query holds a slot from its first computation to its answer."""
+"""Localisation in stored plans and venues: each query holds a slot while it computes, not while it waits for grids."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ class Signals:
 
     Attributes:
         log_odds: of the camera being within 1 m of the answer, by the posterior.
+        cost: matching cost of the answer.
         uncertainty: mean log of the scales that the image encoder predicts; 0 if it predicts none, or saw no wall.
         latent_distance: of the answer. Pictures without a room fit anywhere, as their predictions are uncertain, but
             their latents are far from every layout's.

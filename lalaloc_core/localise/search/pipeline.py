@@ -1,8 +1,8 @@
 """Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
 
-The same code answers over HTTP and in evaluation; only the refiner, which runs pose refinement, differs. A search is
-therefore a generator: it yields refinement jobs, which the caller runs in this process (`run_steps`) or in another one
-(`next_step`).
+The same code answers over HTTP and in evaluation, which records every stage; the refiner, which runs pose refinement,
+differs. A search is therefore a generator: it yields refinement jobs, which the caller runs in this process
+(`run_steps`) or in another one (`next_step`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Refiner = Callable[[RefinementJob], RefinementResult | None]
 
 @dataclass(frozen=True, kw_only=True)
 class LocaliseConfig:
-    """Settings of the search; the defaults are the paper's for those that the paper states (section 5).
+    """Settings of the search; the defaults of `vdr_*` are the paper's (section 5).
 
     Attributes:
         vdr_samples: poses of a Vogel disc.

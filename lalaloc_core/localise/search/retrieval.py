@@ -42,7 +42,7 @@ def grid_costs(
 ) -> GridCosts:
     """Return the costs of the best and all probable pairs of a grid pose and a hypothesis.
 
-    The coarse pass (`coarse_pass.py`) compares all pairs; its best are compared in full.
+    The coarse pass (`coarse_pass.py`) excludes most pairs; the rest, or all of few pairs, are compared in full.
 
     Raises:
         InvalidHintError: strict hints exclude every pose of the grid.
