@@ -173,6 +173,10 @@ def test_features_replace_the_photograph(browser: Browser, service: httpx.Client
     assert found.features.azimuths == expected.features.azimuths
     for name, values in expected.features.outputs.items():
         difference = np.abs(found.features.outputs[name] - values).mean()
+        if name == "object_azimuth":
+            # Objects that are not there are anywhere.
+            shown = expected.features.outputs["object_probability"] > 0.1
+            difference = np.abs(found.features.outputs[name] - values)[shown].sum()
         assert difference < 0.02 + 0.03 * np.std(values), name
     fields = {name: str(value) for name, value in stated.items()} | {"floorplan_id": answer["floorplan_id"]}
     uploaded = service.post("/localise", data=fields, files={"photo": content}).json()

@@ -19,7 +19,7 @@ export interface Header {
 }
 
 const MAGIC = "LLFT",
-  VERSION = 1,
+  VERSION = 2,
   PREFIX_BYTES = 10;
 
 /** Return a file with a header and arrays, in the order of the format. */

@@ -6,6 +6,7 @@ import * as ort from "onnxruntime-web/wasm";
 
 import { InputError } from "../input_error";
 import { radians } from "../layout";
+import type { Size } from "../projection";
 import type { PatchSize } from "./patches";
 
 /** Parts of the manifest that are used. */
@@ -18,6 +19,7 @@ export interface Manifest {
   ring_sectors: number | null;
   room_types: string[];
   image_config: { modes?: number };
+  objects?: { names: string[] } | null;
   view: { image_height: number; image_width: number; sectors: number; top_deg: number } | null;
 }
 
@@ -26,7 +28,8 @@ type Outputs = Record<string, Float32Array>;
 const RUNTIME = "/web/onnxruntime.wasm.gz",
   RUNTIME_SCRIPT = "/web/onnxruntime.js";
 const SPHERES = "image_encoder.onnx",
-  VIEWS = "view_encoder.onnx";
+  VIEWS = "view_encoder.onnx",
+  OBJECTS = "objects.onnx";
 // As in lalaloc_core: camera heights (m) of the rings, the height of all other outputs, and the patches read at once.
 const HEIGHTS_M = [0.5, 1, 1.5, 2, 3],
   HEIGHT_M = 1,
@@ -108,6 +111,23 @@ export class Model {
       parts.push(await this.run(VIEWS, images, [batch.length, height, width, 4], HEIGHT_M, names));
     }
     return names.map((name) => Float32Array.from(parts.flatMap((part) => [...part[name]!])));
+  }
+
+  /** Return probability and azimuth of each object in a picture with the given azimuths of columns; none without a classifier. */
+  async objects(rgb: Uint8ClampedArray, { width, height }: Size, azimuths: number[]): Promise<Float32Array[]> {
+    if (!this.manifest.objects) return [];
+    const outputs = await this.run(OBJECTS, new Uint8Array(rgb), [1, height, width, 3], HEIGHT_M, [
+      "probability",
+      "by_column",
+    ]);
+    const probability = outputs.probability!,
+      byColumn = outputs.by_column!,
+      columns = azimuths.length;
+    const places = Float32Array.from(probability, (_, object) => {
+      const row = byColumn.subarray(object * columns, (object + 1) * columns);
+      return azimuths[row.indexOf(Math.max(...row))]!;
+    });
+    return [probability, places];
   }
 
   private async run(

@@ -7,6 +7,7 @@ import { type Header, featuresFile } from "./features_file";
 import { findLens, type Lens, poseAngle, type Stated } from "./lens";
 import { type Metadata, readMetadata } from "./metadata";
 import { type Manifest, Model } from "./model";
+import { columnAzimuths, overviewSize } from "./objects";
 import { cutPatch, FINER, patchSteps, seenDeg } from "./patches";
 import { decoded, levelled, looksSpherical, scaled } from "./pixels";
 import { findSegments } from "./segments";
@@ -32,6 +33,8 @@ const MIN_PIXELS = 64,
   MAX_PITCH_DEG = 60,
   MAX_ROLL_DEG = 180,
   JUDGED = { width: 256, height: 128 };
+// Pixels of a column in which the classifier of objects finds them.
+const OBJECT_COLUMN = 32;
 // Photographs are scaled down if they are finer than this times the need.
 const SMALLEST_REDUCTION = 0.85;
 const NOT_ESTIMATED =
@@ -147,7 +150,12 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
     share = wanted > SMALLEST_REDUCTION ? 1 : wanted;
   const picture = scaled(bitmap, Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height)));
   const steps = patchSteps(hfov, size);
-  const arrays = await encoder.patches(steps.map((step) => cutPatch(picture, view, step * size.step, size)));
+  const shown = overviewSize(bitmap),
+    overview = scaled(bitmap, shown.width, shown.height);
+  const arrays = [
+    ...(await encoder.patches(steps.map((step) => cutPatch(picture, view, step * size.step, size)))),
+    ...(await encoder.objects(overview.rgb, shown, columnAzimuths(view, shown.width / OBJECT_COLUMN))),
+  ];
   const header: Header = {
     ...common(lens, encoder),
     hfov: view.hfov,
