@@ -180,7 +180,7 @@ class AdmissionLimits:
     """Limits of requests in progress.
 
     Attributes:
-        requests: uploads and queries, from the first byte of the body.
+        requests: uploads and queries, from the end of the head.
         queries: queries that are computed or wait for a thread.
         waiting_queries: queries that wait for a slot.
         reads: read-only requests.

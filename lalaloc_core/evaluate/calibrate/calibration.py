@@ -56,7 +56,8 @@ class CalibrationConfig:
         seed: of the homes.
         textures: folder of material pictures; None makes all materials procedural.
         views: calibrate the encoder of views instead of that of spheres.
-        keep_evidence: keep the bundle's matching weights and fit only the confidence.
+        keep_evidence: keep the bundle's matching weights, except for a given `tail` or `openings_weight`, and fit the
+            confidence.
         openings_weight: weight of openings relative to walls; None fits it.
         tail: scale of the errors of walls over the predicted one; None keeps the bundle's.
         out: folder of the predictions, from which an interrupted calibration continues; None keeps none.

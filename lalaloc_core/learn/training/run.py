@@ -53,7 +53,7 @@ def train_stage(
     layout_from: Path | None = None,
     teacher: Path | None = None,
 ) -> Checkpoint:
-    """Train a stage in `folder`: "layout", then "image" or "view", or the first two at once ("end-to-end").
+    """Train a stage in `folder`: "layout", then "image", or both at once ("end-to-end"), or "view".
 
     Args:
         name: stage to train.

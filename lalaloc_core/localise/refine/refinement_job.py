@@ -14,9 +14,8 @@ class RefinementJob:
 
     `descent_methods.refine_walls` compares wall profiles with `log_profile`, on numpy. `latent_refiner.PoseOptimiser`
     compares embedded layouts with `targets`, by differences times `precision` if that is not None.
-    `PoseRefiner` reads a job with `log_profile` differently: it passes the optimiser a copy with `log_profile` as the
-    targets, and uses the job's own `targets`, which are latents, for the latent distance alone. Without `log_profile`
-    it compares latents and ignores `precision`.
+    `PoseRefiner` runs `refine_walls` for a job with `log_profile`, whose `targets`, latents, give the latent distance
+    alone; for others it compares latents and ignores `precision`.
 
     Attributes:
         targets: (k, d) latents, or other embeddings for an optimiser with another embedding.

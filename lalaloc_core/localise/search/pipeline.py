@@ -1,8 +1,8 @@
 """Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
 
 The same code answers over HTTP and in evaluation, which records every stage; the refiner, which runs pose refinement,
-differs. A search is therefore a generator: it yields refinement jobs, which the caller runs in this process
-(`run_steps`) or in another one (`next_step`).
+differs. A search is therefore a generator: it yields refinement jobs, which the caller runs at once
+(`run_steps`) or wherever it wants (`next_step`).
 """
 
 from __future__ import annotations
