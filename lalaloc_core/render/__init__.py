@@ -2,8 +2,8 @@
 
 Begin with `sweep.py`, which renders many poses of a plan at once, for numpy only; search and training use it.
 `profile.py` casts rays from poses of one room at walls, and adds floor and ceiling; `layout.py` adds openings and the
-rooms behind them, and `gradient.py` computes derivatives by the pose. These run on numpy and on torch alike, for the encoders
-and for refinement. `sampling.py` draws poses.
+rooms behind them, and `gradient.py` computes derivatives by the pose. These run on numpy and on torch alike, for the
+encoders and for refinement. `sampling.py` draws poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.
 """
 
