@@ -97,7 +97,14 @@ class FloorPlanDocument(BaseModel):
         [], description="Doors, windows and passages; they can touch but not overlap."
     )
     opening_kinds: list[OpeningKind] | None = Field(
-        None, description="Kinds of openings that the plan shows completely. Default: the kinds that occur in it."
+        None,
+        description="Kinds of openings that the plan shows completely. Default: the kinds that occur and are not in "
+        "`opening_trust`.",
+    )
+    opening_trust: dict[OpeningKind, Annotated[float, Field(ge=0, le=1)]] | None = Field(
+        None,
+        description="Probability by kind that an opening that exists is drawn, for kinds that are not in "
+        "`opening_kinds`. Default: 0, openings of the kind are not compared.",
     )
     opening_tolerance_m: float = Field(
         0.35, ge=0.01, le=1.5, description="Largest distance between an opening and the wall it belongs to."

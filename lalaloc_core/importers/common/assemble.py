@@ -17,6 +17,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.importers.common.completeness import estimate_trust
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import ImportLimits
 from lalaloc_core.importers.common.import_options import ImportOptions
@@ -37,6 +38,8 @@ _MAX_ANCHOR_SHIFT_M = 20_000.0
 # Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED, _MAX_USES = 5, 12
+# Trusts in openings below this are reported as guesses.
+_CERTAIN = 0.9
 
 
 class NoRoomError(InvalidFloorPlanError):
@@ -110,13 +113,28 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, shift) for room in rooms]
     if placed.openings:
         document["openings"] = [_opening(opening) for opening in placed.openings]
-    if sketch.opening_kinds is not None:
-        document["opening_kinds"] = list(sketch.opening_kinds)
+    _add_trust(document, sketch, builder)
     # Coordinates on Earth have no unit that could be mistaken.
     builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
     # Validate now, while the error can still refer to the file.
     checked = (limits, FloorPlan.from_dict(document, limits))
     return ImportedPlan(document, builder.build(), sketch.level, anchor, checked)
+
+
+def _add_trust(document: dict[str, Any], sketch: Sketch, builder: ReportBuilder) -> None:
+    """Set the trust in every kind of openings, and report it."""
+    if sketch.opening_kinds is not None:
+        document["opening_kinds"] = list(sketch.opening_kinds)
+        return
+    builder.opening_trust = estimate_trust(document, sketch.recall, sketch.kinds)
+    document["opening_kinds"] = []
+    document["opening_trust"] = {entry.kind: entry.trust for entry in builder.opening_trust if entry.trust > 0.0}
+    builder.unsure += [
+        f"{100.0 * entry.trust:.0f} % of {entry.kind}s are taken to be drawn, because {entry.reason}; correct it with "
+        "opening_trust, or list the kind in opening_kinds if all are drawn"
+        for entry in builder.opening_trust
+        if entry.trust < _CERTAIN
+    ]
 
 
 def assemble_levels(

@@ -79,7 +79,9 @@ class Sketch:
         obstacles: areas without floor, such as columns; cut out of the rooms that they lie in.
         north_deg: direction of north, clockwise from +y.
         anchor: place of the origin on Earth.
-        opening_kinds: kinds of openings that the source shows completely; None for those that occur.
+        opening_kinds: kinds of openings that the source shows completely; None to estimate the trust in each kind.
+        recall: share of drawn openings that the importer finds.
+        kinds: kinds of openings that the source can hold.
         drawn: box around the drawn walls, if rooms were found between them.
     """
 
@@ -92,6 +94,8 @@ class Sketch:
     level: Level | None = None
     anchor: Anchor | None = None
     opening_kinds: tuple[str, ...] | None = None
+    recall: float = 0.95
+    kinds: tuple[OpeningKind, ...] = ("door", "window", "passage")
     drawn: BaseGeometry | None = None
 
 

@@ -79,8 +79,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
                 f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
             )
         _join_touching(sketch, builder)
-        kinds = {opening.kind for opening in sketch.openings}
-        sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(storeys, options, budget.limits, make)
