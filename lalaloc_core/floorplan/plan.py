@@ -19,6 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.fixtures import Fixture, read_fixtures
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
@@ -51,6 +52,7 @@ _PLAN_KEYS = {
     "opening_kinds",
     "opening_trust",
     "opening_tolerance_m",
+    "fixtures",
 }
 
 
@@ -81,6 +83,7 @@ class FloorPlan:
     camera_height_std_m: float | None = None
     states_camera_height: bool = False
     anchor: Anchor | None = None
+    fixtures: tuple[Fixture, ...] = ()
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -156,6 +159,7 @@ class FloorPlan:
             ),
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
+            fixtures=read_fixtures(document.get("fixtures"), limits),
         )
 
     def anchor_within(self, venue_anchor: Anchor | None) -> Anchor | None:
@@ -188,6 +192,10 @@ class FloorPlan:
         document["rooms"] = [_room_document(room) for room in self.rooms]
         if self.openings:
             document["openings"] = [_opening_document(opening) for opening in self.openings]
+        if self.fixtures:
+            document["fixtures"] = [
+                {"kind": fixture.kind, "outline": fixture.outline_m.tolist()} for fixture in self.fixtures
+            ]
         return document
 
     @property

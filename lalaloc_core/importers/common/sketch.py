@@ -52,6 +52,14 @@ class SketchedOpening:
 
 
 @dataclass(frozen=True)
+class SketchedFixture:
+    """Fixture with its outline seen from above, in metres; `kind` is one of `conventions.FIXTURE_KINDS`."""
+
+    kind: str
+    shape: shapely.Polygon
+
+
+@dataclass(frozen=True)
 class Level:
     """Storey of a building."""
 
@@ -97,6 +105,7 @@ class Sketch:
     recall: float = 0.95
     kinds: tuple[OpeningKind, ...] = ("door", "window", "passage")
     drawn: BaseGeometry | None = None
+    fixtures: list[SketchedFixture] = field(default_factory=list)
 
 
 def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:

@@ -252,6 +252,7 @@ export function scaled(plan: PlanDocument, factor: number): PlanDocument {
     ...plan,
     rooms: plan.rooms.map(scaledRoom),
     openings: (plan.openings ?? []).map((opening) => ({ ...opening, line: all(opening.line) as [Point, Point] })),
+    ...(plan.fixtures ? { fixtures: plan.fixtures.map((f) => ({ ...f, outline: all(f.outline) })) } : {}),
   };
 }
 
