@@ -26,6 +26,11 @@ MIN_CAMERA_HEIGHT_M = 0.1
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 
+# Kinds of fixtures in plans.
+FIXTURE_KINDS = (
+    "toilet", "bath", "shower", "basin", "sink", "stove", "fridge", "washer", "bed", "sofa", "stairs",
+)  # fmt: skip
+
 # Room types; the index is the code. docs/reference/plan-format.md describes each.
 ROOM_TYPES = (
     "unknown",

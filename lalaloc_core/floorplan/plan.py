@@ -6,7 +6,7 @@ Rooms can have holes and free-standing walls. Openings are parts of walls: the w
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.fixtures import Fixture, read_fixtures
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
@@ -29,9 +30,10 @@ from lalaloc_core.floorplan.reading import (
     TOLERANCES_M,
     read_camera_height,
     read_ceiling,
-    read_opening_kinds,
+    read_opening_trust,
     read_openings,
     read_rooms,
+    trust_warnings,
 )
 from lalaloc_core.floorplan.rooms import Room, frozen
 from lalaloc_core.floorplan.values import check_keys, json_kind, read_name, read_optional
@@ -48,7 +50,9 @@ _PLAN_KEYS = {
     "anchor",
     "openings",
     "opening_kinds",
+    "opening_trust",
     "opening_tolerance_m",
+    "fixtures",
 }
 
 
@@ -60,7 +64,7 @@ class FloorPlan:
         camera_height_m: height of the camera assumed for photographs of this plan.
         warnings: problems that do not prevent use, such as overlapping rooms.
         north: azimuth of true north (radians), None if unknown.
-        opening_kinds: kinds of openings that the plan shows completely.
+        opening_trust: probability by kind that an opening that exists is drawn; kinds that are left out have 0.
         opening_tolerance_m: maximum distance between an opening's line and its wall.
         opening_faces: the parts of walls that openings occupy.
         camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
@@ -73,12 +77,13 @@ class FloorPlan:
     warnings: tuple[str, ...] = ()
     north: float | None = None
     openings: tuple[Opening, ...] = ()
-    opening_kinds: frozenset[str] = frozenset()
+    opening_trust: Mapping[str, float] = field(default_factory=dict)
     opening_tolerance_m: float = DEFAULT_OPENING_TOLERANCE_M
     opening_faces: tuple[OpeningFace, ...] = ()
     camera_height_std_m: float | None = None
     states_camera_height: bool = False
     anchor: Anchor | None = None
+    fixtures: tuple[Fixture, ...] = ()
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -120,6 +125,7 @@ class FloorPlan:
         rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)
         check_size(rooms, limits)
         openings = read_openings(document.get("openings"), rooms, limits)
+        opening_trust = read_opening_trust(document, openings)
         tolerance_m = read_optional(document.get("opening_tolerance_m"), "opening_tolerance_m", *TOLERANCES_M, " m")
         tolerance_m = DEFAULT_OPENING_TOLERANCE_M if tolerance_m is None else tolerance_m
         faces, unplaced = place_openings(openings, rooms, tolerance_m, limits)
@@ -137,7 +143,7 @@ class FloorPlan:
             north = heading_from_degrees(anchor.north_deg)
         if warnings is None:
             off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
-            warnings = (*overlap_warnings(rooms, limits), *off_wall)
+            warnings = (*overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
         return cls(
             name=name,
             rooms=rooms,
@@ -145,7 +151,7 @@ class FloorPlan:
             warnings=tuple(warnings),
             north=north,
             openings=openings,
-            opening_kinds=read_opening_kinds(document.get("opening_kinds"), openings),
+            opening_trust=opening_trust,
             opening_tolerance_m=tolerance_m,
             opening_faces=faces,
             camera_height_std_m=read_optional(
@@ -153,6 +159,7 @@ class FloorPlan:
             ),
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
+            fixtures=read_fixtures(document.get("fixtures"), limits),
         )
 
     def anchor_within(self, venue_anchor: Anchor | None) -> Anchor | None:
@@ -176,13 +183,25 @@ class FloorPlan:
             document["north_deg"] = round(heading_to_degrees(self.north), 9) % 360.0
         if self.anchor is not None:
             document["anchor"] = anchor_document(self.anchor)
-        if self.openings or self.opening_kinds:
+        if self.openings or self.opening_trust:
             document["opening_kinds"] = sorted(self.opening_kinds)
+            doubted = {kind: trust for kind, trust in sorted(self.opening_trust.items()) if trust < 1.0}
+            if doubted:
+                document["opening_trust"] = doubted
             document["opening_tolerance_m"] = self.opening_tolerance_m
         document["rooms"] = [_room_document(room) for room in self.rooms]
         if self.openings:
             document["openings"] = [_opening_document(opening) for opening in self.openings]
+        if self.fixtures:
+            document["fixtures"] = [
+                {"kind": fixture.kind, "outline": fixture.outline_m.tolist()} for fixture in self.fixtures
+            ]
         return document
+
+    @property
+    def opening_kinds(self) -> frozenset[str]:
+        """Kinds of openings that the plan shows completely."""
+        return frozenset(kind for kind, trust in self.opening_trust.items() if trust == 1.0)
 
     @property
     def area_m2(self) -> float:

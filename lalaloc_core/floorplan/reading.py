@@ -202,12 +202,37 @@ def read_openings(raw: Any, rooms: Sequence[Room], limits: PlanLimits) -> tuple[
     return tuple(_read_opening(entry, f"opening {index}", ids, limits) for index, entry in enumerate(entries))
 
 
-def read_opening_kinds(raw: Any, openings: Sequence[Opening]) -> frozenset[str]:
-    """Read the kinds of openings that a plan shows completely; by default the kinds that occur in it."""
-    if raw is None:
-        return frozenset(opening.kind for opening in openings)
-    kinds = read_list(raw, "opening_kinds", len(_KINDS), "one of each kind")
-    return frozenset(read_choice(kind, _KINDS, "an entry of opening_kinds") for kind in kinds)
+def read_opening_trust(document: Mapping[str, Any], openings: Sequence[Opening]) -> dict[str, float]:
+    """Read the positive trusts in a plan's kinds of openings.
+
+    `opening_kinds` lists kinds with a trust of 1, by default those that occur and are not in `opening_trust`.
+
+    Raises:
+        InvalidFloorPlanError: a kind is unknown, or a trust is not a probability.
+    """
+    raw = document.get("opening_trust")
+    if raw is not None and not isinstance(raw, Mapping):
+        raise InvalidFloorPlanError(f"opening_trust must be an object, not {json_kind(raw)}")
+    check_keys(raw or {}, set(_KINDS), where="opening_trust: ")
+    stated = {
+        kind: read_number_between(value, f"opening_trust: {kind}", 0.0, 1.0, "") for kind, value in (raw or {}).items()
+    }
+    if document.get("opening_kinds") is None:
+        complete = {opening.kind for opening in openings} - stated.keys()
+    else:
+        kinds = read_list(document["opening_kinds"], "opening_kinds", len(_KINDS), "one of each kind")
+        complete = {read_choice(kind, _KINDS, "an entry of opening_kinds") for kind in kinds}
+    return {kind: trust for kind, trust in (stated | dict.fromkeys(complete, 1.0)).items() if trust > 0.0}
+
+
+def trust_warnings(document: Mapping[str, Any]) -> list[str]:
+    """Return a warning for each kind with another trust in `opening_trust` than in `opening_kinds`."""
+    stated, complete = document.get("opening_trust") or {}, document.get("opening_kinds") or ()
+    return [
+        f"opening_trust of '{kind}' is {value:g}, but opening_kinds lists it: 1 is used; remove it from one of them"
+        for kind, value in stated.items()
+        if kind in complete and value != 1
+    ]
 
 
 def _read_opening(raw: Any, where: str, room_ids: set[str], limits: PlanLimits) -> Opening:

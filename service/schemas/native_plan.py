@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.conventions import FIXTURE_KINDS, MIN_CAMERA_HEIGHT_M, OPENING_CLASSES, ROOM_TYPES
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Segment = Annotated[list[Point], Field(min_length=2, max_length=2)]
@@ -40,6 +40,13 @@ class OpeningDocument(BaseModel):
     rooms: list[str] | None = Field(
         None, description="Ids of the rooms that it belongs to. Default: all rooms whose wall it lies on."
     )
+
+
+class FixtureDocument(BaseModel):
+    """Fixture of a room."""
+
+    kind: Annotated[str, WithJsonSchema({"type": "string", "enum": [*FIXTURE_KINDS]})]
+    outline: Ring = Field(description="Corners [x, y] in metres, seen from above.")
 
 
 class ControlPoint(BaseModel):
@@ -96,8 +103,16 @@ class FloorPlanDocument(BaseModel):
     openings: list[OpeningDocument] = Field(
         [], description="Doors, windows and passages; they can touch but not overlap."
     )
+    fixtures: list[FixtureDocument] = Field([], description="Fixtures, such as toilets, stoves and stairs.")
     opening_kinds: list[OpeningKind] | None = Field(
-        None, description="Kinds of openings that the plan shows completely. Default: the kinds that occur in it."
+        None,
+        description="Kinds of openings that the plan shows completely. Default: the kinds that occur and are not in "
+        "`opening_trust`.",
+    )
+    opening_trust: dict[OpeningKind, Annotated[float, Field(ge=0, le=1)]] | None = Field(
+        None,
+        description="Probability by kind that an opening that exists is drawn, for kinds that are not in "
+        "`opening_kinds`. Default: 0, openings of the kind are not compared.",
     )
     opening_tolerance_m: float = Field(
         0.35, ge=0.01, le=1.5, description="Largest distance between an opening and the wall it belongs to."

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.schemas.fields import ResponseModel
+from service.schemas.native_plan import OpeningKind
 
 
 class _FileOptions(BaseModel):
@@ -72,6 +73,14 @@ class LevelAnswer(ResponseModel):
     elevation_m: float | None = Field(description="Height of its floor in the file; null if unknown.")
 
 
+class OpeningTrustAnswer(ResponseModel):
+    """Trust in the openings of one kind."""
+
+    kind: OpeningKind
+    trust: float = Field(ge=0, le=1, description="Probability that an opening that exists is drawn.")
+    reason: str
+
+
 class ImportReport(ResponseModel):
     """Report on reading a plan file."""
 
@@ -88,4 +97,7 @@ class ImportReport(ResponseModel):
         default=[],
         description="Outlines (m) of areas inside the drawn walls of a picture that became no room, the largest first; "
         "marked in `preview.svg`.",
+    )
+    opening_trust: list[OpeningTrustAnswer] = Field(
+        default=[], description="Estimated `opening_trust` of the plan; empty if the file states it."
     )

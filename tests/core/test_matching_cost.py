@@ -149,6 +149,34 @@ class TestOpenings:
         assert claimed > 1.0
         assert unclaimed < 0.02
 
+    def test_trust_mixes_the_drawn_class_with_what_is_left_out_elsewhere(self) -> None:
+        plan = FloorPlan.from_dict({**PLAN.to_dict(), "opening_kinds": ["window"], "opening_trust": {"door": 0.6}})
+        probability = np.random.default_rng(3).dirichlet(np.ones(4), (1, 8))
+        query = make_query(np.zeros((1, 8)), np.zeros((1, 8)), openings=openings(probability))
+        kinds = [WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE]
+        layouts = hall_layouts(np.zeros((4, 8)), np.repeat(np.array(kinds, np.uint8)[:, None], 8, axis=1))
+        found = MatchingCost(plan, query, 0.0, WEIGHTS, CONFIG).costs(layouts)[0][0]
+        ratio = probability[0] / PRIOR
+        missing = PRIOR * [1.0, 0.4, 0.0, 1.0]
+        elsewhere = ratio @ missing / missing.sum()
+        drawn = np.stack([elsewhere, 0.6 * ratio[:, 1] + 0.4 * elsewhere, ratio[:, 2], elsewhere], axis=1)
+        likelihood = np.log(0.03 + 0.97 * drawn)
+        expected = 0.5 * (likelihood.max(axis=1, keepdims=True) - likelihood).mean(axis=0)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+    @pytest.mark.parametrize("kinds", [[], ["door"], ["window", "passage"]])
+    def test_trust_of_0_and_1_costs_the_same_as_a_list_of_kinds(self, kinds: list[str]) -> None:
+        trust = {kind: float(kind in kinds) for kind in ("door", "window", "passage")}
+        listed, trusted = (
+            FloorPlan.from_dict(PLAN.to_dict() | claims)
+            for claims in ({"opening_kinds": kinds}, {"opening_kinds": [], "opening_trust": trust})
+        )
+        probability = np.random.default_rng(4).dirichlet(np.ones(4), (1, 8))
+        query = make_query(np.zeros((1, 8)), np.zeros((1, 8)), openings=openings(probability))
+        layouts = hall_layouts(np.zeros((4, 8)), np.repeat(np.arange(4, dtype=np.uint8)[:, None], 8, axis=1))
+        found = [MatchingCost(plan, query, 0.0, WEIGHTS, CONFIG).costs(layouts)[0] for plan in (listed, trusted)]
+        np.testing.assert_array_equal(found[0], found[1])
+
     def test_uninformative_openings_favour_no_kind(self) -> None:
         # An uninformative prediction equals the prior, so every class costs the same.
         query = make_query(np.zeros((1, 8)), np.zeros((1, 8)), openings=openings(np.tile(PRIOR, (1, 8, 1))))
@@ -179,7 +207,8 @@ class TestOpenings:
         rng = np.random.default_rng(seed)
         probability, prior = rng.dirichlet(np.ones(4), 5), rng.dirichlet(np.full(4, 5.0))
         appearance, floor = rng.dirichlet(np.ones(4), 4), 0.03
-        found = class_losses(probability, prior, claimed, floor, appearance.tolist())
+        trust = [float(kind in claimed) for kind in range(4)]
+        found = class_losses(probability, prior, trust, floor, appearance.tolist())
         for azimuth, drawn in np.ndindex(found.shape):
             # Classes that the plan does not claim are drawn as wall.
             kinds = [drawn] if drawn in claimed else [kind for kind in range(4) if kind not in claimed]
@@ -189,8 +218,8 @@ class TestOpenings:
                 for seen in range(4)
             )
             assert found[azimuth, drawn] == pytest.approx(-math.log(floor + (1.0 - floor) * share), abs=1e-9)
-        itself = class_losses(probability, prior, claimed, floor, np.eye(4).tolist())
-        np.testing.assert_allclose(class_losses(probability, prior, claimed, floor), itself, atol=1e-12)
+        itself = class_losses(probability, prior, trust, floor, np.eye(4).tolist())
+        np.testing.assert_allclose(class_losses(probability, prior, trust, floor), itself, atol=1e-12)
 
     @pytest.mark.parametrize("rows", [((1.0, 0.0),) * 4, ((0.5, 0.3, 0.1, 0.0),) * 4, ((1.5, -0.5, 0.0, 0.0),) * 4])
     def test_invalid_appearance_is_refused(self, rows: tuple[tuple[float, ...], ...]) -> None:

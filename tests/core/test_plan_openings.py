@@ -145,6 +145,31 @@ def test_opening_kinds_default_to_those_that_occur() -> None:
     assert "'gate'" in refused(with_openings, DOOR, opening_kinds=["gate"])
 
 
+def test_opening_trust_is_for_kinds_that_are_not_complete() -> None:
+    assert with_openings(DOOR).opening_trust == {"door": 1.0}
+    plan = with_openings(DOOR, opening_trust={"door": 0.7, "passage": 0})
+    assert (plan.opening_trust, plan.opening_kinds, plan.warnings) == ({"door": 0.7}, frozenset(), ())
+    assert plan.to_dict()["opening_trust"] == {"door": 0.7}
+    assert FloorPlan.from_dict(plan.to_dict()).opening_trust == plan.opening_trust
+    assert with_openings(DOOR, opening_trust={"window": 0.2}).opening_trust == {"door": 1.0, "window": 0.2}
+    # Older clients add a kind to opening_kinds and send the trust back.
+    corrected = with_openings(DOOR, opening_kinds=["door"], opening_trust={"door": 0.7})
+    assert corrected.opening_trust == {"door": 1.0}
+    assert corrected.warnings == (
+        "opening_trust of 'door' is 0.7, but opening_kinds lists it: 1 is used; remove it from one of them",
+    )
+
+
+@pytest.mark.parametrize(
+    ("trust", "fault"),
+    [(["door"], "a list"), ({"gate": 1}, "gate"), ({"door": 1.5}, "1.5"), ({"door": "much"}, "door")],
+)
+def test_invalid_opening_trust_is_rejected(trust: Any, fault: str) -> None:
+    message = refused(with_openings, DOOR, opening_trust=trust)
+    assert "opening_trust" in message
+    assert fault in message
+
+
 @pytest.mark.parametrize("value", [0.0, 2.0, "0.3", None])
 def test_tolerance_out_of_range_is_refused(value: Any) -> None:
     if value is None:

@@ -34,11 +34,13 @@ from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
     Prototypes,
+    claims_of_trust,
     joined,
     most_probable,
     packed_openings,
     prototypes_of,
     share_searched,
+    trust_of_claims,
     unpacked_openings,
 )
 from lalaloc_core.render.sampling import PoseSet, pose_grid
@@ -455,10 +457,30 @@ def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes])
 def test_search_sent_to_another_machine_has_the_same_costs(prototype_sets: list[Prototypes]) -> None:
     search = PlanSearch(query_at(prototype_sets[0], 2, np.random.default_rng(16)), STEP_M, WEIGHTS, CONFIG)
     alone = len(pickle.dumps(search))
-    assert search.costs.opening_loss is not None
+    search.costs.opening_loss(claims_of(FAMILIES - 1))
     sent = pickle.dumps(search)
     assert len(sent) < 2 * alone
-    np.testing.assert_array_equal(pickle.loads(sent).costs.opening_loss, search.costs.opening_loss)
+    np.testing.assert_array_equal(
+        pickle.loads(sent).costs.opening_loss(claims_of(FAMILIES - 1)),
+        search.costs.opening_loss(claims_of(FAMILIES - 1)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("trust", "level"),
+    [
+        ({}, [0, 0, 0]),
+        ({"door": 1.0, "window": 1.0, "passage": 1.0}, [1, 1, 1]),
+        ({"door": 0.9, "window": 0.7, "passage": 0.3}, [1, 0.75, 0.35]),
+    ],
+)
+def test_claims_keep_the_nearest_level_of_each_trust(trust: dict[str, float], level: list[float]) -> None:
+    assert trust_of_claims(claims_of_trust(trust)) == [0.0, *level]
+
+
+def test_claims_of_complete_kinds_are_those_of_earlier_databases() -> None:
+    assert claims_of_trust({"door": 1.0, "passage": 1.0}) == 0b1010
+    assert [trust_of_claims(claims_of(family)) for family in (0, 5)] == [[0, 0, 0, 0], [0, 1, 0, 1]]
 
 
 def test_plans_with_and_without_openings_are_found() -> None:
@@ -521,7 +543,7 @@ def test_merged_costs_equal_those_of_each_plan(merged_plans: MergedPlans) -> Non
     for plan in PLANS:
         grid = grid_of(plan)
         # Only opening kinds that every plan shows are compared; one plan shows none.
-        compared = replace(plan, opening_kinds=frozenset())
+        compared = replace(plan, opening_trust={})
         parts.append(MatchingCost(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
     np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
 

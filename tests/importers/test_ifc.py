@@ -238,3 +238,27 @@ def test_building_of_low_spaces_alone_is_refused():
     model.spaces(model.prism("IfcSpace", _box(0, 0, 4000, 5000), 0, 1300, LongName="Eaves"))
     with pytest.raises(InvalidFloorPlanError, match=r"no room is higher than a camera, 1.5 m: room 'Eaves'"):
         import_plan(model.content())
+
+
+def test_terminals_furniture_and_stairs_become_fixtures() -> None:
+    model = _Model()
+
+    def box(x: float, y: float, width: float, depth: float) -> list[tuple[float, float]]:
+        return [(x, y), (x + width, y), (x + width, y + depth), (x, y + depth)]
+
+    model.spaces(
+        model.prism("IfcSpace", box(0, 0, 4000, 3000), 0, 2500, Name="1"),
+        model.prism("IfcSpace", box(4200, 0, 2000, 3000), 0, 2500, Name="2"),
+    )
+    elements = [
+        model.prism("IfcSanitaryTerminal", box(200, 200, 400, 600), 0, 450, Name="A1", PredefinedType="TOILETPAN"),
+        model.prism("IfcFurniture", box(1500, 500, 900, 900), 0, 450, Name="Chair"),
+        model.prism("IfcStairFlight", box(4300, 100, 1000, 2800), 0, 2600, Name="S"),
+    ]
+    model.file.create_entity(
+        "IfcRelContainedInSpatialStructure", ifcopenshell.guid.new(), RelatedElements=elements,
+        RelatingStructure=model.storey,
+    )  # fmt: skip
+    plan = import_plan(model.file.to_string().encode())
+    assert [fixture["kind"] for fixture in plan.document["fixtures"]] == ["toilet", "stairs"]
+    assert {room["name"]: room.get("type") for room in plan.document["rooms"]} == {"1": "bathroom", "2": "stairs"}

@@ -132,11 +132,11 @@ def test_picture_is_a_draft_with_its_guesses(drawn: dict[Style, DrawnPlan]):
     assert any("texts of the picture were read" in line for line in plan.report.notes)
 
 
-def test_draft_claims_no_kind_of_opening(drawn: dict[Style, DrawnPlan]):
+def test_draft_uses_its_openings_as_far_as_they_seem_complete(drawn: dict[Style, DrawnPlan]):
     draft = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
-    assert draft.plan().openings
     assert draft.plan().opening_kinds == frozenset()
-    assert any("opening_kinds" in guess for guess in draft.report.unsure)
+    assert draft.plan().opening_trust["door"] > 0.8
+    assert {entry.kind: entry.trust for entry in draft.report.opening_trust}["door"] < 1.0
 
 
 def test_picture_without_scale_is_rejected(drawn: dict[Style, DrawnPlan]):

@@ -22,6 +22,7 @@ const LABELS: Record<string, string> = {
   layers: "Only these layers",
   ceiling_height_m: "Ceiling",
   opening_kinds: "Complete in this plan",
+  opening_trust: "Trust in openings",
   projection: "Kind",
   motion: "These photographs are",
 };

@@ -17,13 +17,23 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.importers.common.completeness import estimate_trust
+from lalaloc_core.importers.common.fixtures import place_fixtures, type_rooms
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import ImportLimits
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document
-from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
+from lalaloc_core.importers.common.sketch import (
+    Level,
+    Sketch,
+    SketchedFixture,
+    SketchedOpening,
+    SketchedRoom,
+    T,
+    choose_levels,
+)
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
@@ -37,6 +47,8 @@ _MAX_ANCHOR_SHIFT_M = 20_000.0
 # Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED, _MAX_USES = 5, 12
+# Trusts in openings below this are reported as guesses.
+_CERTAIN = 0.9
 
 
 class NoRoomError(InvalidFloorPlanError):
@@ -107,16 +119,37 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
     document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
+    fixtures = place_fixtures([_shift_fixture(fixture, shift) for fixture in sketch.fixtures], rooms, builder)
+    rooms = type_rooms(rooms, fixtures, builder)
     document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, shift) for room in rooms]
     if placed.openings:
         document["openings"] = [_opening(opening) for opening in placed.openings]
-    if sketch.opening_kinds is not None:
-        document["opening_kinds"] = list(sketch.opening_kinds)
+    if fixtures:
+        document["fixtures"] = [
+            {"kind": fixture.kind, "outline": _ring(fixture.shape.exterior)} for _, fixture in fixtures
+        ]
+    _add_trust(document, sketch, builder)
     # Coordinates on Earth have no unit that could be mistaken.
     builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
     # Validate now, while the error can still refer to the file.
     checked = (limits, FloorPlan.from_dict(document, limits))
     return ImportedPlan(document, builder.build(), sketch.level, anchor, checked)
+
+
+def _add_trust(document: dict[str, Any], sketch: Sketch, builder: ReportBuilder) -> None:
+    """Set the trust in every kind of openings, and report it."""
+    if sketch.opening_kinds is not None:
+        document["opening_kinds"] = list(sketch.opening_kinds)
+        return
+    builder.opening_trust = estimate_trust(document, sketch.recall, sketch.kinds)
+    document["opening_kinds"] = []
+    document["opening_trust"] = {entry.kind: entry.trust for entry in builder.opening_trust if entry.trust > 0.0}
+    builder.unsure += [
+        f"{100.0 * entry.trust:.0f} % of {entry.kind}s are taken to be drawn, because {entry.reason}; correct it with "
+        "opening_trust, or list the kind in opening_kinds if all are drawn"
+        for entry in builder.opening_trust
+        if entry.trust < _CERTAIN
+    ]
 
 
 def assemble_levels(
@@ -292,6 +325,10 @@ def _shift_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: Re
 def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
     (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
     return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
+
+
+def _shift_fixture(fixture: SketchedFixture, shift: tuple[float, float]) -> SketchedFixture:
+    return replace(fixture, shape=affinity.translate(fixture.shape, *shift))
 
 
 def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:

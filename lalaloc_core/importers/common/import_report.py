@@ -10,6 +10,8 @@ from typing import Any, Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.importers.common.completeness import OpeningTrust
+
 TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
 # Corners of an area in metres.
 Outline = tuple[tuple[float, float], ...]
@@ -42,6 +44,7 @@ class ImportReport:
         layers: use of the entities, by layer.
         unsure: guesses and their reasons.
         no_room: outlines (m) of the largest areas inside the drawn walls that became no room.
+        opening_trust: trust in each kind of openings; empty if the file states it.
     """
 
     format: str
@@ -53,6 +56,7 @@ class ImportReport:
     warnings: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
     no_room: tuple[Outline, ...] = ()
+    opening_trust: tuple[OpeningTrust, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -75,6 +79,7 @@ class ReportBuilder:
     unsure: list[str] = field(default_factory=list)
     uses: Counter[tuple[str, str]] = field(default_factory=Counter)
     no_room: list[shapely.Polygon] = field(default_factory=list)
+    opening_trust: tuple[OpeningTrust, ...] = ()
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -93,6 +98,7 @@ class ReportBuilder:
             warnings=_limit_lines(self.warnings),
             unsure=_limit_lines(self.unsure),
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
+            opening_trust=self.opening_trust,
         )
 
 

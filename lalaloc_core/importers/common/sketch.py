@@ -52,6 +52,14 @@ class SketchedOpening:
 
 
 @dataclass(frozen=True)
+class SketchedFixture:
+    """Fixture with its outline seen from above, in metres; `kind` is one of `conventions.FIXTURE_KINDS`."""
+
+    kind: str
+    shape: shapely.Polygon
+
+
+@dataclass(frozen=True)
 class Level:
     """Storey of a building."""
 
@@ -79,7 +87,9 @@ class Sketch:
         obstacles: areas without floor, such as columns; cut out of the rooms that they lie in.
         north_deg: direction of north, clockwise from +y.
         anchor: place of the origin on Earth.
-        opening_kinds: kinds of openings that the source shows completely; None for those that occur.
+        opening_kinds: kinds of openings that the source shows completely; None to estimate the trust in each kind.
+        recall: share of drawn openings that the importer finds.
+        kinds: kinds of openings that the source can hold.
         drawn: box around the drawn walls, if rooms were found between them.
     """
 
@@ -92,7 +102,10 @@ class Sketch:
     level: Level | None = None
     anchor: Anchor | None = None
     opening_kinds: tuple[str, ...] | None = None
+    recall: float = 0.95
+    kinds: tuple[OpeningKind, ...] = ("door", "window", "passage")
     drawn: BaseGeometry | None = None
+    fixtures: list[SketchedFixture] = field(default_factory=list)
 
 
 def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:

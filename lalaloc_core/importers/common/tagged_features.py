@@ -18,6 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.fixtures import fixture_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
@@ -30,6 +31,7 @@ from lalaloc_core.importers.common.sketch import (
     OpeningKind,
     Point,
     Sketch,
+    SketchedFixture,
     SketchedOpening,
     SketchedRoom,
 )
@@ -233,6 +235,10 @@ class _Drawer:
             builder.use(layer, "ignored (not in the option layers)")
         elif role == "room":
             self._add_rooms(feature, shape, layer)
+        elif role in ("obstacle", "ignored") and (kind := _fixture(properties)) and polygons_from_geometry(shape):
+            parts = polygons_from_geometry(shape)
+            builder.use(layer, "fixtures", len(parts))
+            sketch.fixtures += [SketchedFixture(kind, part) for part in parts]
         elif role == "obstacle":
             parts = polygons_from_geometry(shape)
             builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
@@ -295,6 +301,14 @@ class _Drawer:
             lost += ends is None and point.has_level
         if lost:
             self._builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
+
+
+def _fixture(properties: Mapping[str, Any]) -> str | None:
+    """Return the kind of a piece of furniture or equipment; None for parts of the building."""
+    if str(properties.get("feature_type") or "").casefold() in ("unit", "area", "room") or "indoor" in properties:
+        return None
+    texts = (properties.get(key) for key in ("category", "type", "kind", "class", "furniture"))
+    return fixture_from_name(*(text for text in texts if isinstance(text, str)), _name(properties))
 
 
 def _layer(properties: Mapping[str, Any]) -> str:

@@ -60,7 +60,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     Raises:
         InvalidFloorPlanError: the drawing has too many lines that could be walls, or the time is over.
     """
-    sketch = Sketch()
+    sketch = Sketch(fixtures=drawing.fixtures)
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]

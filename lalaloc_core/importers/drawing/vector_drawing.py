@@ -14,6 +14,7 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.geometry import point_xy
+from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role
 
 # Fills of lower luminance (of 255) can be walls.
@@ -104,6 +105,7 @@ class Drawing:
     swings: list[Swing] = field(default_factory=list)
     letterings: list[Lettering] = field(default_factory=list)
     patches: list[Patch] = field(default_factory=list)
+    fixtures: list[SketchedFixture] = field(default_factory=list)
 
     @property
     def next_order(self) -> int:
@@ -137,6 +139,7 @@ class Drawing:
             [replace(s, hinge=point(s.hinge), first=point(s.first), last=point(s.last)) for s in self.swings],
             [replace(t, position=point(t.position), height=t.height * factor) for t in self.letterings],
             [replace(patch, shape=shape(patch.shape)) for patch in self.patches],
+            [replace(fixture, shape=shape(fixture.shape)) for fixture in self.fixtures],
         )
 
 

@@ -27,14 +27,17 @@ from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
 from jaxtyping import Float
+from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.fixtures import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
@@ -59,10 +62,11 @@ _OPTIONS = threading.Lock()
 
 @dataclass(frozen=True)
 class _Context:
-    """Effective layer of an entity, and its role by the name of its layer or block."""
+    """Effective layer of an entity, its role by the name of its layer or block, and the fixture that a block shows."""
 
     layer: str
     role: Role | None
+    fixture: str | None = None
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -200,6 +204,8 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
+        elif context.fixture is not None and options.includes_layer(context.layer):
+            _add_fixture(entity, context, drawing, builder, sag, budget)
         elif context.role == "ignored" or not options.includes_layer(context.layer):
             builder.use(context.layer, "ignored")
         else:
@@ -216,7 +222,7 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
 def _walk(
     entities: Iterable[Any], block: _Context | None, depth: int, budget: Budget
 ) -> Iterator[tuple[DXFGraphic, _Context]]:
-    """Yield entities with their contexts. Blocks are expanded, except for windows, passages and obstacles.
+    """Yield entities with their contexts. Blocks are expanded, except for windows, passages, obstacles and fixtures.
 
     `block` is the context of the block that contains the entities, None for the model space.
     """
@@ -238,7 +244,10 @@ def _walk(
             for copy in entity.multi_insert() if entity.mcount > 1 else (entity,):
                 budget.check_time()
                 context = _Context(layer, role)
-                if role in ("window", "passage", "obstacle"):
+                fixture = fixture_from_name(entity.dxf.name) if role in (None, "ignored") else None
+                if fixture is not None:
+                    yield copy, _Context(layer, role, fixture)
+                elif role in ("window", "passage", "obstacle"):
                     yield copy, context
                 else:
                     yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
@@ -283,18 +292,38 @@ def _add_block(
     entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
 ) -> None:
     """Add a window, passage or obstacle drawn as a block: the smallest rectangle around its entities."""
-    inner = Drawing()
-    for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
-        if part.dxftype() in _LINES | _FILLED:
-            _add(part, context, inner, ReportBuilder(), sag, budget)
-    if not inner.shapes:
+    box = _box(entity, context, sag, budget)
+    if box is None:
         return
-    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(inner.shapes))
     builder.use(context.layer, f"blocks: {context.role}")
     if isinstance(box, shapely.Polygon):
         drawing.areas.append(Area(box, context.layer, context.role))
     elif isinstance(box, shapely.LineString):
         drawing.strokes.append(Stroke(box, context.layer, context.role))
+
+
+def _add_fixture(
+    entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
+) -> None:
+    assert isinstance(entity, Insert)
+    assert context.fixture is not None
+    # Lines of furniture count whatever the role of their layer.
+    box = _box(entity, _Context(context.layer, "obstacle"), sag, budget)
+    if isinstance(box, shapely.Polygon):
+        builder.use(context.layer, f"fixtures: {context.fixture}")
+        drawing.fixtures.append(SketchedFixture(context.fixture, box))
+    else:
+        builder.use(context.layer, "ignored (block without area)")
+
+
+def _box(entity: Insert, context: _Context, sag: float, budget: Budget) -> BaseGeometry | None:
+    """Return the smallest rectangle around the lines and areas of a block, None without any."""
+    inner = Drawing()
+    for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
+        if part.dxftype() in _LINES | _FILLED:
+            _add(part, context, inner, ReportBuilder(), sag, budget)
+    shapes = [*inner.shapes, *(fixture.shape for fixture in inner.fixtures)]
+    return shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes)) if shapes else None
 
 
 def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:

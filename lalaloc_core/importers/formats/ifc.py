@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Float
-from pyproj.exceptions import ProjError
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.floors import find_floor, join_faces, report_floor
 from lalaloc_core.importers.common.geometry import opening_line
@@ -30,10 +28,13 @@ from lalaloc_core.importers.common.sketch import (
     Level,
     OpeningKind,
     Sketch,
+    SketchedFixture,
     SketchedOpening,
     SketchedRoom,
 )
 from lalaloc_core.importers.common.vocabulary import role_from_name
+from lalaloc_core.importers.formats.ifc_anchor import model_anchor
+from lalaloc_core.importers.formats.ifc_fixtures import FURNISHINGS, fixture_kind
 
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
@@ -44,6 +45,8 @@ _END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 # Heights of storeys nearer than this are of one storey (m).
 _SAME_STOREY_M = 1.5
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
+# Share of the time limit after which shapes of fixtures, which can be very detailed, are left out.
+_FIXTURES_SHARE = 0.6
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -61,7 +64,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         raise InvalidFloorPlanError(
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
-    anchor = _anchor(model)
+    anchor = model_anchor(model, _unit(model))
     meshes = _Meshes(budget)
     elements = _elements(model, storeys, meshes)
 
@@ -79,8 +82,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
                 f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
             )
         _join_touching(sketch, builder)
-        kinds = {opening.kind for opening in sketch.openings}
-        sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(storeys, options, budget.limits, make)
@@ -198,8 +199,10 @@ def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Mes
         for storey in model.by_type("IfcBuildingStorey")
     )
     found = _Elements({key: [] for key in storeys})
-    for name in (*_KINDS, "IfcColumn"):
+    for name in (*_KINDS, "IfcColumn", *FURNISHINGS):
         for element in model.by_type(name):
+            if name in FURNISHINGS and (fixture_kind(element) is None or not meshes.has_time_for_fixtures):
+                continue
             key = _container(element)
             if key not in storeys:
                 key = _storey_at(_shape(element, meshes), heights)
@@ -246,6 +249,9 @@ def _add_elements(
 ) -> None:
     """Add the doors, windows and columns of a storey."""
     for element in elements:
+        if (fixture := fixture_kind(element)) is not None:
+            _add_fixture(element, fixture, sketch, builder, meshes)
+            continue
         mesh = _shape(element, meshes)
         kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
         opening = None if mesh is None or kind is None else _opening(element, kind, mesh[0], floor_m)  # type: ignore[arg-type]
@@ -261,6 +267,16 @@ def _add_elements(
             )
             continue
         builder.use(element.is_a(), kind or "holes")
+
+
+def _add_fixture(element: Any, kind: str, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes) -> None:
+    mesh = meshes.of(element) if meshes.has_time_for_fixtures else None
+    outline = None if mesh is None else shapely.minimum_rotated_rectangle(shapely.MultiPoint(mesh[0][:, :2]))
+    if isinstance(outline, shapely.Polygon):
+        sketch.fixtures.append(SketchedFixture(kind, outline))
+        builder.use(element.is_a(), f"fixtures: {kind}")
+    else:
+        builder.use(element.is_a(), "ignored (no geometry)" if meshes.has_time_for_fixtures else "ignored (no time)")
 
 
 def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
@@ -315,6 +331,11 @@ class _Meshes:
         """Function that raises an exception if the time is over."""
         return self._budget.check_time
 
+    @property
+    def has_time_for_fixtures(self) -> bool:
+        """True while there is time to spare."""
+        return self._budget.elapsed_s < _FIXTURES_SHARE * self._budget.limits.max_import_s
+
     def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
         """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
 
@@ -363,79 +384,3 @@ def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shap
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
     return join_faces([shapely.Polygon(triangle) for triangle in corners[flat]]) if flat.any() else []
-
-
-def _anchor(model: Any) -> Anchor | None:
-    """Return the place of the model's origin from IfcMapConversion (IFC 4), else from the site's coordinates."""
-    mapped = _map_conversion(model)
-    if mapped is not None:
-        return mapped
-    north_deg = _true_north_deg(model)
-    for site in model.by_type("IfcSite"):
-        if not site.RefLatitude or not site.RefLongitude:
-            continue
-        latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
-        if abs(latitude) > 90.0 or abs(longitude) > 180.0:
-            continue
-        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, _unit(model))
-        altitude = None if site.RefElevation is None else float(site.RefElevation) * _unit(model)
-        return Anchor(latitude, longitude, altitude, north_deg)
-    return None
-
-
-def _map_conversion(model: Any) -> Anchor | None:
-    conversions = model.by_type("IfcMapConversion") if str(model.schema).startswith("IFC4") else []
-    for conversion in conversions:
-        code = str(getattr(conversion.TargetCRS, "Name", "") or "").upper().replace(" ", "")
-        if not code.startswith("EPSG:"):
-            continue
-        east, north = float(conversion.Eastings), float(conversion.Northings)
-        try:
-            # A step along grid north gives the angle between grid north and true north.
-            lon_lat = to_wgs84(code, np.array([[east, north]]))
-            frame = LocalFrame(float(lon_lat[0, 0]), float(lon_lat[0, 1]))
-            step = frame.to_local(to_wgs84(code, np.array([[east, north + 100.0]])))[0]
-        except ProjError:
-            continue
-        if not np.isfinite(step).all():
-            continue
-        grid_north_deg = math.degrees(math.atan2(step[0], step[1]))
-        x, y = float(conversion.XAxisAbscissa or 1.0), float(conversion.XAxisOrdinate or 0.0)
-        # The model's x axis points along (x, y) of the grid: grid north lies this angle clockwise from its y axis.
-        turned_deg = math.degrees(math.atan2(y, x))
-        height = float(conversion.OrthogonalHeight or 0.0)
-        return Anchor(frame.latitude, frame.longitude, height, (turned_deg - grid_north_deg) % 360.0)
-    return None
-
-
-def _true_north_deg(model: Any) -> float:
-    for context in model.by_type("IfcGeometricRepresentationContext", include_subtypes=False):
-        direction = context.TrueNorth
-        if direction is not None and len(direction.DirectionRatios) >= 2:
-            x, y = (float(ratio) for ratio in direction.DirectionRatios[:2])
-            if x or y:
-                return math.degrees(math.atan2(x, y)) % 360.0
-    return 0.0
-
-
-def _degrees(angle: Iterable[int]) -> float:
-    """Convert a compound angle (degrees, minutes, seconds, millionths of a second, all of one sign) to degrees."""
-    parts = [float(part) for part in angle]
-    return sum(part / size for part, size in zip(parts, (1.0, 60.0, 3600.0, 3600e6), strict=False))
-
-
-def _origin_from_site(
-    site: Any, latitude: float, longitude: float, north_deg: float, unit: float
-) -> tuple[float, float]:
-    """Return latitude and longitude of the model's origin if the site is placed elsewhere in the model."""
-    from ifcopenshell.util.placement import get_local_placement
-
-    if site.ObjectPlacement is None:
-        return latitude, longitude
-    offset = -np.asarray(get_local_placement(site.ObjectPlacement))[:2, 3] * unit
-    turn = math.radians(north_deg)
-    # North lies `north_deg` clockwise from +y of the plan.
-    north = offset @ np.array([math.sin(turn), math.cos(turn)])
-    east = offset @ np.array([math.cos(turn), -math.sin(turn)])
-    origin = LocalFrame(longitude, latitude).to_earth(np.array([[east, north]]))[0]
-    return float(origin[1]), float(origin[0])

@@ -89,7 +89,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
     def make(level: Level, members: list[_Cell]) -> ImportedPlan:
         builder = ReportBuilder("indoorgml", factor, "the option units" if options.units else "the format: metres")
-        sketch = Sketch(level=level if len(levels) > 1 else None, name=level.name if len(levels) > 1 else None)
+        sketch = Sketch(kinds=("door",))
+        if len(levels) > 1:
+            sketch.level, sketch.name = level, level.name
         if without:
             builder.use("CellSpace", "ignored (no floor)", len(without))
             named = ", ".join(f"'{name}'" for name in without[:_MAX_NAMED])
@@ -106,7 +108,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         lowest = level.elevation_m or 0.0
         on_level = [door for door in doors if lowest - _STOREY_M < door.low < lowest + _STOREY_M]
         _add_doors(on_level, lowest, sketch, builder, budget)
-        sketch.opening_kinds = ("door",) if sketch.openings else None
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(levels, options, budget.limits, make)

@@ -107,6 +107,8 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
     builder.use("rooms", "rooms", len(rooms))
     for opening in plan.get("openings") or ():
         builder.use("openings", str(opening["kind"]))
+    for fixture in plan.get("fixtures") or ():
+        builder.use("fixtures", str(fixture["kind"]))
     builder.warnings.extend(check_document(parsed.to_dict()))
     return ImportedPlan(plan, builder.build(), anchor=parsed.anchor, checked=(limits, parsed))
 
@@ -129,6 +131,14 @@ def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[s
             if isinstance(opening, Mapping)
             else opening
             for opening in openings
+        ]
+    fixtures = plan.get("fixtures")
+    if isinstance(fixtures, list):
+        plan["fixtures"] = [
+            {**fixture, **_scale_keys(fixture, ("outline",), factor, y_factor)}
+            if isinstance(fixture, Mapping)
+            else fixture
+            for fixture in fixtures
         ]
     if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _MAX_NUMBER:
         # A flip of y mirrors angles and turns +y by half a turn.

@@ -20,11 +20,20 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.fixtures import fixture_from_name
 from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Level, OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import (
+    Level,
+    OpeningKind,
+    Point,
+    Sketch,
+    SketchedFixture,
+    SketchedOpening,
+    SketchedRoom,
+)
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 
@@ -55,7 +64,7 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
     Raises:
         InvalidFloorPlanError: the scan is invalid, or has neither floors nor walls around a room.
     """
-    keys = ("walls", "floors", "sections", *_OPENINGS)
+    keys = ("walls", "floors", "sections", "objects", *_OPENINGS)
     surfaces = {key: list(_objects(document, key, budget)) for key in keys}
     stories = sorted({_story(raw) for key in ("walls", "floors") for raw in surfaces[key]})
     levels = {str(story): (Level(f"story {story}", float(story)), story) for story in stories}
@@ -88,6 +97,8 @@ def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: Report
         around = [wall for wall in walls if room.distance(wall.line.interpolate(0.5, normalized=True)) < 0.3]
         height_m = float(np.median([wall.high_m - floor_m for wall in around])) if around else None
         sketch.rooms.append(SketchedRoom(room, name, room_type_from_name(name), height_m))
+    for index, raw in enumerate(surfaces["objects"]):
+        _add_object(raw, f"object {index}", sketch, builder)
     for key, kind in _OPENINGS.items():
         for index, raw in enumerate(surfaces[key]):
             part = _surface(raw, f"{key} {index}")
@@ -95,6 +106,19 @@ def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: Report
             sill_m = part.low_m - floor_m if part.low_m - floor_m >= _MIN_SILL_M else None
             sketch.openings.append(SketchedOpening(kind, part.start, part.end, None, sill_m, part.high_m - floor_m))
     return sketch
+
+
+def _add_object(raw: Mapping[str, Any], where: str, sketch: Sketch, builder: ReportBuilder) -> None:
+    """Add a piece of furniture, a box with its category: `{"toilet": {}}` or "toilet"."""
+    category = raw.get("category")
+    name = next(iter(category), "") if isinstance(category, Mapping) else category
+    kind = fixture_from_name(name if isinstance(name, str) else None)
+    builder.use(f"objects: {str(name)[:50]}", "fixtures" if kind else "ignored")
+    if kind is not None:
+        width_m, _, depth_m = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}").tolist()
+        corners = [[x * width_m, 0.0, z * depth_m] for x, z in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+        outline = shapely.Polygon(_from_above(_place(np.array(corners), raw, where)))
+        sketch.fixtures += [SketchedFixture(kind, part) for part in polygons_from_geometry(outline)]
 
 
 def _objects(document: Mapping[str, Any], key: str, budget: Budget) -> Iterator[Mapping[str, Any]]:

@@ -20,11 +20,13 @@ import svgelements
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.fixtures import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.safe_xml import local_name, read_xml
+from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
@@ -66,12 +68,16 @@ _STYLE = (
 
 @dataclass(frozen=True)
 class _Context:
-    """Labels of the elements around a shape, innermost last, and the role and layer that follow from them."""
+    """Labels of the elements around a shape, innermost last, and the role and layer that follow from them.
+
+    `kind` are words about the use of a room; of a fixture, its kind.
+    """
 
     labels: tuple[str, ...] = ()
     role: Role | None = None
     layer: str = ""
     kind: str | None = None
+    is_fixture: bool = False
 
     def nested(self, element: Any) -> _Context:
         """Return the context of a child element; the innermost label with a role decides."""
@@ -217,7 +223,9 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
         budget.spend()
         if _is_hidden(element):
             continue
-        if context.role == "ignored" or not options.includes_layer(*context.labels):
+        if context.is_fixture and options.includes_layer(*context.labels):
+            _add_fixture(element, context, drawing, builder, budget)
+        elif context.role == "ignored" or not options.includes_layer(*context.labels):
             builder.use(context.layer, "ignored")
         elif isinstance(element, svgelements.Text):
             _add_text(element, context, drawing)
@@ -229,10 +237,30 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
 def _walk(group: svgelements.Group, context: _Context) -> Iterator[tuple[Any, _Context]]:
     for element in group:
         nested = context.nested(element)
-        if isinstance(element, svgelements.Group):
+        # Words such as "furniture" or "sanitary" tell a bath from a bathroom.
+        fixture = fixture_from_name(*nested.labels[len(context.labels) :]) if nested.role == "ignored" else None
+        if fixture is not None:
+            yield element, _Context(nested.labels, nested.role, nested.layer, fixture, is_fixture=True)
+        elif isinstance(element, svgelements.Group):
             yield from _walk(element, nested)
         else:
             yield element, nested
+
+
+def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
+    """Add the smallest rectangle around a shape or the shapes of a group."""
+    parts = fixture.select() if isinstance(fixture, svgelements.Group) else [fixture]
+    points = []
+    for part in parts:
+        budget.spend()
+        if isinstance(part, svgelements.Shape) and not _is_hidden(part):
+            points += [outline for outline, _, _ in _outlines(svgelements.Path(part), budget) if len(outline)]
+    box = shapely.minimum_rotated_rectangle(shapely.MultiPoint(np.concatenate(points))) if points else None
+    if context.kind is not None and isinstance(box, shapely.Polygon):
+        builder.use(context.layer, f"fixtures: {context.kind}")
+        drawing.fixtures.append(SketchedFixture(context.kind, box))
+    else:
+        builder.use(context.layer, "ignored")
 
 
 def _is_hidden(element: Any) -> bool:

@@ -28,6 +28,8 @@ _MAX_TURN_DEG, _HALF = 45.0, 127
 # Share of a room's outline that has a seen wall within so many cells, if unknown cells close the rest; rooms that
 # share more with others than the last are these.
 _SEEN_SHARE, _BESIDE_CELLS, _OLD = 0.6, 3.0, 0.5
+# Share of openings that a map shows: closed doors are walls in it.
+_RECALL = 0.7
 # A smaller share of the free cells in rooms gives a warning.
 _USED_SHARE = 0.8
 
@@ -78,10 +80,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
         )
     _report_free_cells(sketch, grid, builder)
     if sketch.openings:
-        builder.unsure.append(
-            f"{len(sketch.openings)} gaps in walls are taken for passages or doors; set opening_kinds to the kinds "
-            "that are complete"
-        )
+        builder.unsure.append(f"{len(sketch.openings)} gaps in walls are taken for passages or doors")
     return sketch
 
 
@@ -125,7 +124,7 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
     for opening in sketch.openings:
         start, end = to_map(np.array([opening.start, opening.end]))
         openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
-    return Sketch(rooms=rooms, openings=openings, opening_kinds=()), inner
+    return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
 
 
 class _Distance:

@@ -30,6 +30,8 @@ _MAX_ISLAND_M2 = 2.0
 # Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area.
 _OUTLINE_ADVANTAGE = 1.6
 _SURE = 0.85
+# Share of drawn openings that are found and classified (benchmarks.plan_pictures).
+_RECALL = 0.95
 # Gaps of twice this width are closed to find the drawn area; parts of it thinner than the walls and the clearance (m)
 # are no rooms. A smaller share covered by rooms gives a warning, with its largest parts.
 _CLOSING_M, _CLEARANCE_M, _COVERED, _MAX_NAMED = 1.5, 0.2, 0.9, 5
@@ -66,10 +68,9 @@ def sketch_picture(
 ) -> Sketch:
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
-    Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used. The
-    sketch claims no kind of opening as complete: a reviewer of the draft has to set `opening_kinds`. Rows of `gray` are
-    from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards blue. Without
-    `straighten`, the coordinates are those of the picture even if its lines are skew.
+    Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used.
+    Rows of `gray` are from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards
+    blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
@@ -100,12 +101,7 @@ def sketch_picture(
         budget.trace.add("no room", builder.no_room)
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
     openings = _openings(best, ink, builder)
-    if openings:
-        builder.unsure.append(
-            "openings are drawn but not used for localisation; set opening_kinds to the kinds that are complete"
-        )
-    # A missed or misclassified opening would count against the right pose.
-    return Sketch(rooms=rooms, openings=openings, opening_kinds=(), drawn=best.enclosed.walls.envelope)
+    return Sketch(rooms=rooms, openings=openings, recall=_RECALL, drawn=best.enclosed.walls.envelope)
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, WALL_CODE
+from lalaloc_core.conventions import TWO_PI, WALL_CODE
 from lalaloc_core.localise.query import PredictedCeiling, PredictedRoomType
 
 # Smallest trusted scale of a predicted log distance: a centimetre at ten metres.
@@ -84,18 +84,18 @@ def room_type_losses(predicted: PredictedRoomType, floor: float) -> Float[np.nda
 def class_losses(
     probability: Float[np.ndarray, "*n c"],
     prior: Float[np.ndarray, "c"],
-    claimed: Collection[int],
+    trust: Sequence[float],
     floor: float,
     appearance: Sequence[Sequence[float]] | None = None,
 ) -> Float[np.ndarray, "*n c"]:
     """Return `-log q` of every opening class that a plan can show (`matching_cost.py` has the equation).
 
-    `probability` and `prior` are those of the classes seen; `claimed` are the codes of the classes that the plan shows
-    completely. All others are drawn as wall, each as often as it occurs. `floor` is ε, and `appearance` is a.
+    `probability` and `prior` are those of the classes seen; `trust` is t, `floor` is ε, and `appearance` is a.
     """
-    classes = len(OPENING_CLASSES)
-    drawn_as_wall = np.array([code == WALL_CODE or code not in claimed for code in range(classes)])
-    kind = np.where(drawn_as_wall[:, None], prior * drawn_as_wall / prior[drawn_as_wall].sum(), np.eye(classes))
+    drawn = np.array(trust)
+    drawn[WALL_CODE] = 0.0
+    missing = prior * (1.0 - drawn)
+    kind = drawn[:, None] * np.eye(len(drawn)) + (1.0 - drawn[:, None]) * (missing / missing.sum())
     seen = kind if appearance is None else kind @ np.asarray(appearance)
     return -np.log(floor + (1.0 - floor) * (probability / prior) @ seen.T)
 

@@ -15,10 +15,12 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   model that predicts a second mode, with r' for that mode and o for its odds. Azimuths that the photograph does not
   show have an infinite b and cost nothing.
 * **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))` for the class c_w that the plan shows, with
-  `q_w(c) = ε + (1 - ε) sum_s a(s | c) p_w(s) / π(s)`: the predicted probability p of seeing the class s, over its
-  frequency π. a is the probability that a class of the plan looks like another (`MatchingWeights.appearance`): an open
-  door looks like a passage, a patio door like a window. Kinds that the plan does not claim to show completely count as
-  wall.
+  `q_w(c) = ε + (1 - ε) sum_{s,k} a(s | k) m(k | c) p_w(s) / π(s)`: the predicted probability p of seeing the class s,
+  over its frequency π. a is the probability that a class looks like another (`MatchingWeights.appearance`): an open
+  door looks like a passage, a patio door like a window. m is the probability that the class k is where the plan draws
+  c. The plan draws a share t_c of the openings of a kind (`FloorPlan.opening_trust`; t = 0 for walls), and as many that
+  do not exist as it misses: m(k | c) = t_c [k = c] + (1 - t_c) m(k), with m(k) ∝ π(k) (1 - t_k) where no opening is
+  drawn.
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
 * **Room type.** As openings, once per room.
 * **Objects.** As the room type, by the objects that a classifier of photographs recognises. It replaces the room type,
@@ -332,13 +334,13 @@ class MatchingCost:
     def _opening_losses(self) -> Float[np.ndarray, "k w c"] | None:
         """Unweighted cost of each class by hypothesis and azimuth; None if openings are not compared."""
         predicted = self._query.openings
-        claimed = [OPENING_CLASSES.index(kind) for kind in sorted(self._plan.opening_kinds)]
-        if predicted is None or not claimed or not self._config.use_openings:
+        trust = [self._plan.opening_trust.get(kind, 0.0) for kind in OPENING_CLASSES]
+        if predicted is None or not any(trust) or not self._config.use_openings:
             return None
         # Openings appear displaced by up to the reach, seen at the median distance.
         median_m = median_distance_m(self._first.centre[0], self._first.precision[0])
         probability = smoothed(np.exp(predicted.log_probability), self._reach_m / median_m)
-        loss = class_losses(probability, predicted.prior, claimed, self._config.floor, self._weights.appearance)
+        loss = class_losses(probability, predicted.prior, trust, self._config.floor, self._weights.appearance)
         loss -= loss.min(axis=-1, keepdims=True)
         return np.ascontiguousarray(loss[:, :: self._stride], np.float32)
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.match.layouts import joined_layouts
@@ -31,8 +32,8 @@ class MergedPlans:
     """Merged plan of p plans, and its pose grid.
 
     Attributes:
-        plan: the merged plan. It claims the opening kinds that every plan claims, as a kind that only some plans show
-            would make these fit worse than plans without it.
+        plan: the merged plan. Its trust in a kind of openings is the lowest of all plans, as a kind that only some
+            plans show would make these fit worse than plans without it.
         grid: poses of all plans in the merged frame, in the order of the plans.
         shift_m: (p, 2) translation (m) of each plan into the merged frame.
     """
@@ -62,7 +63,9 @@ class MergedPlans:
                 for plan, shift in zip(plans, shift_m, strict=True)
                 for opening in plan.openings
             ),
-            opening_kinds=frozenset.intersection(*(plan.opening_kinds for plan in plans)),
+            opening_trust={
+                kind: min(plan.opening_trust.get(kind, 0.0) for plan in plans) for kind in OPENING_CLASSES[1:]
+            },
             opening_faces=_faces(plans),
         )
         grid = _grid(plans, grids, shift_m, camera_height_m)

@@ -60,7 +60,7 @@ class PrototypeAlignment:
         self._costs = costs
         reach_m = costs.reach_m
         self._precisions = [costs.precisions(share * reach_m) for share in (*_STEPS, _COMPARISON)]
-        self._opening_loss = costs.opening_losses(_COMPARISON * reach_m, _OPENINGS_SHARE)
+        self._opening_loss: dict[int, np.ndarray] = {}
         self._max_m = _MAX_REACHES * reach_m
         azimuth = costs.azimuths
         self._along = np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32)
@@ -94,8 +94,8 @@ class PrototypeAlignment:
         prior = (np.square(step) * self._stiffness).sum(axis=1)
         cost = np.log(factor).mean(axis=1) + 0.5 * prior / temperature
         cost += self._costs.room_costs(rows, offset)
-        if self._opening_loss is not None:
-            cost += self._openings(self._opening_loss, rows, hypothesis, inverse_m, step)
+        if self._costs.compares_openings:
+            cost += self._openings(rows, hypothesis, inverse_m, step)
         return cost, step
 
     def _jacobian(self, log_m: Float[np.ndarray, "n a"], inverse_m: Float[np.ndarray, "n a"]) -> np.ndarray:
@@ -126,7 +126,6 @@ class PrototypeAlignment:
 
     def _openings(
         self,
-        loss: Float[np.ndarray, "m k a c"],
         rows: np.ndarray,
         hypothesis: np.ndarray,
         inverse_m: Float[np.ndarray, "n a"],
@@ -138,9 +137,18 @@ class PrototypeAlignment:
             aside += step[:, 2:3]
         place = (np.arange(AZIMUTHS) + np.rint(aside * (AZIMUTHS / TWO_PI)).astype(np.intp)) % AZIMUTHS
         kind = np.take_along_axis(unpacked_openings(rows["openings"]), place, axis=1)
-        _, k, azimuths, classes = loss.shape
-        first = (rows["claims"].astype(np.intp) * k + hypothesis)[:, None] * azimuths + np.arange(azimuths)
-        return loss.ravel().take(first * classes + kind).sum(axis=1)
+        cost = np.empty(len(rows), np.float32)
+        for claims in np.unique(rows["claims"]).tolist():
+            row = np.flatnonzero(rows["claims"] == claims)
+            cost[row] = self._loss(claims)[hypothesis[row, None], np.arange(AZIMUTHS), kind[row]].sum(axis=1)
+        return cost
+
+    def _loss(self, claims: int) -> Float[np.ndarray, "k a c"]:
+        """Return the losses of opening classes after alignment."""
+        if claims not in self._opening_loss:
+            reach_m = _COMPARISON * self._costs.reach_m
+            (self._opening_loss[claims],) = self._costs.opening_losses([claims], reach_m, _OPENINGS_SHARE)
+        return self._opening_loss[claims]
 
 
 def _slopes(log_m: Float[np.ndarray, "n a"]) -> Float[np.ndarray, "n a"]:

@@ -5,9 +5,9 @@ package (`scripts/make_prototype_cells.py`). An inverted file probes only the ce
 and Zisserman, *Video Google*, 2003; Jégou et al., *Product quantization for nearest neighbor search*, 2011). Cells
 determine which prototypes are compared, and so speed and recall; they do not change the cost of a prototype.
 
-A plan claims the opening classes that it shows completely. Prototypes are assigned by the claimed classes alone, so
-there is a *family* of cells for every set of claimed classes. All families share the centroids; cell numbers are
-`family · centroids + centroid`.
+A plan claims the opening classes with a trust of about a half or more. Prototypes are assigned by the claimed classes
+alone, so there is a *family* of cells for every set of claimed classes. All families share the centroids; cell numbers
+are `family · centroids + centroid`.
 """
 
 from __future__ import annotations
@@ -82,10 +82,10 @@ class Cells:
         residual = (position - query_costs.shifted[..., None]) * query_costs.precision[:, None, :, None]
         by_bin = (np.log1p(np.square(residual)) / AZIMUTHS).astype(np.float32).reshape(k * j, -1)
         walls = (self._bins @ by_bin.T).reshape(v, k, j) + query_costs.penalty.astype(np.float32)
-        if query_costs.opening_loss is None:
+        if not query_costs.compares_openings:
             return dict.fromkeys(families, walls)
         share = self.share.reshape(v, -1)
-        losses = {family: query_costs.opening_loss[claims_of(family)].reshape(k, -1) for family in families}
+        losses = {family: query_costs.opening_loss(claims_of(family)).reshape(k, -1) for family in families}
         return {family: walls + (share @ loss.T)[:, :, None] for family, loss in losses.items()}
 
     @cached_property

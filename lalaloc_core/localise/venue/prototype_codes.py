@@ -132,9 +132,9 @@ def lookup_tables(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j 
     distance = _samples(np.log((_MIN_DISTANCE_M, *_EDGES_M, _MAX_DISTANCE_M)))
     residual = (distance - costs.shifted[..., None, None]) * costs.precision[:, None, :, None, None]
     tables[:, :, azimuth] = np.log1p(np.square(residual)).mean(axis=-1) / AZIMUTHS
-    if costs.opening_loss is not None:
+    if costs.compares_openings:
         # A value combines the classes of two azimuths, the first in the lower bits.
-        loss, classes = costs.opening_loss[claims], len(OPENING_CLASSES)
+        loss, classes = costs.opening_loss(claims), len(OPENING_CLASSES)
         pair = loss[:, 1::2, :, None] + loss[:, ::2, None, :]
         tables[:, :, AZIMUTHS:-2] = pair.reshape(k, 1, AZIMUTHS // 2, classes * classes)
     ceiling_m = _samples(np.array((_MIN_CEILING_M, *_CEILING_EDGES_M, _MAX_CEILING_M))).mean(axis=-1)

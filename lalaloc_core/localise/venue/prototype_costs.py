@@ -7,13 +7,14 @@ Differences to the matching cost of grid poses:
 * Views through openings are ignored.
 * Openings have less weight, as they appear displaced from a prototype up to half a metre away from the camera.
   `prototype_alignment` solves for the displacement.
-* The openings' term is relative to the best class of a plan that claims all classes, so that plans with different
-  claims can be compared. Classes that a plan does not claim are merged with the wall.
+* The openings' term is relative to the best class of a plan that shows all openings, so that plans with different
+  trusts in their openings can be compared. Trusts have four levels.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -32,7 +33,14 @@ from lalaloc_core.localise.match.cost_terms import (
     smoothed,
 )
 from lalaloc_core.localise.query import PredictedCeiling, Query
-from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
+from lalaloc_core.localise.venue.prototypes import (
+    AZIMUTHS,
+    PER_BYTE,
+    STEPS,
+    azimuths,
+    trust_of_claims,
+    unpacked_openings,
+)
 
 # Spacing of the tried logs of the camera height; prototypes' distances are too coarse for smaller differences.
 _OFFSET_SPACING = 0.2
@@ -68,6 +76,9 @@ class PrototypeCosts:
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
         self.precision = self.precisions(self.reach_m)
         self.offsets = _offsets(query)
+        # Losses of openings by claims, of which a venue has few.
+        self._opening_loss: dict[int, np.ndarray] = {}
+        self._byte_losses: dict[int, np.ndarray] = {}
         self.penalty = query.camera_height.penalty(self.offsets) / weights.temperature
 
     @property
@@ -121,7 +132,7 @@ class PrototypeCosts:
         log_profile = rows["log_profile"].astype(np.float32)
         cost = _walls(log_profile - self.shifted[hypothesis, offset], self.precision[hypothesis])
         cost += self.room_costs(rows, offset)
-        if self.opening_loss is not None:
+        if self.compares_openings:
             cost += self._openings(rows, hypothesis)
         return cost
 
@@ -160,52 +171,52 @@ class PrototypeCosts:
 
     def _openings(self, rows: np.ndarray, hypothesis: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the openings' term, by one table entry for every byte."""
-        table, packed = self._byte_losses, rows["openings"]
-        begin = (rows["claims"].astype(np.intp) * len(self.centre) + hypothesis) * packed.shape[1]
-        cost = np.zeros(len(rows), np.float32)
-        for byte in range(packed.shape[1]):
-            cost += table[(begin + byte) * 256 + packed[:, byte]]
+        packed, cost = rows["openings"], np.zeros(len(rows), np.float32)
+        for claims in np.unique(rows["claims"]).tolist():
+            row = np.flatnonzero(rows["claims"] == claims)
+            table, begin = self._byte_loss(claims), hypothesis[row] * packed.shape[1]
+            for byte in range(packed.shape[1]):
+                cost[row] += table[(begin + byte) * 256 + packed[row, byte]]
         return cost
 
-    @cached_property
-    def opening_loss(self) -> Float[np.ndarray, "m k a c"] | None:
-        """The `opening_losses` of prototypes."""
-        return self.opening_losses(self.reach_m, _OPENINGS_SHARE)
+    @property
+    def compares_openings(self) -> bool:
+        """True if the query has openings that are compared."""
+        return self._query.openings is not None and self._config.use_openings
 
-    def opening_losses(self, reach_m: float, share: float) -> Float[np.ndarray, "m k a c"] | None:
+    def opening_loss(self, claims: int) -> Float[np.ndarray, "k a c"]:
+        """Return the `opening_losses` of prototypes with some claims."""
+        if claims not in self._opening_loss:
+            (self._opening_loss[claims],) = self.opening_losses([claims], self.reach_m, _OPENINGS_SHARE)
+        return self._opening_loss[claims]
+
+    def opening_losses(self, claims: Sequence[int], reach_m: float, share: float) -> Float[np.ndarray, "m k a c"]:
         """Return the weighted cost of each opening class by claims, hypothesis and azimuth.
 
         The openings' term is the sum over the azimuths. There are m claims, see `prototypes.ROW`. Openings appear
-        displaced by up to `reach_m`; their weight is a share of the matching cost's. None if openings are not compared.
+        displaced by up to `reach_m`; their weight is a share of the matching cost's.
         """
         predicted = self._query.openings
-        if predicted is None or not self._config.use_openings:
-            return None
+        assert predicted is not None
         probability = np.exp(predicted.log_probability[:: self._every])
         spread = reach_m / median_distance_m(self.centre[0], self.precision[0])
         probability = smoothed(probability, spread)[:, self._columns]
+        trusts = [*map(trust_of_claims, claims), [1.0] * _CLASSES]
+        floor, appearance = self._config.floor, self._weights.appearance
         loss = np.stack(
-            [
-                class_losses(
-                    probability,
-                    predicted.prior,
-                    [code for code in range(_CLASSES) if claims >> code & 1],
-                    self._config.floor,
-                    self._weights.appearance,
-                )
-                for claims in range(1 << _CLASSES)
-            ]
+            [class_losses(probability, predicted.prior, trust, floor, appearance) for trust in trusts]
         ).astype(np.float32)
-        # Costs are relative to the best class for a plan that claims all classes.
-        loss -= loss[-1].min(axis=-1, keepdims=True)
+        # Costs are relative to the best class for a plan that shows all openings.
+        loss = loss[:-1] - loss[-1].min(axis=-1, keepdims=True)
         return loss * np.float32(share * self._weights.openings / AZIMUTHS)
 
-    @cached_property
-    def _byte_losses(self) -> Float[np.ndarray, "t"]:
-        """Sums of `opening_loss` over the four azimuths of a byte, by claims, hypothesis, byte and its value."""
-        assert self.opening_loss is not None
-        loss = self.opening_loss.reshape(-1, PER_BYTE, _CLASSES)
-        return np.ascontiguousarray(sum(loss[:, i, _CLASSES_BY_BYTE[:, i]] for i in range(PER_BYTE))).ravel()
+    def _byte_loss(self, claims: int) -> Float[np.ndarray, "t"]:
+        """Return sums of `opening_loss` over the four azimuths of a byte, by hypothesis, byte and its value."""
+        if claims not in self._byte_losses:
+            loss = self.opening_loss(claims).reshape(-1, PER_BYTE, _CLASSES)
+            sums = sum(loss[:, i, _CLASSES_BY_BYTE[:, i]] for i in range(PER_BYTE))
+            self._byte_losses[claims] = np.ascontiguousarray(sums).ravel()
+        return self._byte_losses[claims]
 
 
 def _offsets(query: Query) -> Float[np.ndarray, "j"]:

@@ -14,7 +14,7 @@ gives every plan a mass, its unnormalised probability:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,8 @@ STEPS = math.sqrt(2.0)
 # Number of opening classes packed into a byte, two bits each, the first azimuth lowest.
 PER_BYTE = 4
 # Record of a prototype, in memory, files and the database. `log_profile` is in log metres, `log_area` in log square
-# metres. `claims` has a bit for each opening class that the plan shows completely; `cell` is that of `prototype_cells`.
+# metres. `claims` has two bits for each opening class, see `claims_of_trust`; `cell` is
+# that of `prototype_cells`.
 ROW = np.dtype(
     [
         ("log_profile", "<f2", (AZIMUTHS,)),
@@ -43,6 +44,8 @@ ROW = np.dtype(
         ("claims", "u1"),
     ]
 )
+# Trusts in openings by the first and the second bit of `claims`; earlier databases have only first bits.
+_TRUST_LEVELS = ((0.0, 0.35), (1.0, 0.75))
 # Minimum log probability of a searched plan: posteriors leave out pairs below it (`posterior.NEGLIGIBLE`).
 _NEGLIGIBLE = -12.0
 # Plans whose log masses differ by less than this count as copies of each other.
@@ -82,8 +85,23 @@ def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
     rows["log_area"] = np.log(floor_m2[room] / np.bincount(room)[room])
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
     rows["room_type"] = np.array([ROOM_TYPES.index(plan_room.type) for plan_room in plan.rooms], np.uint8)[room]
-    rows["claims"] = sum(1 << OPENING_CLASSES.index(kind) for kind in plan.opening_kinds)
+    rows["claims"] = claims_of_trust(plan.opening_trust)
     return Prototypes(rows, grid.step_m)
+
+
+def claims_of_trust(opening_trust: Mapping[str, float]) -> int:
+    """Return the `claims` of a plan: the nearest levels of its trusts."""
+    claims = 0
+    for kind, trust in opening_trust.items():
+        bits = min(np.ndindex(2, 2), key=lambda bits: abs(_TRUST_LEVELS[bits[0]][bits[1]] - trust))
+        claims |= (bits[0] | bits[1] << len(OPENING_CLASSES)) << OPENING_CLASSES.index(kind)
+    return claims
+
+
+def trust_of_claims(claims: int) -> list[float]:
+    """Return the trust in each opening class, see `claims_of_trust`."""
+    classes = len(OPENING_CLASSES)
+    return [_TRUST_LEVELS[claims >> code & 1][claims >> classes + code & 1] for code in range(classes)]
 
 
 def joined(parts: Sequence[Prototypes]) -> Prototypes:

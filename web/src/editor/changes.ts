@@ -184,13 +184,16 @@ export function addOpening(plan: PlanDocument, kind: OpeningKind, wall: WallRef,
 
 /** Return the kinds of openings that a plan shows completely; by default those that occur in it. */
 export function claimedKinds(plan: PlanDocument): OpeningKind[] {
-  return plan.opening_kinds ?? [...new Set((plan.openings ?? []).map(({ kind }) => kind))];
+  const occurring = new Set((plan.openings ?? []).map(({ kind }) => kind));
+  return plan.opening_kinds ?? [...occurring].filter((kind) => plan.opening_trust?.[kind] === undefined);
 }
 
-/** Set whether a plan shows all openings of a kind. */
+/** Set whether a plan shows all openings of a kind: a trust of 1 or 0. */
 export function claimKind(plan: PlanDocument, kind: OpeningKind, isComplete: boolean): PlanDocument {
   const otherKinds = claimedKinds(plan).filter((claimed) => claimed !== kind);
-  return { ...plan, opening_kinds: isComplete ? [...otherKinds, kind] : otherKinds };
+  const { [kind]: _, ...trust } = plan.opening_trust ?? {};
+  const changed = { ...plan, opening_kinds: isComplete ? [...otherKinds, kind] : otherKinds };
+  return plan.opening_trust ? { ...changed, opening_trust: trust } : changed;
 }
 
 export function changeOpening(plan: PlanDocument, index: number, change: Partial<OpeningDocument>): PlanDocument {
@@ -249,6 +252,7 @@ export function scaled(plan: PlanDocument, factor: number): PlanDocument {
     ...plan,
     rooms: plan.rooms.map(scaledRoom),
     openings: (plan.openings ?? []).map((opening) => ({ ...opening, line: all(opening.line) as [Point, Point] })),
+    ...(plan.fixtures ? { fixtures: plan.fixtures.map((f) => ({ ...f, outline: all(f.outline) })) } : {}),
   };
 }
 

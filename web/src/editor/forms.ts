@@ -83,8 +83,11 @@ function completeKinds(plan: PlanDocument, edit: FormActions["edit"]): HTMLEleme
     ...OPENING_KINDS.map((kind) => {
       const box = h("input", { type: "checkbox", id: `plan-form-all-${kind}`, checked: claimed.includes(kind) });
       box.addEventListener("change", () => edit(change.claimKind(current, kind, box.checked)));
+      const trust = claimed.includes(kind) ? 1 : (plan.opening_trust?.[kind] ?? 0);
+      box.indeterminate = trust > 0 && trust < 1;
+      const share = box.indeterminate ? `, ${Math.round(100 * trust)} % of them drawn` : "";
       const count = (plan.openings ?? []).filter((opening) => opening.kind === kind).length;
-      return h("label", { class: "inline" }, box, `${count} ${kind}${count === 1 ? "" : "s"}`);
+      return h("label", { class: "inline" }, box, `${count} ${kind}${count === 1 ? "" : "s"}${share}`);
     }),
   );
 }
