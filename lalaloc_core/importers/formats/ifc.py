@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Float
-from pyproj.exceptions import ProjError
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.floors import find_floor, join_faces, report_floor
-from lalaloc_core.importers.common.geometry import opening_line
+from lalaloc_core.importers.common.geometry import check_coordinates, opening_line
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -34,13 +32,13 @@ from lalaloc_core.importers.common.sketch import (
     SketchedRoom,
 )
 from lalaloc_core.importers.common.vocabulary import role_from_name
+from lalaloc_core.importers.formats.ifc_file import open_model
+from lalaloc_core.importers.formats.ifc_place import find_anchor
 
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
-# End of a complete file; some tools append white space or comments.
-_END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 # Heights of storeys nearer than this are of one storey (m).
 _SAME_STOREY_M = 1.5
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
@@ -54,14 +52,14 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         ModuleNotFoundError: ifcopenshell is not installed.
     """
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
-    model = _open(content)
+    model = open_model(content)
     budget.check_time()
     storeys = _storeys(model)
     if not storeys:
         raise InvalidFloorPlanError(
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
-    anchor = _anchor(model)
+    anchor = find_anchor(model, _unit(model))
     meshes = _Meshes(budget)
     elements = _elements(model, storeys, meshes)
 
@@ -84,25 +82,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(storeys, options, budget.limits, make)
-
-
-def _open(content: bytes) -> Any:
-    import ifcopenshell
-
-    # ifcopenshell reads a truncated file without an error, and the rest is missing.
-    if _END not in content[-_TAIL_BYTES:]:
-        raise InvalidFloorPlanError(
-            f"the IFC file is truncated: it does not end with {_END.decode()}; export or upload it again"
-        )
-    try:
-        # The format is ASCII and escapes other characters, so nothing is lost by "replace".
-        model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
-        schema = str(model.schema)
-    except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
-        raise InvalidFloorPlanError(f"the IFC model cannot be read: {error}; export it again as IFC4") from error
-    if not schema.startswith(("IFC2X3", "IFC4")):
-        raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}; export it as IFC2X3 or IFC4")
-    return model
 
 
 def _unit(model: Any) -> float:
@@ -339,7 +318,8 @@ class _Meshes:
             return None
         vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
         triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
-        if not len(triangles) or not np.isfinite(vertices).all():
+        check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
+        if not len(triangles):
             return None
         return vertices, triangles
 
@@ -363,79 +343,3 @@ def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shap
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
     return join_faces([shapely.Polygon(triangle) for triangle in corners[flat]]) if flat.any() else []
-
-
-def _anchor(model: Any) -> Anchor | None:
-    """Return the place of the model's origin from IfcMapConversion (IFC 4), else from the site's coordinates."""
-    mapped = _map_conversion(model)
-    if mapped is not None:
-        return mapped
-    north_deg = _true_north_deg(model)
-    for site in model.by_type("IfcSite"):
-        if not site.RefLatitude or not site.RefLongitude:
-            continue
-        latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
-        if abs(latitude) > 90.0 or abs(longitude) > 180.0:
-            continue
-        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, _unit(model))
-        altitude = None if site.RefElevation is None else float(site.RefElevation) * _unit(model)
-        return Anchor(latitude, longitude, altitude, north_deg)
-    return None
-
-
-def _map_conversion(model: Any) -> Anchor | None:
-    conversions = model.by_type("IfcMapConversion") if str(model.schema).startswith("IFC4") else []
-    for conversion in conversions:
-        code = str(getattr(conversion.TargetCRS, "Name", "") or "").upper().replace(" ", "")
-        if not code.startswith("EPSG:"):
-            continue
-        east, north = float(conversion.Eastings), float(conversion.Northings)
-        try:
-            # A step along grid north gives the angle between grid north and true north.
-            lon_lat = to_wgs84(code, np.array([[east, north]]))
-            frame = LocalFrame(float(lon_lat[0, 0]), float(lon_lat[0, 1]))
-            step = frame.to_local(to_wgs84(code, np.array([[east, north + 100.0]])))[0]
-        except ProjError:
-            continue
-        if not np.isfinite(step).all():
-            continue
-        grid_north_deg = math.degrees(math.atan2(step[0], step[1]))
-        x, y = float(conversion.XAxisAbscissa or 1.0), float(conversion.XAxisOrdinate or 0.0)
-        # The model's x axis points along (x, y) of the grid: grid north lies this angle clockwise from its y axis.
-        turned_deg = math.degrees(math.atan2(y, x))
-        height = float(conversion.OrthogonalHeight or 0.0)
-        return Anchor(frame.latitude, frame.longitude, height, (turned_deg - grid_north_deg) % 360.0)
-    return None
-
-
-def _true_north_deg(model: Any) -> float:
-    for context in model.by_type("IfcGeometricRepresentationContext", include_subtypes=False):
-        direction = context.TrueNorth
-        if direction is not None and len(direction.DirectionRatios) >= 2:
-            x, y = (float(ratio) for ratio in direction.DirectionRatios[:2])
-            if x or y:
-                return math.degrees(math.atan2(x, y)) % 360.0
-    return 0.0
-
-
-def _degrees(angle: Iterable[int]) -> float:
-    """Convert a compound angle (degrees, minutes, seconds, millionths of a second, all of one sign) to degrees."""
-    parts = [float(part) for part in angle]
-    return sum(part / size for part, size in zip(parts, (1.0, 60.0, 3600.0, 3600e6), strict=False))
-
-
-def _origin_from_site(
-    site: Any, latitude: float, longitude: float, north_deg: float, unit: float
-) -> tuple[float, float]:
-    """Return latitude and longitude of the model's origin if the site is placed elsewhere in the model."""
-    from ifcopenshell.util.placement import get_local_placement
-
-    if site.ObjectPlacement is None:
-        return latitude, longitude
-    offset = -np.asarray(get_local_placement(site.ObjectPlacement))[:2, 3] * unit
-    turn = math.radians(north_deg)
-    # North lies `north_deg` clockwise from +y of the plan.
-    north = offset @ np.array([math.sin(turn), math.cos(turn)])
-    east = offset @ np.array([math.cos(turn), -math.sin(turn)])
-    origin = LocalFrame(longitude, latitude).to_earth(np.array([[east, north]]))[0]
-    return float(origin[1]), float(origin[0])
