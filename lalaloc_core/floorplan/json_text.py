@@ -14,8 +14,8 @@ _OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uin
 # An unterminated string matches up to the end of the text: a match that begins never fails, so the time is linear. If
 # the closing quote were required, every quote of such a string would be tried again.
 _JSON_STRING = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
-# More digits than any finite number of metres has. Python parses thousands, in time quadratic in their number.
-_MAX_DIGITS = 1000
+# No floating-point number has more. Python parses thousands, in time quadratic in their number.
+_MAX_DIGITS = 300
 _DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MAX_DIGITS + 1},}}")
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
-from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError, SeveralLevelsError
 from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
@@ -25,6 +25,7 @@ _GEOJSON_TYPES = {
     "FeatureCollection", "Feature", "Polygon", "MultiPolygon", "LineString", "MultiLineString", "Point", "MultiPoint",
     "GeometryCollection",
 }  # fmt: skip
+_NO_MEMORY = ("bad_alloc", "Insufficient memory", "Failed to allocate", "bad allocation")
 # Advice for files of other kinds, by the last word of their description.
 _ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": "unpack it"}
 # Suffixes of plan files, such as .imdf.zip.
@@ -76,8 +77,15 @@ def import_plans(
         raise InvalidFloorPlanError(
             f"the file is nested too deep; the limit is {limits.max_depth} levels (max_depth)"
         ) from error
-    except MemoryError as error:
-        raise InvalidFloorPlanError("the file needs more memory than is available; export a single storey") from error
+    except InvalidInputError:
+        raise
+    except Exception as error:
+        if not _lacks_memory(error):
+            raise
+        raise InvalidFloorPlanError(
+            "the file needs more memory than is available (LALALOC_IMPORT_MEMORY_BYTES in the service); export a "
+            "single storey, or a smaller picture"
+        ) from error
     building = options.name or building
     if building is not None:
         several = len(plans) > 1
@@ -204,6 +212,11 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
     # A zip archive with a single IFC model is an .ifczip file.
     models = [name for name in files if name.casefold().endswith(".ifc")]
     return (FORMATS["ifc"], files[models[0]]) if len(models) == 1 else (format, files)
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Return whether an error of Python or of a library says that there is no memory; those of C++ have no class."""
+    return isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY)
 
 
 def _json_format(document: Any) -> Format:

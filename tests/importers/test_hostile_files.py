@@ -6,7 +6,9 @@ import io
 import itertools
 import json
 import pickle
+import re
 import struct
+import time
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
@@ -18,10 +20,13 @@ import shapely
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
+from benchmarks.hostile_plans import HOSTILE_PLANS, HostilePlan, star
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
+from lalaloc_core.importers.common.crossings import check_network
+from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
 from lalaloc_core.importers.drawing import enclosed_rooms
@@ -266,7 +271,8 @@ def test_gaps_and_rooms_are_compared_with_their_neighbours(monkeypatch: pytest.M
     intersection = shapely.intersection
 
     def counted(first: shapely.Geometry, second: shapely.Geometry) -> shapely.Geometry:
-        compared.append(second)
+        if isinstance(second, shapely.Polygon):
+            compared.append(second)
         return intersection(first, second)
 
     monkeypatch.setattr(shapely, "intersection", counted)
@@ -297,3 +303,73 @@ def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.Monke
     # A jamb at both ends of each wall, found from both of its faces.
     assert [joint.length for joint in joints] == pytest.approx([0.2] * 200)
     assert sum(compared) < 5 * 200
+
+
+# Pictures, and pages that are drawn, take seconds whatever they show.
+_DRAWN = {"picture", "pdf"}
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        pytest.param(
+            plan,
+            id=f"{plan.format}, {plan.title}",
+            marks=[pytest.mark.slow] if plan.format in _DRAWN or "mega" in plan.title or "noise" in plan.title else [],
+        )
+        for plan in HOSTILE_PLANS
+    ],
+)
+def test_small_file_takes_little_time(plan: HostilePlan):
+    content = plan.make(20_000)
+    begin_s = time.process_time()
+    with suppress(InvalidFloorPlanError):
+        import_plans(content, plan.options)
+    assert time.process_time() - begin_s < (40.0 if plan.format in _DRAWN or "mega" in plan.title else 3.0)
+
+
+def test_outline_that_crosses_itself_is_refused_before_it_is_repaired(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shapely, "make_valid", pytest.fail)
+    with pytest.raises(InvalidFloorPlanError, match=r"2001 points .* crosses itself more than 2000 times"):
+        polygons_from_geometry(shapely.Polygon(star(2001)))
+
+
+def test_outline_that_crosses_itself_a_few_times_is_repaired():
+    assert len(polygons_from_geometry(shapely.Polygon(star(5)))) == 5
+
+
+def test_crossing_lines_are_refused_before_they_are_joined(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shapely, "unary_union", pytest.fail)
+    lines = [shapely.LineString([(0.1 * k, 0), (0.1 * k, 99)]) for k in range(500)]
+    lines += [shapely.LineString([(0, 0.1 * k), (99, 0.1 * k)]) for k in range(500)]
+    with pytest.raises(InvalidFloorPlanError, match=r"1000 lines .* cross more than 11000 times"):
+        enclose([], lines)
+
+
+def test_lines_that_meet_at_their_ends_do_not_cross():
+    points = [(np.cos(k), np.sin(k)) for k in np.linspace(0.0, 6.0, 2000)]
+    check_network([shapely.LineString([a, b]) for a, b in itertools.pairwise(points)] * 5)
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-1e308", "91"])
+def test_latitude_out_of_range_is_named(number: str):
+    osm = f'<osm><node id="1" lat="{number}" lon="0"/><way id="2"><nd ref="1"/><tag k="indoor" v="room"/></way></osm>'
+    _assert_rejected(osm.encode(), rf"lat {re.escape(str(float(number)))}; it must be a number from -90 to 90")
+
+
+@pytest.mark.parametrize("lines", ["a: &a [1]\nb: *a", "a: {<<: {b: 1}}", "a: &a {b: 1}\nb: {<<: *a}"])
+def test_yaml_that_repeats_values_is_refused(lines: str):
+    yaml = f"image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n{lines}\n"
+    _assert_rejected(zip_file({"map.yaml": yaml, "a.pgm": b"P5\n1 1\n255\n0"}), "an alias .* or a merge key")
+
+
+def test_placement_in_itself_is_named():
+    pytest.importorskip("ifcopenshell")
+    plan = next(plan for plan in HOSTILE_PLANS if plan.title == "a placement in itself")
+    _assert_rejected(plan.make(1000), "the IfcLocalPlacement #7 is relative to itself")
+
+
+def test_large_number_of_a_model_is_named():
+    pytest.importorskip("ifcopenshell")
+    plan = next(plan for plan in HOSTILE_PLANS if plan.title == "a number of 1.E400")
+    _assert_rejected(plan.make(1000), "the number 1.E400; the limit is 1.E100")

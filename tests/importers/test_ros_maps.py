@@ -177,7 +177,7 @@ def test_picture_alone_needs_a_scale():
         ({"a.yaml": "image: m.pgm\nresolution: 0.05", "m.pgm": b"P5 2 2 255 abcd"}, "origin of the ROS map is None"),
         (
             {"a.yaml": "image: m.pgm\nresolution: .nan\norigin: [0, 0]", "m.pgm": b"P5 2 2 255 abcd"},
-            "resolution of the ROS map is nan",
+            "resolution of the ROS map is .nan",
         ),
         ({"a.yaml": "image: m.pgm", "m.pgm": b"P5 90000 90000 255 "}, "90000 x 90000 cells|cannot be read"),
         ({"a.yaml": "image: m.pgm", "m.pgm": b"nothing"}, "cannot be read"),

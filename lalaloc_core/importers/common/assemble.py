@@ -18,6 +18,7 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
 from lalaloc_core.importers.common.completeness import estimate_trust
+from lalaloc_core.importers.common.crossings import check_network, distinct
 from lalaloc_core.importers.common.fixtures import place_fixtures, type_rooms
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import ImportLimits
@@ -91,7 +92,9 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         NoRoomError: the sketch has no rooms.
         InvalidFloorPlanError: the plan is invalid.
     """
-    obstacles = shapely.STRtree(sketch.obstacles)
+    columns = distinct(sketch.obstacles)
+    check_network(columns)
+    obstacles = shapely.STRtree(columns)
     rooms = [room for drawn in sketch.rooms for room in _clean(drawn, obstacles, limits, builder)]
     if not rooms:
         raise NoRoomError(
@@ -206,9 +209,9 @@ def _clean(
 ) -> list[SketchedRoom]:
     label = _label(room)
     shape = room.shape
-    for obstacle in obstacles.geometries[np.sort(obstacles.query(shape))]:
-        if obstacle.intersects(shape):
-            shape = shapely.difference(shape, obstacle)
+    near = obstacles.geometries[np.sort(obstacles.query(shape))]
+    if inside := [obstacle for obstacle in near if obstacle.intersects(shape)]:
+        shape = shapely.difference(shape, shapely.union_all(inside))
     floors = [
         simple
         for floor in polygons_from_geometry(shape)

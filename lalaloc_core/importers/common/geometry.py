@@ -11,12 +11,45 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.crossings import check_network, check_outline
+
+# Largest coordinate of a file, in any unit: 10,000 km in millimetres.
+MAX_COORDINATE = 1e10
+
+
+def check_coordinates(points: Float[np.ndarray, "..."], where: str) -> None:
+    """Check coordinates before they are computed with.
+
+    Raises:
+        InvalidFloorPlanError: one is not finite, or beyond `MAX_COORDINATE`; names its place `where`.
+    """
+    if not in_range(points):
+        wrong = ~(np.abs(points) <= MAX_COORDINATE)
+        raise InvalidFloorPlanError(
+            f"{where} has the coordinate {np.asarray(points)[wrong][0]:g}; the limit is {MAX_COORDINATE:g} units to "
+            "either side; correct it, and export the file again"
+        )
+
+
+def in_range(points: Float[np.ndarray, "..."]) -> bool:
+    """Return whether all coordinates are finite and within `MAX_COORDINATE`."""
+    return bool((np.abs(points) <= MAX_COORDINATE).all())
+
 
 def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
-    """Return the polygons of a geometry, made valid, without those of no area."""
+    """Return the polygons of a geometry, made valid, without those of no area.
+
+    Raises:
+        InvalidFloorPlanError: a coordinate is not finite, or the geometry crosses itself too often.
+    """
     if geometry.is_empty:
         return []
-    valid = geometry if geometry.is_valid else shapely.make_valid(geometry)
+    valid = geometry
+    if not geometry.is_valid:
+        check_coordinates(shapely.get_coordinates(geometry), "an outline")
+        check_outline(geometry)
+        valid = shapely.make_valid(geometry)
     parts: Iterable[BaseGeometry] = shapely.get_parts(valid)
     found: list[shapely.Polygon] = []
     for part in parts:
@@ -29,11 +62,18 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule)."""
-    shape: BaseGeometry = shapely.Polygon()
-    for ring in rings:
-        shape = shapely.symmetric_difference(shape, ring)
-    return polygons_from_geometry(shape)
+    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule).
+
+    Raises:
+        InvalidFloorPlanError: the outlines cross too often.
+    """
+    shapes: list[BaseGeometry] = list(rings)
+    check_network(shapes)
+    # In pairs, so that the time is not quadratic in the number of outlines.
+    while len(shapes) > 1:
+        pairs = zip(shapes[::2], shapes[1::2], strict=False)
+        shapes = [*(shapely.symmetric_difference(a, b) for a, b in pairs), *shapes[len(shapes) & ~1 :]]
+    return polygons_from_geometry(shapes[0]) if shapes else []
 
 
 def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float, float]] | None:

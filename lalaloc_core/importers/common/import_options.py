@@ -14,6 +14,8 @@ METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in":
 _SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
 _MAX_LENGTH, _MAX_LAYERS = 200, 100
 _CEILING_M = (1.0, 20.0)
+# Numbers of a known distance, and the lengths of a unit of a drawing that follow (m).
+_MAX_NUMBER, _METRES_PER_UNIT = 1e10, (1e-9, 1e4)
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,11 @@ class KnownDistance:
 
     def __post_init__(self) -> None:
         numbers = (*self.start, *self.end, self.distance_m)
-        if not all(math.isfinite(number) for number in numbers) or self.drawn <= 0.0 or self.distance_m <= 0.0:
+        is_usable = all(abs(number) <= _MAX_NUMBER for number in numbers) and self.drawn > 0.0
+        if not is_usable or not _METRES_PER_UNIT[0] <= self.metres_per_unit <= _METRES_PER_UNIT[1]:
             raise InvalidFloorPlanError(
-                f"known_distance is {numbers}; give x0, y0, x1, y1, metres with two different points and metres above 0"
+                f"known_distance is {numbers}; give x0, y0, x1, y1, metres, numbers up to {_MAX_NUMBER:g} with two "
+                f"different points; a unit must be {_METRES_PER_UNIT[0]:g} to {_METRES_PER_UNIT[1]:g} m"
             )
 
     @property

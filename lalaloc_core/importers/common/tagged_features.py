@@ -55,9 +55,11 @@ _OPENING_TAGS: Mapping[str, tuple[Role, Role]] = {
 }  # fmt: skip
 # Width (m) of an opening drawn as a point without a width.
 _USUAL_WIDTH_M: Mapping[OpeningKind, float] = {"door": 0.9, "window": 1.2, "passage": 1.0}
-_LENGTH = re.compile(r"(\d+(?:[.,]\d+)?)\s*(mm|cm|m|ft|in|'|\"|)(?:\s*(\d+(?:\.\d+)?)\s*(?:in|\"))?")
+_LENGTH = re.compile(r"(\d{1,9}(?:[.,]\d{1,99})?)\s*(mm|cm|m|ft|in|'|\"|)(?:\s*(\d{1,9}(?:\.\d{1,99})?)\s*(?:in|\"))?")
 _RANGE = re.compile(r"(-?\d{1,3})\s*-\s*(-?\d{1,3})")
 _MAX_LEVELS = 200
+# Further levels of all features together: shafts and stairs are on all levels.
+_REPEATS, _REPEATS_PER_FEATURE = 1000, 5
 
 
 @dataclass(frozen=True)
@@ -104,11 +106,18 @@ def import_features(
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []
+    repeats = 0
     for feature in features:
         keys = _levels_of(feature)
         if not keys and is_indoor and shapely.get_dimensions(feature.shape) == 0:
             on_any_level.append(feature)
             continue
+        repeats += max(len(keys) - 1, 0)
+        if repeats > _REPEATS + _REPEATS_PER_FEATURE * len(features):
+            raise InvalidFloorPlanError(
+                f"{len(features)} features are on several levels, {repeats} times in all; the limit for as many is "
+                f"{_REPEATS + _REPEATS_PER_FEATURE * len(features)}; export a single level"
+            )
         # A feature on several levels is as much work as several features.
         budget.spend(max(len(keys) - 1, 0) * (1 + shapely.count_coordinates(feature.shape)))
         for key in keys or ["0"]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -23,6 +24,8 @@ _SLANTED_DEG = 8.0
 _THICK_LEAF_M = 0.08
 # Ends of lines nearer than this touch (m).
 _TOUCH_M = 0.03
+# Hinges within this distance are of one door.
+_NEAR: dict[str, Any] = {"predicate": "dwithin", "distance": 5 * _TOUCH_M}
 
 
 @dataclass(frozen=True)
@@ -45,13 +48,13 @@ def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing], areas: Seque
     walls = [area.shape for area in areas if area.is_dark or area.role == "wall"]
     tree = shapely.STRtree([*(stroke.line for stroke in others), *walls])
     axis = _axis([*(stroke.line for stroke in others), *(wall.exterior for wall in walls)])
-    kept, leaves = [], list(arcs.values())
+    kept, leaves, hinges = [], list(arcs.values()), _hinges(turning)
     for index, stroke in enumerate(others):
-        leaf = _leaf(stroke, index, tree, axis, turning)
+        leaf = _leaf(stroke, index, tree, axis, turning, hinges)
         if leaf is None:
             kept.append(stroke)
         # The arc of a leaf shows its width and both positions.
-        elif not any(math.dist(leaf.hinge, arc.hinge) <= 5 * _TOUCH_M for arc in turning):
+        elif not len(hinges.query(shapely.Point(leaf.hinge), **_NEAR)):
             leaves.append(leaf)
     return Leaves(kept, leaves)
 
@@ -76,12 +79,16 @@ def drawn_leaves(drawing: Drawing) -> list[Swing]:
 
 def without_leaves(areas: Sequence[Area], swings: Sequence[Swing]) -> list[Area]:
     """Return the areas that are no door leaves: thin rectangles at the hinge of an arc, as long as its radius."""
-    return [area for area in areas if not any(_is_leaf(area.shape, swing) for swing in swings)]
+    hinges = _hinges(swings)
+    near = [[swings[k] for k in hinges.query(area.shape, **_NEAR)] for area in areas]
+    return [a for a, turning in zip(areas, near, strict=True) if not any(_is_leaf(a.shape, swing) for swing in turning)]
+
+
+def _hinges(swings: Sequence[Swing]) -> shapely.STRtree:
+    return shapely.STRtree([shapely.Point(swing.hinge) for swing in swings])
 
 
 def _is_leaf(shape: shapely.Polygon, swing: Swing) -> bool:
-    if shapely.distance(shape, shapely.Point(swing.hinge)) > 5 * _TOUCH_M:
-        return False
     thin, long = side_lengths(shape)
     tip = min(shapely.distance(shape, shapely.Point(end)) for end in (swing.first, swing.last))
     has_size = thin <= _THICK_LEAF_M and abs(long - swing.radius) <= 0.1 * swing.radius
@@ -103,7 +110,9 @@ def _axis(lines: Sequence[shapely.LineString]) -> float:
     return float(np.angle(total)) / 4.0
 
 
-def _leaf(stroke: Stroke, index: int, tree: shapely.STRtree, axis: float, turning: Sequence[Swing]) -> Swing | None:
+def _leaf(
+    stroke: Stroke, index: int, tree: shapely.STRtree, axis: float, turning: Sequence[Swing], hinges: shapely.STRtree
+) -> Swing | None:
     points = shapely.get_coordinates(stroke.line)
     if len(points) != 2 or not LEAF_M[0] <= stroke.line.length <= LEAF_M[1]:
         return None
@@ -116,10 +125,8 @@ def _leaf(stroke: Stroke, index: int, tree: shapely.STRtree, axis: float, turnin
     hinge, tip = points if first else points[::-1]
     x, y = tip - hinge
     off_axis = abs((math.atan2(y, x) - axis + 0.25 * math.pi) % (0.5 * math.pi) - 0.25 * math.pi)
-    has_arc = any(
-        math.dist(hinge, arc.hinge) <= 5 * _TOUCH_M and abs(arc.radius - stroke.line.length) <= 0.1 * arc.radius
-        for arc in turning
-    )
+    arcs = [turning[k] for k in hinges.query(shapely.Point(hinge), **_NEAR)]
+    has_arc = any(abs(arc.radius - stroke.line.length) <= 0.1 * arc.radius for arc in arcs)
     if math.degrees(off_axis) < _SLANTED_DEG and not has_arc:
         return None
     return Swing(point_xy(hinge), point_xy(tip), point_xy(tip), stroke.layer)

@@ -43,6 +43,8 @@ _SQUARE_FOOT_M2, _AREA_M2 = 0.3048**2, (0.5, 2000.0)
 _TOLERANCE, _AREA_TOLERANCE = 0.05, 0.25
 # Usual size of a drawing (m).
 _EXTENT_M = (3.0, 300.0)
+# Length of a unit of any drawing (m).
+_METRES_PER_UNIT = (1e-9, 1e4)
 
 # Text of a dimension, and the lengths in units of the drawing that it may be about.
 Dimension = tuple[str, Sequence[float]]
@@ -76,21 +78,36 @@ def drawing_scale(
                 f"{subject} has no size on paper, so scale=1:{options.scale:g} cannot be used; "
                 "set metres_per_pixel or known_distance instead"
             )
-        return options.scale * paper_m_per_unit, "option scale"
+        return _checked(options.scale * paper_m_per_unit, "option scale", subject)
     if options.units is not None:
         return METRES_PER_UNIT[options.units], "option units"
     if own is not None:
-        return own
+        return _checked(*own, subject)
     written = _written_scale(lettering.text for drawing in drawings for lettering in drawing.letterings)
     if written is not None and paper_m_per_unit is not None:
-        return written * paper_m_per_unit, f"1:{written:g}, written in the drawing"
+        return _checked(written * paper_m_per_unit, f"1:{written:g}, written in the drawing", subject)
     if measured := next(filter(None, (drawn_scale(drawing, check_time) for drawing in drawings)), None):
-        return measured
+        return _checked(*measured, subject)
     hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
     raise InvalidFloorPlanError(
         f"{subject} gives no scale{hint}: set scale (1:100), metres_per_pixel (metres per unit of the drawing) or "
         "known_distance (x0, y0, x1, y1, metres)"
     )
+
+
+def _checked(metres_per_unit: float, source: str, subject: str) -> tuple[float, str]:
+    """Return a scale with its source.
+
+    Raises:
+        InvalidFloorPlanError: no drawing has it.
+    """
+    low, high = _METRES_PER_UNIT
+    if not low <= metres_per_unit <= high:
+        raise InvalidFloorPlanError(
+            f"{subject} has {metres_per_unit:g} m per unit ({source}); the limits are {low:g} and {high:g}; correct "
+            "its size, or set metres_per_pixel"
+        )
+    return metres_per_unit, source
 
 
 def _written_scale(texts: Iterable[str]) -> int | None:

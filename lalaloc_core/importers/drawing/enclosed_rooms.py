@@ -16,7 +16,9 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.importers.common.crossings import check_network, distinct
 from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.drawing.wall_areas import WallAreas
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
@@ -106,7 +108,13 @@ def enclose(
     `bodies` and `lines` are walls drawn as areas and as lines; `closers` are doors and windows drawn as areas in the
     walls. `check_time` is called between steps and raises an exception to stop. `rank` ranks a gap, lowest first; a gap
     of rank None is not an opening and stays open.
+
+    Raises:
+        InvalidFloorPlanError: the walls cross too often.
     """
+    bodies, lines, closers = distinct(bodies), distinct(lines), distinct(closers)
+    check_network([*bodies, *lines, *closers])
+    check_time()
     faces, loose = _faces(lines, config, check_time) if lines else ([], [])
     thin = [face for face in faces if _is_thin(face, config)]
     solid = shapely.unary_union([*bodies, *thin]) if bodies or thin else shapely.Polygon()
@@ -118,7 +126,7 @@ def enclose(
     blocked = shapely.unary_union([solid, *closers, *(line.buffer(0.01, cap_style="flat") for line in unpaired)])
     check_time()
     gaps = find_gaps(blocked, config, check_time, rank)
-    paired = Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config), gaps, solid)
+    paired = Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config, check_time), gaps, solid)
     # Pillars, stairs or one thick wall beside single lines are no reason to look for the other face of every line.
     drawn_m = sum(line.length for line in lines)
     if bodies or sum(line.length for line in lines if not around.covers(line)) < _MOSTLY_SINGLE * drawn_m:
@@ -142,17 +150,16 @@ def find_gaps(
     rank: Callable[[Gap], int | None] = rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
-    parts = [
-        simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))
-    ]
-    tree = shapely.STRtree(parts)
+    areas = WallAreas(
+        [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
+    )
     found: list[Gap] = []
-    for part in parts:
+    for part in areas.parts:
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
             for wall in _ends(np.asarray(ring.coords), config):
                 check_time()
-                gap = _gap_before(wall, parts, tree, config)
+                gap = _gap_before(wall, areas, config)
                 if gap is not None:
                     found.append(gap)
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
@@ -200,22 +207,20 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     return found
 
 
-def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRtree, config: WallConfig) -> Gap | None:
+def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
     """Return the gap in front of the end of a wall, None if nothing lies within the limits of width."""
     outward = wall.outward
     distances = []
     for share in (0.15, 0.5, 0.85):
         origin = wall.start + share * (wall.end - wall.start) + 0.5 * config.thinnest * outward
         ray = shapely.LineString([origin, origin + config.widest_gap * outward])
-        hits = [parts[index].intersection(ray) for index in tree.query(ray, predicate="intersects")]
-        reached = [shapely.distance(shapely.Point(origin), hit) for hit in hits if not hit.is_empty]
-        distances.append(0.5 * config.thinnest + float(min(reached, default=math.inf)))
+        distances.append(0.5 * config.thinnest + areas.distance_along(ray))
     # One of the three rays can miss if the walls are not quite in line.
     nearest, middle, farthest = sorted(distances)
     width = farthest if farthest - middle <= 0.25 * config.thickest else middle
     if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
         return None
-    is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, tree)
+    is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, areas)
     is_sure = width - nearest <= 0.25 * config.thickest and (
         wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
     )
@@ -234,13 +239,13 @@ def _faces_an_end(
     end: Float[np.ndarray, "2"],
     outward: Float[np.ndarray, "2"],
     width: float,
-    tree: shapely.STRtree,
+    areas: WallAreas,
 ) -> bool:
     """Return whether the other side of a gap is the end of a wall of similar thickness."""
     a, b = start + (width + 0.02) * outward, end + (width + 0.02) * outward
     side = 0.12 * (b - a) / np.linalg.norm(b - a)
     outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
-    return not any(len(tree.query(piece, predicate="intersects")) > 0 for piece in outside)
+    return not any(areas.meets(piece) for piece in outside)
 
 
 def _faces(
@@ -349,16 +354,23 @@ def _from_single_lines(
     joints = [line.buffer(0.002) for line in (*corners, *(shapely.LineString([g.start, g.end]) for g in gaps))]
     walls = shapely.unary_union([line.buffer(0.002) for line in segments])
     distinct = {tuple(sorted((gap.start, gap.end))): gap for gap in gaps if gap.width >= config.narrowest_gap}
-    return Enclosed(_insides([walls, *joints, *closers], config), list(distinct.values()), walls)
+    return Enclosed(_insides([walls, *joints, *closers], config, check_time), list(distinct.values()), walls)
 
 
-def _insides(pieces: Sequence[BaseGeometry], config: WallConfig) -> list[shapely.Polygon]:
+def _insides(
+    pieces: Sequence[BaseGeometry], config: WallConfig, check_time: Callable[[], None]
+) -> list[shapely.Polygon]:
     """Return the areas enclosed by the union of some pieces that are large enough for a room."""
-    union = shapely.unary_union(list(pieces))
+    parts = polygons_from_geometry(shapely.unary_union(list(pieces)))
+    tree = shapely.STRtree(parts)
     rooms = []
-    for part in polygons_from_geometry(union):
+    for index, part in enumerate(parts):
         for ring in part.interiors:
-            inside = shapely.Polygon(ring).difference(union)
+            check_time()
+            hole = shapely.Polygon(ring)
+            # The walls around a hole do not reach into it, so the islands alone are taken out.
+            islands = [parts[k] for k in tree.query(hole, predicate="intersects") if k != index]
+            inside = hole.difference(shapely.union_all(islands)) if islands else hole
             for floor in polygons_from_geometry(inside):
                 if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config):
                     rooms.append(floor.simplify(0.004))

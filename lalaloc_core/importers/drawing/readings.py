@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.crossings import check_network, check_overlaps
 from lalaloc_core.importers.common.geometry import polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -149,7 +150,8 @@ def _is_better(reading: Reading, best: Reading) -> bool:
 
 def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[Swing]) -> Reading:
     """Return a reading with its doors and names counted."""
-    closed = {index for leaf in leaves if (index := gap_of(leaf, reading.gaps)) is not None}
+    finder = GapFinder(reading.gaps)
+    closed = {index for leaf in leaves if (index := finder.closed_by(leaf)) is not None}
     names = [t.position for t in drawing.letterings if room_type_from_name(t.text) is not None]
     named: set[int] = set()
     if names and reading.rooms:
@@ -159,9 +161,14 @@ def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[
 
 
 def marked_rooms(drawing: Drawing, builder: ReportBuilder) -> list[Area]:
-    """Return the closed outlines on layers named after rooms: by a word for rooms, or by the use of a room."""
+    """Return the closed outlines on layers named after rooms: by a word for rooms, or by the use of a room.
+
+    Raises:
+        InvalidFloorPlanError: too many lie over one another.
+    """
     by_word = [area for area in drawing.areas if area.role == "room"]
     by_use = [area for area in drawing.areas if area.role is None and _use(area) is not None and is_room_like(area)]
+    check_overlaps([area.shape for area in (*by_word, *by_use)], what="rooms")
     rooms = _without_containers([*by_word, *by_use], builder)
     # Furniture of a kitchen can lie on a layer of that name, inside the room.
     tree = shapely.STRtree([room.shape for room in rooms])
@@ -310,29 +317,33 @@ def _closers(drawing: Drawing) -> list[BaseGeometry]:
     return [shape for shape in (*areas, *windows) if side_lengths(shape)[0] < 0.7]
 
 
-def gap_of(swing: Swing, gaps: Sequence[Gap]) -> int | None:
-    """Return the index of the gap that a leaf closes, alone or as one of two leaves."""
-    best: tuple[float, int] | None = None
-    for index, gap in enumerate(gaps):
-        for near, far in ((gap.start, gap.end), (gap.end, gap.start)):
+class GapFinder:
+    """Gaps by their ends, to find those that leaves close."""
+
+    def __init__(self, gaps: Sequence[Gap]) -> None:
+        self.gaps = gaps
+        self._ends = [pair for gap in gaps for pair in ((gap.start, gap.end), (gap.end, gap.start))]
+        self._tree = shapely.STRtree([shapely.Point(near) for near, _ in self._ends])
+
+    def closed_by(self, swing: Swing) -> int | None:
+        """Return the index of the gap that a leaf closes, alone or as one of two leaves."""
+        best: tuple[float, int] | None = None
+        for end in sorted(self._tree.query(shapely.Point(swing.hinge), predicate="dwithin", distance=_HINGE_M)):
+            (near, far), gap = self._ends[end], self.gaps[end // 2]
             distance = math.dist(swing.hinge, near)
             shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
             fits = any(_LEAF_OF_GAP[0] <= share <= _LEAF_OF_GAP[1] for share in shares)
             tip_distance = min(math.dist(swing.first, far), math.dist(swing.last, far))
-            if (
-                distance <= _HINGE_M
-                and fits
-                and tip_distance <= _OPEN_LEAF * gap.width
-                and (best is None or distance < best[0])
-            ):
-                best = (distance, index)
-    return None if best is None else best[1]
+            if fits and tip_distance <= _OPEN_LEAF * gap.width and (best is None or distance < best[0]):
+                best = (distance, int(end) // 2)
+        return None if best is None else best[1]
 
 
 def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
     """Group shapes that are near each other into one geometry each."""
     if not shapes:
         return []
+    check_network(shapes)
     around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
     regions = list(shapely.get_parts(around))
     tree = shapely.STRtree(regions)

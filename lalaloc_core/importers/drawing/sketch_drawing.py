@@ -30,9 +30,9 @@ from lalaloc_core.importers.drawing.drawing_scale import check_areas
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.readings import (
     SYMBOL_M,
+    GapFinder,
     choose_reading,
     clusters,
-    gap_of,
     marked_rooms,
     report_unused,
     split_lines,
@@ -89,13 +89,17 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
-    closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if gap_of(swing, gaps) is not None]
-    sketch.openings = [*_symbols(drawing, closing), *_swings([*drawing.swings, *closing], gaps, shapes)]
-    taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
+    finder = GapFinder(gaps)
+    closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
+    sketch.openings = [*_symbols(drawing, closing), *_swings([*drawing.swings, *closing], finder, shapes)]
+    taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
+    rooms = shapely.STRtree([room.shape for room in shapes])
     for gap in gaps:
+        budget.check_time()
         line = shapely.LineString([gap.start, gap.end])
-        if taken.is_empty or shapely.intersection(line, taken).length < 0.3 * line.length:
-            kind = _kind_without_symbol(gap, shapes) if gap.is_painted else "passage"
+        near = shapely.union_all(taken.geometries[taken.query(line, predicate="intersects")])
+        if shapely.intersection(line, near).length < 0.3 * line.length:
+            kind = _kind_without_symbol(gap, rooms) if gap.is_painted else "passage"
             sketch.openings.append(SketchedOpening(kind, gap.start, gap.end))
             builder.unsure.append(
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
@@ -105,7 +109,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     return sketch
 
 
-def _kind_without_symbol(gap: Gap, rooms: Sequence[Area]) -> OpeningKind:
+def _kind_without_symbol(gap: Gap, rooms: shapely.STRtree) -> OpeningKind:
     """Return the kind of an opening that is painted over a wall: a window if it is blue or leads outside."""
     if gap.is_bluish:
         return "window"
@@ -113,8 +117,7 @@ def _kind_without_symbol(gap: Gap, rooms: Sequence[Area]) -> OpeningKind:
     along = (end - start) / max(gap.width, 1e-9)
     step = (0.5 * side_lengths(gap.shape)[0] + _BESIDE_M) * np.array([-along[1], along[0]])
     places = [shapely.Point(0.5 * (start + end) + side * step) for side in (1.0, -1.0)]
-    inside = [any(room.shape.contains(place) for room in rooms) for place in places]
-    return "passage" if all(inside) else "window"
+    return "passage" if all(len(rooms.query(place, predicate="within")) for place in places) else "window"
 
 
 def _trace_drawing(drawing: Drawing, trace: Trace | None) -> None:
@@ -214,7 +217,7 @@ def _is_frame(part: BaseGeometry) -> bool:
     return 0.02 <= short <= 0.6 and long >= max(1.3 * short, _OPENING_M[0])
 
 
-def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area]) -> list[SketchedOpening]:
+def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -> list[SketchedOpening]:
     """Return doors from their swings: the gap that a leaf closes, else the leaf in its closed position."""
     walls = shapely.union_all([area.shape.exterior for area in rooms]) if rooms else shapely.LineString()
     found: list[SketchedOpening] = []
@@ -222,11 +225,11 @@ def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area])
     for swing in swings:
         if not LEAF_M[0] <= swing.radius <= LEAF_M[1]:
             continue
-        index = gap_of(swing, gaps)
+        index = finder.closed_by(swing)
         if index is not None:
             if index not in closed:
                 closed.add(index)
-                found.append(SketchedOpening("door", gaps[index].start, gaps[index].end))
+                found.append(SketchedOpening("door", finder.gaps[index].start, finder.gaps[index].end))
         elif not walls.is_empty:
             found.append(_closed_leaf(swing, walls))
     return found

@@ -33,7 +33,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.fixtures import fixture_from_name
-from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -262,7 +262,7 @@ def _add(
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
         point = entity.dxf.get("insert")
-        if point is not None and text.strip():
+        if point is not None and text.strip() and in_range(np.array([point[0], point[1]])):
             position = (float(point[0]), float(point[1]))
             drawing.letterings += [Lettering(line[:200], position, context.layer) for line in text.splitlines()[:20]]
             builder.use(context.layer, "texts")
@@ -329,6 +329,7 @@ def _box(entity: Insert, context: _Context, sag: float, budget: Budget) -> BaseG
 def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
     points = _points(entity, sag)
     if len(points) < 2:
+        builder.use(context.layer, "ignored (no length, or coordinates out of range)")
         return
     role = context.role
     if entity.dxftype() == "ARC" and role in (None, "door"):
@@ -357,7 +358,7 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
         points = _flatten(dxf_path.make_path(entity), sag)
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
-    if not len(points) or not np.isfinite(points).all():
+    if not len(points) or not in_range(points):
         return np.empty((0, 2))
     return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
 
@@ -366,8 +367,8 @@ def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
     """Return the points along a path; a curve larger than the drawing's stated size has no more than others."""
     corners = np.array([(vertex.x, vertex.y) for vertex in path.control_vertices()])
     size = float(np.ptp(corners, axis=0).max(initial=0.0)) if len(corners) else 0.0
-    if not np.isfinite(size):
-        raise ValueError("the path has coordinates that are not finite")
+    if not in_range(corners):
+        raise ValueError("the path has coordinates that are out of range")
     return np.array([(vertex.x, vertex.y) for vertex in path.flattening(max(sag, _SAG * size), segments=8)])
 
 
@@ -379,7 +380,7 @@ def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
         rings = [_flatten(path, sag) for path in paths]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
-    usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]
+    usable = [ring for ring in rings if len(ring) >= 4 and in_range(ring)]
     return even_odd_polygons(part for ring in usable for part in polygons_from_geometry(shapely.Polygon(ring)))
 
 

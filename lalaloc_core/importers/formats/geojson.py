@@ -13,7 +13,9 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
+from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
+from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions, check_units
 from lalaloc_core.importers.common.tagged_features import Feature, import_features
@@ -70,7 +72,7 @@ def parse_features(document: Any, budget: Budget) -> Iterator[Feature]:
     elif kind == "Feature":
         yield from _feature(document, "the feature", budget)
     else:
-        yield from _feature({"type": "Feature", "geometry": document, "properties": {}}, "the geometry", budget)
+        yield from _feature({"type": "Feature", "geometry": document, "properties": {}}, "the file", budget)
 
 
 def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
@@ -79,16 +81,19 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     geometry = raw.get("geometry")
     if geometry is None:
         return
-    budget.spend(1 + _count_numbers(geometry) // 2)
+    budget.spend(1 + _count_numbers(geometry, where) // 2)
     try:
-        shape = shapely.from_geojson(json.dumps(geometry, allow_nan=True))
+        shape = shapely.from_geojson(json.dumps(geometry))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
-        raise InvalidFloorPlanError(f"the geometry of {where} is not a GeoJSON geometry: {error}") from error
+        raise InvalidFloorPlanError(
+            f"the geometry of {where} is not a GeoJSON geometry: it must have a known 'type', and 'coordinates' that "
+            "are lists of numbers, closed rings for a polygon; export it again"
+        ) from error
     if shape is None or shape.is_empty:
         return
     shape = shapely.force_2d(shape)
-    if not np.isfinite(shapely.get_coordinates(shape)).all():
-        raise InvalidFloorPlanError(f"the geometry of {where} has coordinates that are not finite; remove it")
+    # A position of one number has no y.
+    check_coordinates(shapely.get_coordinates(shape), f"the geometry of {where}")
     given = raw.get("properties")
     properties = dict(given) if isinstance(given, Mapping) else {}
     # Some converters of OpenStreetMap data nest its tags.
@@ -100,8 +105,12 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     yield Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
 
 
-def _count_numbers(value: Any) -> int:
-    """Count the numbers in nested lists."""
+def _count_numbers(value: Any, where: str) -> int:
+    """Count the numbers in nested lists.
+
+    Raises:
+        InvalidFloorPlanError: one is out of range.
+    """
     pending, count = [value], 0
     while pending:
         item = pending.pop()
@@ -110,6 +119,11 @@ def _count_numbers(value: Any) -> int:
         elif isinstance(item, list):
             pending.extend(item)
         else:
+            if is_number(item) and not abs(item) <= MAX_COORDINATE:
+                raise InvalidFloorPlanError(
+                    f"the geometry of {where} has the number {str(item)[:50]}; the limit is {MAX_COORDINATE:g} to "
+                    "either side; correct it, and export the file again"
+                )
             count += 1
     return count
 

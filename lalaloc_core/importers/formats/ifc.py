@@ -19,7 +19,7 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.floors import find_floor, join_faces, report_floor
-from lalaloc_core.importers.common.geometry import opening_line
+from lalaloc_core.importers.common.geometry import check_coordinates, opening_line
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -33,15 +33,14 @@ from lalaloc_core.importers.common.sketch import (
     SketchedRoom,
 )
 from lalaloc_core.importers.common.vocabulary import role_from_name
-from lalaloc_core.importers.formats.ifc_anchor import model_anchor
+from lalaloc_core.importers.formats.ifc_file import open_model
 from lalaloc_core.importers.formats.ifc_fixtures import FURNISHINGS, fixture_kind
+from lalaloc_core.importers.formats.ifc_place import find_anchor
 
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
-# End of a complete file; some tools append white space or comments.
-_END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 # Heights of storeys nearer than this are of one storey (m).
 _SAME_STOREY_M = 1.5
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
@@ -57,14 +56,14 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         ModuleNotFoundError: ifcopenshell is not installed.
     """
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
-    model = _open(content)
+    model = open_model(content)
     budget.check_time()
     storeys = _storeys(model)
     if not storeys:
         raise InvalidFloorPlanError(
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
-    anchor = model_anchor(model, _unit(model))
+    anchor = find_anchor(model, _unit(model))
     meshes = _Meshes(budget)
     elements = _elements(model, storeys, meshes)
 
@@ -85,25 +84,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(storeys, options, budget.limits, make)
-
-
-def _open(content: bytes) -> Any:
-    import ifcopenshell
-
-    # ifcopenshell reads a truncated file without an error, and the rest is missing.
-    if _END not in content[-_TAIL_BYTES:]:
-        raise InvalidFloorPlanError(
-            f"the IFC file is truncated: it does not end with {_END.decode()}; export or upload it again"
-        )
-    try:
-        # The format is ASCII and escapes other characters, so nothing is lost by "replace".
-        model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
-        schema = str(model.schema)
-    except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
-        raise InvalidFloorPlanError(f"the IFC model cannot be read: {error}; export it again as IFC4") from error
-    if not schema.startswith(("IFC2X3", "IFC4")):
-        raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}; export it as IFC2X3 or IFC4")
-    return model
 
 
 def _unit(model: Any) -> float:
@@ -360,7 +340,8 @@ class _Meshes:
             return None
         vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
         triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
-        if not len(triangles) or not np.isfinite(vertices).all():
+        check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
+        if not len(triangles):
             return None
         return vertices, triangles
 

@@ -19,7 +19,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.floors import Floor, find_floor, report_floor
-from lalaloc_core.importers.common.geometry import opening_line, point_xy
+from lalaloc_core.importers.common.geometry import check_coordinates, opening_line, point_xy
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -231,10 +231,7 @@ def _positions(element: Element, budget: Budget) -> Float[np.ndarray, "n 3"]:
         budget.spend(len(values) // size)
         found += [[*values[first : first + size], 0.0][:3] for first in range(0, len(values) - size + 1, size)]
     points = np.array(found, dtype=float).reshape(-1, 3)
-    if not np.isfinite(points).all() or np.abs(points).max(initial=0.0) > 1e9:
-        raise InvalidFloorPlanError(
-            "a position in the IndoorGML file is not a finite number below 1e9; export it again"
-        )
+    check_coordinates(points, "a position in the IndoorGML file")
     return points
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -15,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.crossings import check_network
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
@@ -53,8 +55,8 @@ def _from_xml(content: bytes, budget: Budget) -> list[dict[str, Any]]:
             {
                 "type": child.tag,
                 "id": child.get("id"),
-                "lat": _decimal(child.get("lat")),
-                "lon": _decimal(child.get("lon")),
+                "lat": _decimal(child, "lat"),
+                "lon": _decimal(child, "lon"),
                 "tags": {str(tag.get("k")): str(tag.get("v")) for tag in child.iter("tag")},
                 "nodes": [node.get("ref") for node in child.iter("nd")],
                 "members": [dict(member.attrib) for member in child.iter("member")],
@@ -63,11 +65,16 @@ def _from_xml(content: bytes, budget: Budget) -> list[dict[str, Any]]:
     return elements
 
 
-def _decimal(text: str | None) -> float | None:
-    try:
-        return None if text is None else float(text)
-    except ValueError:
+def _decimal(element: Element, key: str) -> float | None:
+    text = element.get(key)
+    if text is None:
         return None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InvalidFloorPlanError(
+            f"{element.tag} {str(element.get('id'))[:20]} has {key} '{text[:50]}'; it must be a number of degrees"
+        ) from error
 
 
 def _features(elements: Sequence[Mapping[str, Any]], budget: Budget) -> Iterator[Feature]:
@@ -85,7 +92,7 @@ def _features(elements: Sequence[Mapping[str, Any]], budget: Budget) -> Iterator
         elif kind == "way":
             shape = _way_shape(lines[key], tags)
         elif kind == "relation" and tags.get("type") == "multipolygon":
-            shape = _multipolygon(element, lines)
+            shape = _multipolygon(element, lines, budget)
         if shape is not None:
             # The tag `type` of a relation says nothing about the room.
             yield Feature(shape, {name: value for name, value in tags.items() if name != "type"}, f"{kind}/{key}")
@@ -94,6 +101,12 @@ def _features(elements: Sequence[Mapping[str, Any]], budget: Budget) -> Iterator
 def _position(element: Any) -> _Position | None:
     if not isinstance(element, Mapping) or not is_number(element.get("lat")) or not is_number(element.get("lon")):
         return None
+    for key, limit in (("lat", 90), ("lon", 180)):
+        if not abs(element[key]) <= limit:
+            raise InvalidFloorPlanError(
+                f"a position of the OpenStreetMap file has {key} {str(element[key])[:50]}; it must be a number from "
+                f"-{limit} to {limit}"
+            )
     return float(element["lon"]), float(element["lat"])
 
 
@@ -116,7 +129,9 @@ def _way_shape(points: list[_Position], tags: Mapping[str, Any]) -> BaseGeometry
     return shapely.LineString(points) if len(points) >= 2 else None
 
 
-def _multipolygon(element: Mapping[str, Any], lines: Mapping[Any, list[_Position]]) -> BaseGeometry | None:
+def _multipolygon(
+    element: Mapping[str, Any], lines: Mapping[Any, list[_Position]], budget: Budget
+) -> BaseGeometry | None:
     """Return the area of a relation; its rings can be divided into several ways."""
     members = element.get("members")
     rings: dict[bool, list[shapely.LineString]] = {True: [], False: []}
@@ -125,8 +140,12 @@ def _multipolygon(element: Mapping[str, Any], lines: Mapping[Any, list[_Position
             points = lines.get(member.get("ref"), [])
             if len(points) < 2 and isinstance(member.get("geometry"), list):
                 points = [point for raw in member["geometry"] if (point := _position(raw)) is not None]
+            # A way can be a part of many relations.
+            budget.spend(len(points))
             if len(points) >= 2:
                 rings[member.get("role") == "inner"].append(shapely.LineString(points))
+    for role in (False, True):
+        check_network(rings[role])
     outer, inner = (shapely.union_all(shapely.get_parts(shapely.polygonize(rings[role]))) for role in (False, True))
     area = shapely.difference(outer, inner)
     return shapely.MultiPolygon(parts) if (parts := polygons_from_geometry(area)) else None

@@ -47,6 +47,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     try:
         found = read_page(page, budget)
         builder = ReportBuilder("pdf", is_draft=True)
+        if found.out_of_range:
+            builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
         scan = _read_scan(page, found, builder, budget)
         # A unit of a PDF is always a point.
         without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]

@@ -14,7 +14,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
@@ -37,12 +37,16 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass
 class PageContent:
-    """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts."""
+    """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts.
+
+    `out_of_range` lines are left out, as their coordinates are out of range.
+    """
 
     drawing: Drawing = field(default_factory=Drawing)
     size_pt: tuple[float, float] = (0.0, 0.0)
     picture_share: float = 0.0
     letters: list[shapely.Polygon] = field(default_factory=list)
+    out_of_range: int = 0
 
 
 @dataclass
@@ -87,10 +91,10 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     ):
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
-            _add_path(item, matrix, found.drawing, budget)
+            found.out_of_range += _add_path(item, matrix, found.drawing, budget)
         elif kind == pdfium.FPDF_PAGEOBJ_IMAGE:
             corners = _apply(matrix, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-            area = shapely.Polygon(corners).area if np.isfinite(corners).all() else 0.0
+            area = shapely.Polygon(corners).area if in_range(corners) else 0.0
             found.picture_share += min(area / max(width * height, 1.0), 1.0)
     found.drawing.letterings = _letterings(page)
     return found
@@ -115,10 +119,11 @@ def _objects(
             )
 
 
-def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> None:
+def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> int:
+    """Add the outlines and lines of a path; return the number of those out of range, which are left out."""
     fill, stroke = ctypes.c_int(), ctypes.c_int()
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
-        return
+        return 0
     is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
     fill_colour = _fill(item) if is_filled else None
     is_wall = fill_colour is not None and is_dark(*fill_colour[:3])
@@ -126,9 +131,11 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
     pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
     shells: list[shapely.Polygon] = []
+    out_of_range = 0
     for subpath in _subpaths(item, budget):
         points = _apply(matrix, subpath.points)
-        if not np.isfinite(points).all():
+        if not in_range(points):
+            out_of_range += 1
             continue
         swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
         leaves = [swing for swing in swings if swing is not None]
@@ -144,6 +151,7 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     # A coloured floor or a white background has no drawn outline.
     if is_wall or is_stroked:
         drawing.areas += [Area(part, "", None, is_dark=is_wall, width=pen, order=order) for part in parts]
+    return out_of_range
 
 
 def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:

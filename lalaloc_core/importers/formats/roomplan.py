@@ -7,7 +7,6 @@ https://developer.apple.com/documentation/roomplan/capturedroom
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.fixtures import fixture_from_name
-from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -42,6 +41,8 @@ _OPENINGS: Mapping[str, OpeningKind] = {"doors": "door", "windows": "window", "o
 _ENCLOSED_SHARE = 0.8
 # A sill nearer to the floor is rounding of the scan (m).
 _MIN_SILL_M = 0.1
+# Walls beside a room have their middle within this distance of it (m).
+_BESIDE_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,12 @@ def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: Report
         builder.use("floors", "rooms", len(floors))
     floor_m = float(np.median([wall.low_m for wall in walls])) if walls else 0.0
     sketch = Sketch(opening_kinds=tuple(_OPENINGS.values()))
-    for room in rooms:
-        name = _label(room, surfaces["sections"])
-        around = [wall for wall in walls if room.distance(wall.line.interpolate(0.5, normalized=True)) < 0.3]
+    middles = shapely.STRtree([wall.line.interpolate(0.5, normalized=True) for wall in walls])
+    labels = _labels(rooms, surfaces["sections"])
+    for index, room in enumerate(rooms):
+        budget.check_time()
+        name = labels.get(index)
+        around = [walls[k] for k in middles.query(room, predicate="dwithin", distance=_BESIDE_M)]
         height_m = float(np.median([wall.high_m - floor_m for wall in around])) if around else None
         sketch.rooms.append(SketchedRoom(room, name, room_type_from_name(name), height_m))
     for index, raw in enumerate(surfaces["objects"]):
@@ -158,7 +162,9 @@ def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
 def _place(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> Float[np.ndarray, "n 3"]:
     """Return points of a surface in the frame of the scan."""
     transform = _numbers(raw.get("transform"), 16, f"transform of {where}").reshape(4, 4).T
-    return local @ transform[:3, :3].T + transform[:3, 3]
+    placed = local @ transform[:3, :3].T + transform[:3, 3]
+    check_coordinates(placed, where)
+    return placed
 
 
 def _from_above(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -170,18 +176,23 @@ def _numbers(raw: Any, count: int, where: str) -> Float[np.ndarray, "n"]:
     # Some encoders write matrices as four columns.
     parts = raw if isinstance(raw, list) else []
     flat = [value for part in parts for value in (part if isinstance(part, list) else [part])]
-    if len(flat) != count or not all(is_number(value) and math.isfinite(value) for value in flat):
-        raise InvalidFloorPlanError(f"the {where} must be {count} numbers; export the RoomPlan scan again")
+    if len(flat) != count or not all(is_number(value) and abs(value) <= MAX_COORDINATE for value in flat):
+        raise InvalidFloorPlanError(
+            f"the {where} must be {count} numbers up to {MAX_COORDINATE:g}; export the RoomPlan scan again"
+        )
     return np.array(flat, dtype=float)
 
 
-def _label(room: shapely.Polygon, sections: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the name of the section whose centre lies in a room: "livingRoom" is "living room"."""
+def _labels(rooms: Sequence[shapely.Polygon], sections: Sequence[Mapping[str, Any]]) -> dict[int, str]:
+    """Return names by the index of a room, of the first section whose centre lies in it, "livingRoom" as two words."""
+    tree = shapely.STRtree(list(rooms))
+    found: dict[int, str] = {}
     for section in sections:
         label, centre = section.get("label"), section.get("center")
         if not isinstance(label, str) or not isinstance(centre, list) or label == "unidentified":
             continue
         ((x, y),) = _from_above(_numbers(centre, 3, f"centre of section '{label[:50]}'")[None])
-        if room.contains(shapely.Point(x, y)):
-            return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", label).lower()[:100]
-    return None
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", label).lower()[:100]
+        for index in tree.query(shapely.Point(x, y), predicate="within"):
+            found.setdefault(int(index), words)
+    return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,6 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.importers.common.archive import pack
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.geometry import MapFrame
@@ -30,14 +29,15 @@ if TYPE_CHECKING:
     from lalaloc_core.importers.picture.occupancy import OccupancyGrid
 
 YAML_SUFFIXES = (".yaml", ".yml")
-_MAX_YAML_BYTES = 65_536
-_RESOLUTION_M = (0.001, 1.0)
+_MAX_YAML_BYTES, _MAX_YAML_DEPTH = 65_536, 16
+_RESOLUTION_M, _MAX_ORIGIN_M = (0.001, 1.0), 1e6
 # Written maps: cell size, margin around the rooms and thickness of outer walls (m), and the usual values of cells.
 _CELL_M, _MARGIN_M, _WALL_M = 0.05, 1.0, 0.15
 # Cells of larger maps are twice, four times ... as large.
 _MAX_CELLS = 4_000_000
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+_YES = ("1", "true", "yes", "on")
 
 
 def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -143,12 +143,34 @@ def _settings(content: bytes) -> Mapping[str, Any]:
     import yaml
 
     try:
-        settings = yaml.safe_load(content)
-    except (yaml.YAMLError, ValueError) as error:
-        raise InvalidFloorPlanError(f"the YAML of the ROS map is invalid: {error}"[:500]) from error
+        _check_events(yaml.parse(content, Loader=yaml.BaseLoader), yaml.events)
+        # All values are texts.
+        settings = yaml.load(content, Loader=yaml.BaseLoader)
+    except InvalidFloorPlanError:
+        raise
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
+        raise InvalidFloorPlanError(f"the YAML of the ROS map is invalid{where}; save the map again") from error
     if not isinstance(settings, Mapping):
         raise InvalidFloorPlanError("the YAML of the ROS map must have 'image', 'resolution' and 'origin'")
     return settings
+
+
+def _check_events(events: Iterable[Any], kinds: Any) -> None:
+    """Refuse values that are repeated by reference, which a few lines can multiply to billions, and deep nesting."""
+    depth = 0
+    for event in events:
+        if isinstance(event, kinds.AliasEvent) or getattr(event, "value", None) == "<<":
+            raise InvalidFloorPlanError(
+                f"line {event.start_mark.line + 1} of the YAML of the ROS map repeats values with an alias (*) or a "
+                "merge key (<<); write them out"
+            )
+        depth += isinstance(event, kinds.CollectionStartEvent) - isinstance(event, kinds.CollectionEndEvent)
+        if depth > _MAX_YAML_DEPTH:
+            raise InvalidFloorPlanError(
+                f"the YAML of the ROS map is nested more than {_MAX_YAML_DEPTH} deep; write its values side by side"
+            )
 
 
 def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> OccupancyGrid:
@@ -156,13 +178,16 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
 
     resolution_m = _number(settings, "resolution", None, _RESOLUTION_M)
     origin = settings.get("origin")
-    if not isinstance(origin, list) or len(origin) < 2 or not all(_is_near(value) for value in origin):
-        raise InvalidFloorPlanError(f"origin of the ROS map is {str(origin)[:50]}; it must be [x, y, yaw]")
-    x, y, yaw, *_ = [float(value) for value in origin] + [0.0]
+    place = [_to_float(value) for value in origin] if isinstance(origin, list) else []
+    if len(place) < 2 or not all(abs(value) < _MAX_ORIGIN_M for value in place):
+        raise InvalidFloorPlanError(
+            f"origin of the ROS map is {str(origin)[:50]}; it must be [x, y, yaw], numbers below {_MAX_ORIGIN_M:g}"
+        )
+    x, y, yaw, *_ = [*place, 0.0]
     occupied_at = _number(settings, "occupied_thresh", _OCCUPIED_THRESHOLD, (0.0, 1.0))
     free_at = _number(settings, "free_thresh", _FREE_THRESHOLD, (0.0, 1.0))
     values = np.arange(256) / 255.0
-    occupancy = values if settings.get("negate") in (1, True) else 1.0 - values
+    occupancy = values if str(settings.get("negate")).casefold() in _YES else 1.0 - values
     rows, columns = gray.shape
     return OccupancyGrid(
         MapFrame(resolution_m, (x, y, yaw), (rows, columns)),
@@ -247,11 +272,16 @@ def _text(settings: Mapping[str, Any], key: str) -> str:
 
 
 def _number(settings: Mapping[str, Any], key: str, default: float | None, limits: tuple[float, float]) -> float:
-    value, (low, high) = settings.get(key, default), limits
-    if not is_number(value) or not low <= value <= high:
-        raise InvalidFloorPlanError(f"{key} of the ROS map is {str(value)[:50]}; it must be {low:g} to {high:g}")
-    return float(value)
+    raw, (low, high) = settings.get(key, default), limits
+    value = _to_float(raw)
+    if not low <= value <= high:
+        raise InvalidFloorPlanError(f"{key} of the ROS map is {str(raw)[:50]}; it must be {low:g} to {high:g}")
+    return value
 
 
-def _is_near(value: object) -> bool:
-    return is_number(value) and abs(float(value)) < 1e6  # type: ignore[arg-type]
+def _to_float(value: object) -> float:
+    """Return the number in a text of the YAML, NaN if there is none; float() accepts 1_000, which YAML does not."""
+    try:
+        return math.nan if "_" in str(value) else float(str(value))
+    except ValueError:
+        return math.nan

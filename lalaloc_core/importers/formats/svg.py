@@ -21,7 +21,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.fixtures import fixture_from_name
-from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -271,7 +271,7 @@ def _is_hidden(element: Any) -> bool:
 def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
     text = " ".join((element.text or "").split())[:200]
     point = element.transform.point_in_matrix_space((element.x, element.y))
-    if text and np.isfinite([point.x, point.y]).all():
+    if text and in_range(np.array([point.x, point.y], dtype=float)):
         drawing.letterings.append(Lettering(text, (float(point.x), float(point.y)), context.layer))
 
 
@@ -294,6 +294,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
             line, order = shapely.LineString(points), drawing.next_order
             drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
+        elif not len(points):
+            builder.use(context.layer, "ignored (coordinates out of range)")
     order = drawing.next_order
     for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
         if fill is not None and is_filled and not is_wall and context.role is None and fill.opacity > _OPAQUE:
@@ -304,7 +306,10 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
-    """Yield the points of every subpath, whether it is closed, and its curves (runs of curved segments)."""
+    """Yield the points of every subpath, whether it is closed, and its curves (runs of curved segments).
+
+    A subpath whose coordinates are out of range has no points.
+    """
     for subpath in path.as_subpaths():
         segments = [s for s in svgelements.Path(subpath) if not isinstance(s, svgelements.Move)]
         closed = any(isinstance(segment, svgelements.Close) for segment in segments)
@@ -325,7 +330,9 @@ def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarr
                 curves.append(piece)
             was_curved = is_curved
         array = _array(points)
-        if len(array) and np.isfinite(array).all():
+        if not in_range(array):
+            yield np.empty((0, 2)), False, []
+        elif len(array):
             distinct = array[np.concatenate([[True], np.any(np.diff(array, axis=0) != 0.0, axis=1)])]
             returns = len(distinct) > 3 and bool(np.all(distinct[0] == distinct[-1]))
             yield distinct, closed or returns, [_array(curve) for curve in curves]

@@ -12,8 +12,11 @@ from pyproj.exceptions import ProjError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 
 
-def model_anchor(model: Any, unit_m: float) -> Anchor | None:
-    """Return the place of the model's origin from IfcMapConversion (IFC 4), else from the site's coordinates."""
+def find_anchor(model: Any, unit: float) -> Anchor | None:
+    """Return the place of the model's origin from IfcMapConversion (IFC 4), else from the site's coordinates.
+
+    `unit` is the length of the model's unit (m).
+    """
     mapped = _map_conversion(model)
     if mapped is not None:
         return mapped
@@ -24,8 +27,8 @@ def model_anchor(model: Any, unit_m: float) -> Anchor | None:
         latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
         if abs(latitude) > 90.0 or abs(longitude) > 180.0:
             continue
-        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, unit_m)
-        altitude = None if site.RefElevation is None else float(site.RefElevation) * unit_m
+        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, unit)
+        altitude = None if site.RefElevation is None else float(site.RefElevation) * unit
         return Anchor(latitude, longitude, altitude, north_deg)
     return None
 
