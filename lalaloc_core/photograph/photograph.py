@@ -24,15 +24,7 @@ from lalaloc_core.photograph.levelling import (
 )
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
-from lalaloc_core.photograph.picture_files import (
-    FORMATS,
-    NEUTRAL,
-    PhotographLimits,
-    opened_picture,
-    orientation_of,
-    scaled,
-    turned,
-)
+from lalaloc_core.photograph.picture_files import FORMATS, NEUTRAL, PhotographLimits, opened_picture, scaled
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
 from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.photograph.stated_camera import StatedCamera
@@ -135,12 +127,11 @@ def open_picture(
     Raises:
         InvalidPhotographError: the file is not readable or too large.
     """
-    with opened_picture(content, limits or PhotographLimits()) as image:
-        orientation = orientation_of(image)
-        width, height = turned(image.size, orientation)
+    with opened_picture(content, limits or PhotographLimits()) as file:
+        width, height = file.upright_size
         share = min(max_size[0] / width, max_size[1] / height)
         size = max(1, round(share * width)), max(1, round(share * height))
-        return np.asarray(scaled(image, orientation, size))
+        return np.asarray(scaled(file, size))
 
 
 def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
@@ -186,25 +177,25 @@ def open_photograph(
         return read_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
 
     is_fine = sphere_size[0] >= COARSEST[0]
-    with opened_picture(content, limits) as image:
-        orientation = orientation_of(image)
-        width, height = turned(image.size, orientation)
+    with opened_picture(content, limits) as file:
+        width, height = file.upright_size
         if min(width, height) < limits.min_height:
             raise InvalidPhotographError(
                 f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
             )
-        metadata = read_photo_sphere(image.info.get("xmp"), width=width, height=height)
+        metadata = read_photo_sphere(file.packets, width=width, height=height)
         lens = find_lens(
             width,
             height,
             stated=stated,
             sphere=metadata,
-            exif=read_exif_lens(image.getexif(), width=width, height=height),
+            exif=read_exif_lens(file.exif, width=width, height=height),
             looks_spherical=lambda: is_sphere(sphere() if is_fine else sphere(*COARSEST)),
         )
+        lens = replace(lens, warnings=(*file.warnings, *metadata.warnings, *lens.warnings))
         if lens.is_sphere:
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
-        picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
+        picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
     return _photograph_of_picture(picture, (width, height), lens, stated, size)
 
 

@@ -17,14 +17,7 @@ from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
-from lalaloc_core.photograph.picture_files import (
-    NEUTRAL,
-    PhotographLimits,
-    opened_picture,
-    orientation_of,
-    scaled,
-    turned,
-)
+from lalaloc_core.photograph.picture_files import NEUTRAL, PhotographLimits, opened_picture, scaled
 
 # Oversampling of pictures that are placed or levelled, relative to the encoder's input.
 _FINER = 2
@@ -58,17 +51,16 @@ def read_sphere(
             the full sphere nor a part of it that the metadata describe.
     """
     limits = limits or PhotographLimits()
-    with opened_picture(content, limits) as image:
-        orientation = orientation_of(image)
-        upright = turned(image.size, orientation)
-        sphere = read_photo_sphere(image.info.get("xmp"), width=upright[0], height=upright[1])
+    with opened_picture(content, limits) as file:
+        upright = file.upright_size
+        sphere = read_photo_sphere(file.packets, width=upright[0], height=upright[1])
         _check_shape(*upright, sphere, limits)
         sphere = replace(
             sphere, pitch=sphere.pitch if pitch is None else pitch, roll=sphere.roll if roll is None else roll
         )
         finer = 1 if sphere.part is None and sphere.level else _FINER
         canvas_size = (width * finer, height * finer)
-        picture = scaled(image, orientation, _shown_size(sphere.part, canvas_size))
+        picture = scaled(file, _shown_size(sphere.part, canvas_size))
         canvas = picture if sphere.part is None else _placed(picture, sphere.part, canvas_size)
         if not sphere.level:
             canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll))

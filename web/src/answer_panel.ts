@@ -101,7 +101,7 @@ function remarks(answer: Answer): HTMLElement[] {
   const { view, together } = answer,
     advice = adviceWords(answer),
     elsewhere = answer.probability_elsewhere ?? 0;
-  const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) =>
+  const warnings = [...new Set([...answer.warnings, ...(view?.warnings ?? [])])].map((warning) =>
     h("p", { class: "warning" }, plainWords(warning)),
   );
   return [
