@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lalaloc_core.photograph.exif import finite_number
 from lalaloc_core.photograph.gpano import read_gpano
@@ -36,6 +36,16 @@ class SpherePart:
     top: float
     width: float
     height: float
+
+    @property
+    def azimuth(self) -> float:
+        """Azimuth of the part's centre relative to that of the full sphere, radians clockwise."""
+        return math.tau * (self.left + 0.5 * self.width - 0.5)
+
+    @property
+    def centred(self) -> SpherePart:
+        """The part in the middle of a sphere that is turned to its centre."""
+        return replace(self, left=0.5 - 0.5 * self.width)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,17 +48,7 @@ _SIDEWAYS = {5, 6, 7, 8}
 # Largest share of rows that a JPEG without its end can lack.
 _MAX_MISSING = 0.5
 # Decoders raise these for damaged files; their words are not those of users.
-_DAMAGE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    LookupError,
-    TypeError,
-    OverflowError,
-    struct.error,
-)
+_DAMAGE = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, LookupError, OverflowError, struct.error)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
 from lalaloc_core.photograph.file_segments import END
-from tests.core.taken import EXAMPLES, jpeg
+from tests.core.taken import EXAMPLES, jpeg, sphere
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 from tests.service.test_photographs import PHONE, ask, shown
 
@@ -93,3 +94,20 @@ def test_photograph_as_the_body_asks_for_a_form(client: httpx.Client, flat: str)
     assert "send fields in the body, which is multipart/form-data" in fault["message"]
     response = client.post("/localise", content=KITCHEN, headers={"Content-Type": "image/jpeg"})
     assert "send multipart/form-data" in assert_problem(response, 415, "unsupported-media")["detail"]
+
+
+def test_sphere_in_another_layout_is_converted_or_named(client: httpx.Client, flat: str) -> None:
+    pixels = sphere("kitchen")
+    whole = ask(client, flat, jpeg(pixels)).json()
+    height, width = pixels.shape[:2]
+    answer = ask(client, flat, jpeg(np.pad(pixels, ((height // 8, height // 8), (0, 0), (0, 0))))).json()
+    assert answer["view"]["projection"] == "equirectangular"
+    assert any("a sphere with bars at its borders" in text for text in answer["warnings"])
+    assert answer["room"] == whole["room"]
+    place = np.arange(width // 2) + 0.5 - width / 4
+    circle = (np.hypot(*np.meshgrid(place, place)) < width / 4)[..., None].astype(np.uint8)
+    two = np.hstack([pixels[:, : width // 2] * circle, pixels[:, width // 2 :] * circle])
+    detail = assert_problem(
+        ask(client, flat, jpeg(np.maximum(two, 60 * np.hstack([circle] * 2)))), 422, "invalid-panorama"
+    )
+    assert "dual fisheye picture of a 360° camera" in detail["detail"]
