@@ -134,7 +134,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
 
     from lalaloc_core.draw.answer import drawn_answer
     from lalaloc_core.evaluate.methods.lalaloc import LocalModel
-    from lalaloc_core.localise.belief import advice_for, information_bits
+    from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
     from lalaloc_core.localise.encode.features import is_features, read_features
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.photograph import StatedCamera
@@ -174,6 +174,8 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         source = "searched" if found.heading_contradicted else known.source
         warnings = ["the photograph contradicts the heading, which was estimated instead"]
         warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
+        if confidence is not None and not warnings:
+            warnings = [text for text in [reason_for(confidence.position, confidence.elsewhere)] if text]
         details = {
             "stage": found.stage,
             "heading_source": source,

@@ -10,7 +10,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError, SeveralLevelsError
-from lalaloc_core.file_kinds import describe_file
+from lalaloc_core.file_kinds import STAND_INS, describe_file
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
@@ -250,7 +250,8 @@ def _format_by_magic(content: bytes) -> Format:
         raise InvalidFloorPlanError("the file is empty; export it again")
     kind = describe_file(content)
     if kind is not None:
-        found = f"{kind}, which cannot be read: {_ADVICE.get(kind.rpartition(' ')[2], 'convert it')}"
+        advice = STAND_INS.get(kind) or _ADVICE.get(kind.rpartition(" ")[2], "convert it")
+        found = f"{kind}, which cannot be read: {advice}"
     elif start.startswith(b"<"):
         found = "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"
     else:

@@ -1,24 +1,20 @@
 """Photo Sphere metadata: visible part of the sphere, pitch, roll and compass heading.
 
-Read from the GPano properties of a picture's XMP packet (Google's Photo Sphere XMP metadata). The values are not
-trusted: values out of range are ignored, and a contradictory part of the sphere is reported and not used.
+Read from the GPano properties of a picture (Google's Photo Sphere XMP metadata). The values are not trusted: values out
+of range are ignored with a warning, and a contradictory part of the sphere is reported and not used.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from xml.etree.ElementTree import ParseError
-
-from defusedxml.common import DefusedXmlException
-from defusedxml.ElementTree import fromstring
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from lalaloc_core.photograph.exif import finite_number
+from lalaloc_core.photograph.gpano import read_gpano
 
-_NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
-# A packet of a JPEG fits into one segment of 64 KiB.
-_MAX_XMP_BYTES = 256 * 1024
 _MAX_SIDE = 1_000_000
+_MAX_ANGLE_DEG = 180.0
 # Relative difference of equal widths, heights and ratios; stitchers round.
 _TOLERANCE = 0.01
 _MIN_SHARE = 0.1
@@ -41,6 +37,16 @@ class SpherePart:
     width: float
     height: float
 
+    @property
+    def azimuth(self) -> float:
+        """Azimuth of the part's centre relative to that of the full sphere, radians clockwise."""
+        return math.tau * (self.left + 0.5 * self.width - 0.5)
+
+    @property
+    def centred(self) -> SpherePart:
+        """The part in the middle of a sphere that is turned to its centre."""
+        return replace(self, left=0.5 - 0.5 * self.width)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoSphere:
@@ -53,7 +59,8 @@ class PhotoSphere:
         declared: the metadata state that the picture shows a sphere or a part of it.
         cylinder: horizontal field of view of a picture that the metadata state to be cylindrical; None if they do not.
         roll: clockwise rotation of the camera about its viewing direction; the horizon rotates counterclockwise.
-        compass_heading: azimuth of the centre, clockwise from true north; None if missing.
+        compass_heading: azimuth of the full sphere's centre, clockwise from true north; None if missing.
+        warnings: values that were ignored, and why.
     """
 
     part: SpherePart | None = None
@@ -64,6 +71,7 @@ class PhotoSphere:
     pitch: float = 0.0
     roll: float = 0.0
     compass_heading: float | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def level(self) -> bool:
@@ -71,54 +79,59 @@ class PhotoSphere:
         return self.pitch == 0.0 and self.roll == 0.0
 
 
-def read_photo_sphere(xmp: bytes | str | None, *, width: int, height: int) -> PhotoSphere:
-    """Read the XMP packet of a picture of `width` x `height` pixels; unreadable packets count as missing."""
-    values = _properties(xmp)
+def read_photo_sphere(packets: Sequence[bytes | str], *, width: int, height: int) -> PhotoSphere:
+    """Read the XMP packets of a picture of `width` x `height` pixels; unreadable packets count as missing."""
+    values, conflicts = read_gpano(packets)
     projection = values.get("ProjectionType", "equirectangular")
     if projection.lower() != "equirectangular":
         return PhotoSphere(
-            refusal=f"the projection is '{projection[:50]}'; only 'equirectangular' is supported",
+            refusal=f"the projection is '{projection}'; only 'equirectangular' is supported",
             cylinder=_cylinder(values) if projection.lower() == "cylindrical" else None,
+            warnings=conflicts,
         )
     part, fault = _part(values, width, height)
     share = 1.0 if part is None else part.width * part.height
     if share < _MIN_SHARE:
         return PhotoSphere(refusal=f"it shows {share:.1%} of the sphere; the minimum is {_MIN_SHARE:.0%}")
+    warnings = list(conflicts)
+    pitch = _angle(values, "PosePitchDegrees", warnings, largest_deg=90.0) or 0.0
+    roll = _angle(values, "PoseRollDegrees", warnings) or 0.0
+    heading = _angle(values, "PoseHeadingDegrees", warnings)
     return PhotoSphere(
         part=part,
         fault=fault,
         declared="ProjectionType" in values or any(name in values for name in _CROP),
-        pitch=_angle(values, "PosePitchDegrees", -90.0, 90.0) or 0.0,
-        roll=_angle(values, "PoseRollDegrees", -180.0, 180.0) or 0.0,
-        compass_heading=_angle(values, "PoseHeadingDegrees", 0.0, 360.0),
+        pitch=pitch,
+        roll=roll,
+        compass_heading=None if heading is None else heading % math.tau,
+        warnings=tuple(warnings),
     )
 
 
-def _properties(xmp: bytes | str | None) -> dict[str, str]:
-    """Return the GPano properties of a packet, from attributes and elements; the first of each name counts."""
-    if not xmp or len(xmp) > _MAX_XMP_BYTES:
-        return {}
-    packet = xmp.strip("\0 \r\n\t") if isinstance(xmp, str) else xmp.strip(b"\0 \r\n\t")
-    try:
-        root = fromstring(packet, forbid_dtd=True)
-    except (ParseError, DefusedXmlException, ValueError, LookupError):
-        return {}
-    found: dict[str, str] = {}
-    for element in root.iter():
-        for name, value in [*element.attrib.items(), (element.tag, element.text or "")]:
-            if name.startswith(_NAMESPACE):
-                found.setdefault(name.removeprefix(_NAMESPACE), value.strip())
-    return found
+def _number(values: dict[str, str], name: str) -> float | None:
+    """Return a number, which can have a decimal comma; None if it is missing or none."""
+    text = values.get(name)
+    return None if text is None else finite_number(text.replace(",", ".") if text.count(",") == 1 else text)
 
 
-def _angle(values: dict[str, str], name: str, low_deg: float, high_deg: float) -> float | None:
-    degrees = finite_number(values.get(name))
-    return math.radians(degrees) if degrees is not None and low_deg <= degrees <= high_deg else None
+def _angle(values: dict[str, str], name: str, warnings: list[str], largest_deg: float = _MAX_ANGLE_DEG) -> float | None:
+    """Return an angle (radians) between -180° and 180°: some writers count a full turn, such as 340° for -20°."""
+    degrees = _number(values, name)
+    if degrees is not None and abs(degrees) <= 2.0 * _MAX_ANGLE_DEG:
+        turned = degrees if abs(degrees) <= _MAX_ANGLE_DEG else degrees - math.copysign(2.0 * _MAX_ANGLE_DEG, degrees)
+        if abs(turned) <= largest_deg:
+            return math.radians(turned)
+    if values.get(name):
+        warnings.append(
+            f"GPano {name} is '{values[name]}'; it must be between {-largest_deg:g} and {largest_deg:g}, up to a full "
+            "turn, so it is ignored"
+        )
+    return None
 
 
 def _cylinder(values: dict[str, str]) -> float | None:
     """Return the angle that a part of a cylinder shows."""
-    full, part = (finite_number(values.get(name)) for name in ("FullPanoWidthPixels", "CroppedAreaImageWidthPixels"))
+    full, part = (_number(values, name) for name in ("FullPanoWidthPixels", "CroppedAreaImageWidthPixels"))
     return math.tau * part / full if full and part and 0.0 < part <= full else None
 
 
@@ -126,10 +139,10 @@ def _part(values: dict[str, str], width: int, height: int) -> tuple[SpherePart |
     """Return the visible part of the sphere, or the problem with its metadata."""
     if not any(name in values for name in _CROP):
         return None, None
-    numbers = {name: finite_number(values.get(name)) for name in _CROP}
+    numbers = {name: _number(values, name) for name in _CROP}
     for name, number in numbers.items():
         if number is None or not 0.0 <= number <= _MAX_SIDE:
-            return None, f"{name} is '{values.get(name, '')[:50]}'; it must be between 0 and {_MAX_SIDE}"
+            return None, f"{name} is '{values.get(name, '')}'; it must be between 0 and {_MAX_SIDE}"
     full_width, full_height, part_width, part_height, left, top = (number or 0.0 for number in numbers.values())
     if min(full_width, full_height, part_width, part_height) < 1.0:
         return None, "a width or height is 0"

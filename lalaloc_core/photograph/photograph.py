@@ -15,7 +15,8 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_axes
-from lalaloc_core.photograph.exif import read_exif_lens
+from lalaloc_core.photograph.exif import ExifLens, read_exif_lens
+from lalaloc_core.photograph.layouts import Layout, find_layout
 from lalaloc_core.photograph.levelling import (
     MAX_ESTIMATED_SD,
     estimate_attitude,
@@ -24,25 +25,26 @@ from lalaloc_core.photograph.levelling import (
     lines_of,
 )
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
-from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
+from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
     FORMATS,
     NEUTRAL,
     PhotographLimits,
+    PictureFile,
     opened_picture,
-    orientation_of,
     scaled,
-    turned,
 )
-from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
-from lalaloc_core.photograph.spheres import read_sphere
-from lalaloc_core.photograph.stated_camera import StatedCamera
+from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_closed, is_sphere
+from lalaloc_core.photograph.spheres import convert_layout, read_layout, read_sphere
+from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
 # Overviews have about so many pixels, and sides that are multiples of the step.
 _OVERVIEW_PIXELS, _OVERVIEW_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
+# Ratios of sides of photographs, and their relative deviation.
+_USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
 # Seen azimuths: samples of the left and right border, and the largest elevation that counts.
@@ -140,12 +142,11 @@ def open_picture(
     Raises:
         InvalidPhotographError: the file is not readable or too large.
     """
-    with opened_picture(content, limits or PhotographLimits()) as image:
-        orientation = orientation_of(image)
-        width, height = turned(image.size, orientation)
+    with opened_picture(content, limits or PhotographLimits()) as file:
+        width, height = file.upright_size
         share = min(max_size[0] / width, max_size[1] / height)
         size = max(1, round(share * width)), max(1, round(share * height))
-        return np.asarray(scaled(image, orientation, size))
+        return np.asarray(scaled(file, size))
 
 
 def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
@@ -190,26 +191,40 @@ def open_photograph(
         pitch, roll = (None if angle is None else math.radians(angle) for angle in (stated.pitch_deg, stated.roll_deg))
         return read_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
 
-    is_fine = sphere_size[0] >= COARSEST[0]
-    with opened_picture(content, limits) as image:
-        orientation = orientation_of(image)
-        width, height = turned(image.size, orientation)
+    def judged() -> UInt8[np.ndarray, "h w 3"]:
+        return sphere() if sphere_size[0] >= COARSEST[0] else sphere(*COARSEST)
+
+    with opened_picture(content, limits) as file:
+        width, height = file.upright_size
         if min(width, height) < limits.min_height:
             raise InvalidPhotographError(
                 f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
             )
-        metadata = read_photo_sphere(image.info.get("xmp"), width=width, height=height)
+        metadata = read_photo_sphere(file.packets, width=width, height=height)
+        exif = read_exif_lens(file.exif, width=width, height=height)
+        layout = None
+        if _may_hold_sphere(stated, metadata, exif, width, height):
+            # The pixels of a level sphere are decoded in any case.
+            is_plain = file.orientation == 1 and width == 2 * height and metadata.level and _is_unturned(stated)
+            layout = find_layout(judged(), orientation=1) if is_plain else read_layout(content, limits)
+        if layout is not None and layout.is_usable:
+            return _photograph_of_layout(content, layout, file, stated, sphere_size, limits)
+        if layout is not None and stated.projection == AUTO:
+            raise InvalidPhotographError(layout.text)
         lens = find_lens(
             width,
             height,
             stated=stated,
             sphere=metadata,
-            exif=read_exif_lens(image.getexif(), width=width, height=height),
-            looks_spherical=lambda: is_sphere(sphere() if is_fine else sphere(*COARSEST)),
+            exif=exif,
+            looks_spherical=lambda: is_sphere(judged()),
+            closes=lambda: is_closed(open_picture(content, max_size=(_LONG_SIDE, _LONG_SIDE), limits=limits)),
         )
+        named = () if layout is None else (layout.text,)
+        lens = replace(lens, warnings=(*named, *file.warnings, *metadata.warnings, *lens.warnings))
         if lens.is_sphere:
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
-        picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
+        picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
     return _photograph_of_picture(picture, (width, height), lens, stated, size)
 
 
@@ -230,9 +245,53 @@ def _photograph_of_sphere(
         roll=roll,
         azimuths=(-half, half),
         sphere=sphere,
-        compass_heading=metadata.compass_heading,
+        compass_heading=_heading_of_centre(metadata),
         warnings=lens.warnings,
     )
+
+
+def _heading_of_centre(metadata: PhotoSphere) -> float | None:
+    """Return the compass heading of the picture's centre, which is not that of the full sphere in a part beside it."""
+    if metadata.compass_heading is None or metadata.part is None:
+        return metadata.compass_heading
+    return (metadata.compass_heading + metadata.part.azimuth) % math.tau
+
+
+def _may_hold_sphere(stated: StatedCamera, metadata: PhotoSphere, exif: ExifLens, width: int, height: int) -> bool:
+    """Return whether a picture is to be judged by its pixels; cameras write a focal length into usual photographs."""
+    is_known = stated.hfov_deg is not None or stated.intrinsics is not None or metadata.part is not None
+    if is_known or stated.projection not in (AUTO, "equirectangular") or metadata.refusal is not None:
+        return False
+    ratio = max(width, height) / min(width, height)
+    return exif.focal is None or all(abs(ratio / usual - 1.0) > _USUAL_TOLERANCE for usual in _USUAL_RATIOS)
+
+
+def _is_unturned(stated: StatedCamera) -> bool:
+    return stated.pitch_deg is None and stated.roll_deg is None
+
+
+def _photograph_of_layout(
+    content: bytes,
+    layout: Layout,
+    file: PictureFile,
+    stated: StatedCamera,
+    sphere_size: tuple[int, int],
+    limits: PhotographLimits,
+) -> Photograph:
+    """Return the sphere that a picture holds; GPano metadata count if they are of the same picture."""
+    width, height = file.image.size
+    metadata = read_photo_sphere(file.packets, width=width, height=height) if layout.is_stored else PhotoSphere()
+    pitch, roll = (
+        found if given is None else math.radians(given)
+        for given, found in ((stated.pitch_deg, metadata.pitch), (stated.roll_deg, metadata.roll))
+    )
+    pixels = convert_layout(
+        content, layout, height=sphere_size[0], width=sphere_size[1], limits=limits, pitch=pitch, roll=roll
+    )
+    part = SpherePart(left=0.25, top=0.0, width=0.5, height=1.0) if layout.is_half else None
+    warnings = (layout.text, *file.warnings, *metadata.warnings)
+    lens = Lens(projection="equirectangular", projection_source="estimated", warnings=warnings)
+    return _photograph_of_sphere(pixels, lens, stated, replace(metadata, part=part))
 
 
 def _photograph_of_picture(

@@ -7,20 +7,30 @@ little extra memory.
 from __future__ import annotations
 
 import io
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 
 import numpy as np
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.file_kinds import HEIC, describe_file
-from lalaloc_core.photograph.file_segments import check_segments, count_scans
+from lalaloc_core.file_kinds import HEIC, STAND_INS, describe_file
+from lalaloc_core.photograph.file_segments import (
+    END,
+    MAX_TEXT_BYTES,
+    check_segments,
+    count_scans,
+    lacks_end,
+    without_large_texts,
+    xmp_packets,
+)
 
 FORMATS = ("JPEG", "PNG", "WEBP")
+_SUPPORTED = "JPEG, PNG or WEBP"
 # Colour of missing parts of the sphere: the mean that encoders subtract.
 NEUTRAL = (128, 128, 128)
 # Pictures with more pixels are scaled down in bands of about this size.
@@ -35,6 +45,10 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 _SIDEWAYS = {5, 6, 7, 8}
+# Largest share of rows that a JPEG without its end can lack.
+_MAX_MISSING = 0.5
+# Decoders raise these for damaged files; their words are not those of users.
+_DAMAGE = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, LookupError, OverflowError, struct.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +68,38 @@ class PhotographLimits:
     aspect_tolerance: float = 0.01
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureFile:
+    """An opened picture file.
+
+    Attributes:
+        image: the picture, whose pixels are not decoded yet.
+        exif: its Exif metadata, empty if they are damaged.
+        packets: its XMP packets.
+        is_cut: it is a JPEG whose end is missing.
+        warnings: parts of the file that are damaged, or that were ignored.
+    """
+
+    image: Image.Image
+    exif: Image.Exif
+    packets: list[bytes | str]
+    is_cut: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def orientation(self) -> int:
+        """Exif orientation, 1 if there is none."""
+        orientation = self.exif.get(ExifTags.Base.Orientation, 1)
+        return orientation if isinstance(orientation, int) else 1
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """Width and height after applying the orientation."""
+        return turned(self.image.size, self.orientation)
+
+
 @contextmanager
-def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Image.Image]:
+def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[PictureFile]:
     """Open a JPEG, PNG, WebP or HEIC file (the first picture of several) whose pixels are not decoded yet.
 
     Errors of decoding within the context are translated, too.
@@ -64,18 +108,45 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Image.I
         InvalidPhotographError: empty, unsupported format, damaged, too large, too many segments or scans.
     """
     if not content:
-        raise InvalidPhotographError("the photograph is empty")
+        raise InvalidPhotographError("the photograph is empty; if it is still in a cloud, download it first")
     _check_webp_size(content, limits)
     check_segments(content)
-    with _named_errors(content, limits), Image.open(io.BytesIO(content), formats=_formats(content)) as image:
+    is_cut = lacks_end(content)
+    # Without its end, the decoder refuses all of the picture.
+    readable, left_out = (content + END, 0) if is_cut else without_large_texts(content)
+    with _named_errors(content, limits), Image.open(io.BytesIO(readable), formats=_formats(content)) as image:
         _check_pixels(*image.size, limits)
         _check_scans(content, limits)
-        yield image
+        yield _file_of(image, content, is_cut=is_cut, left_out=left_out)
 
 
-def orientation_of(image: Image.Image) -> int:
-    """Return the EXIF orientation, 1 if there is none."""
-    return image.getexif().get(ExifTags.Base.Orientation, 1)
+def _file_of(image: Image.Image, content: bytes, *, is_cut: bool, left_out: int) -> PictureFile:
+    """Return the picture with its metadata and what is wrong with them."""
+    packets, unread = xmp_packets(content)
+    exif, is_damaged = _exif_of(image)
+    faults = {
+        "the file ends before its picture does: the missing part is grey; send the whole file": is_cut,
+        f"texts of {left_out} bytes were ignored; all texts of a PNG can have {MAX_TEXT_BYTES} bytes": left_out > 0,
+        f"the last {unread} XMP packets were ignored; the limit is {len(packets)}": unread > 0,
+        "the Exif metadata are damaged and were ignored; send the camera's original file": is_damaged,
+    }
+    return PictureFile(
+        image=image,
+        exif=exif,
+        packets=[*packets] or [packet for packet in [image.info.get("xmp")] if packet],
+        is_cut=is_cut,
+        warnings=[text for text, applies in faults.items() if applies],
+    )
+
+
+def _exif_of(image: Image.Image) -> tuple[Image.Exif, bool]:
+    """Return the Exif metadata, empty if they are damaged, and whether they are."""
+    try:
+        exif = image.getexif()
+        exif.get_ifd(ExifTags.IFD.Exif)
+    except _DAMAGE:
+        return Image.Exif(), True
+    return exif, False
 
 
 def _formats(content: bytes) -> tuple[str, ...]:
@@ -95,16 +166,18 @@ def turned(size: tuple[int, int], orientation: int) -> tuple[int, int]:
     return (size[1], size[0]) if orientation in _SIDEWAYS else size
 
 
-def scaled(image: Image.Image, orientation: int, size: tuple[int, int], *, oversampling: int = 2) -> Image.Image:
+def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -> Image.Image:
     """Scale the whole picture to a size as RGB, and rotate it upright.
 
     Args:
-        image: picture of `opened_picture`.
-        orientation: its EXIF orientation.
+        file: file of `opened_picture`.
         size: width and height of the upright picture.
         oversampling: least ratio of the decoded to the requested size, for pictures that are large enough.
+
+    Raises:
+        InvalidPhotographError: most of the picture is missing.
     """
-    stored_size = turned(size, orientation)
+    image, stored_size = file.image, turned(size, file.orientation)
     # JPEGs can be decoded directly at a fraction of their size.
     image.draft("RGB", (oversampling * stored_size[0], oversampling * stored_size[1]))
     width, height = image.size
@@ -115,8 +188,21 @@ def scaled(image: Image.Image, orientation: int, size: tuple[int, int], *, overs
         # The box accounts for a partial last block in rows and columns.
         box = (0.0, 0.0, width / factor, height / factor)
         picture = _reduced(image, factor).resize(stored_size, Image.Resampling.BOX, box=box)
-    turn = _UPRIGHT.get(orientation)
+    if file.is_cut:
+        _check_missing(np.asarray(picture))
+    turn = _UPRIGHT.get(file.orientation)
     return picture if turn is None else picture.transpose(turn)
+
+
+def _check_missing(pixels: np.ndarray) -> None:
+    """Refuse a picture most of whose rows are missing: the decoder fills them with one colour."""
+    is_filled = (pixels == pixels[-1, -1]).all(axis=(1, 2))
+    missing = (len(pixels) if is_filled.all() else int(np.argmin(is_filled[::-1]))) / len(pixels)
+    if missing > _MAX_MISSING:
+        raise InvalidPhotographError(
+            f"the last {missing:.0%} of the photograph's rows are missing, because the file ends too early; the limit "
+            f"is {_MAX_MISSING:.0%}: send the whole file"
+        )
 
 
 def _reduced(image: Image.Image, factor: int) -> Image.Image:
@@ -170,20 +256,30 @@ def _named_errors(content: bytes, limits: PhotographLimits) -> Iterator[None]:
         ) from error
     except MemoryError as error:
         raise InvalidPhotographError("there is not enough memory to decode the photograph; scale it down") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise InvalidPhotographError(f"the photograph is damaged: {error}") from error
+    except _DAMAGE as error:
+        if lacks_end(content):
+            raise InvalidPhotographError(
+                "the photograph's file ends before its picture does, and too little of it can be decoded: send the "
+                "whole file"
+            ) from error
+        kind = describe_file(content) or "a picture"
+        raise InvalidPhotographError(
+            f"the photograph is {kind} that is damaged, or coded in a way that is not supported; save or export it as "
+            f"{_SUPPORTED}"
+        ) from error
 
 
 def _unreadable(content: bytes) -> str:
-    formats = f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
     kind = describe_file(content)
+    if kind in STAND_INS:
+        return f"the photograph is {kind}; {STAND_INS[kind]}"
     if kind == HEIC:
         missing = find_spec("pillow_heif") is None
         fault = "which needs the extra `heic` on the server" if missing else "which is damaged"
-        return f"the photograph is {kind}, {fault}; save or export it as {formats}"
-    if kind is None or any(name in kind.upper() for name in FORMATS):
-        return f"the photograph is not a readable {formats} picture"
-    return f"the photograph is {kind}, which is not supported; save or export it as {formats}"
+        return f"the photograph is {kind}, {fault}; save or export it as {_SUPPORTED}"
+    if kind is None or kind.removeprefix("a ").removesuffix(" picture").upper() in FORMATS:
+        return f"the photograph is not a readable {_SUPPORTED} picture"
+    return f"the photograph is {kind}, which is not supported; save or export it as {_SUPPORTED}"
 
 
 def _check_webp_size(content: bytes, limits: PhotographLimits) -> None:

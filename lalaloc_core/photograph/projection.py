@@ -35,6 +35,9 @@ _SPHERE_TOLERANCE = 0.01
 # `is_sphere`: limits of the product of seam and poles, of the seam, of the more uniform pole, and of the contrast (grey
 # levels). Fitted on photographs and rendered spheres: all photographs pass, with a margin of two.
 _MAX_PRODUCT, _MAX_SEAM, _MAX_POLE, _MIN_CONTRAST = 0.2, 8.0, 0.5, 2.0
+# `is_closed`: limit of the difference between the borders, relative to that between columns.
+_MAX_CLOSED_SEAM = 4.0
+_UNCLOSED = ": GPano FullPanoWidthPixels is the width of the part, but the borders do not continue each other"
 # Smallest height and width (pixels) of pictures that `is_sphere` judges.
 COARSEST = 128, 256
 # Relative standard deviation of a stated focal length.
@@ -80,6 +83,7 @@ def find_lens(
     sphere: PhotoSphere,
     exif: ExifLens,
     looks_spherical: Callable[[], bool],
+    closes: Callable[[], bool] = lambda: True,
 ) -> Lens:
     """Return the projection of a picture: as stated, by GPano, by the picture itself, or by its EXIF focal length.
 
@@ -90,6 +94,7 @@ def find_lens(
         sphere: GPano metadata.
         exif: EXIF metadata.
         looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
+        closes: `is_closed` of the picture; called only for a strip whose metadata state 360°.
 
     Raises:
         InvalidPhotographError: a statement is invalid, or nothing says what the picture shows.
@@ -109,12 +114,12 @@ def find_lens(
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
     if projection == "equirectangular":
         return Lens(projection=projection, projection_source=source, hfov_source=source)
-    if projection == "cylindrical" and sphere.cylinder is not None:
+    if projection == "cylindrical" and sphere.cylinder is not None and (sphere.cylinder < TWO_PI or closes()):
         return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano")
     if projection == "cylindrical":
         raise InvalidPhotographError(
-            f"nothing tells which angle the strip of {width} x {height} shows; send hfov_deg, its horizontal field of "
-            "view (up to 360)"
+            f"nothing tells which angle the strip of {width} x {height} shows{_UNCLOSED if sphere.cylinder else ''}; "
+            "send hfov_deg, its horizontal field of view (up to 360)"
         )
     if projection == "fisheye":
         raise InvalidPhotographError(
@@ -144,6 +149,13 @@ def is_sphere(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
     return seam < _MAX_SEAM and min(top, bottom) < _MAX_POLE and seam * top * bottom < _MAX_PRODUCT
 
 
+def is_closed(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
+    """Return whether the left and right border of a picture continue each other."""
+    values = pixels.astype(np.float32)
+    step = float(np.abs(np.diff(values, axis=1)).mean())
+    return float(np.abs(values[:, 0] - values[:, -1]).mean()) / (step + 0.5) < _MAX_CLOSED_SEAM
+
+
 def _is_twice_as_wide(width: int, height: int) -> bool:
     return abs(width / height - 2.0) <= 2.0 * _SPHERE_TOLERANCE
 
@@ -159,6 +171,11 @@ def _projection(
     if stated.projection != AUTO:
         return stated.projection, "given"  # pyright: ignore[reportReturnType]
     if sphere.declared:
+        if sphere.fault is not None and _is_twice_as_wide(width, height) and not looks_spherical():
+            raise InvalidPhotographError(
+                f"the photograph of {width} x {height} has invalid photo sphere metadata, {sphere.fault}, and is not a "
+                f"full 360° sphere; {_HELP}"
+            )
         return "equirectangular", "gpano"
     if sphere.cylinder is not None:
         return "cylindrical", "gpano"

@@ -95,8 +95,10 @@ async def check_parameters(request: Request) -> None:
     counts = Counter(name for name, _ in request.query_params.multi_items())
     if not counts:
         return
-    known = _parameters_of(request.scope.get("route"))
-    faults = [(name[:50], _unknown(known)) for name in counts if name not in known]
+    route = request.scope.get("route")
+    known = _parameters_of(route)
+    unknown = _unknown(known, is_form=_takes_form(route))
+    faults = [(name[:50], unknown) for name in counts if name not in known]
     once = [name for name, repeatable in known.items() if not repeatable]
     faults += [(name, "given more than once") for name in once if counts[name] > 1]
     if faults:
@@ -116,7 +118,13 @@ def _parameters_of(route: object) -> dict[str, bool]:
     return found
 
 
-def _unknown(known: dict[str, bool]) -> str:
-    if not known:
-        return "unknown query parameter; this route has none"
-    return f"unknown query parameter; known: {', '.join(sorted(known))}"
+def _takes_form(route: object) -> bool:
+    """Return whether the body of a route is a form of several parts."""
+    described = route.openapi_extra or {} if isinstance(route, APIRoute) else {}
+    return "multipart/form-data" in described.get("requestBody", {}).get("content", {})
+
+
+def _unknown(known: dict[str, bool], *, is_form: bool) -> str:
+    names = f"known: {', '.join(sorted(known))}" if known else "this route has none"
+    advice = "; send fields in the body, which is multipart/form-data" if is_form else ""
+    return f"unknown query parameter; {names}{advice}"

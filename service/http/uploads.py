@@ -36,6 +36,10 @@ _MAX_PARTS = 20
 _MAX_FIELD_BYTES = 32 * 1024
 # Beginning of the parser's message about more files than it was allowed to read.
 _TOO_MANY_FILES = "Too many files"
+# Beginning of its message about a part without a file name that exceeds `_MAX_FIELD_BYTES`.
+_TOO_LARGE_PART = "Part exceeded maximum size"
+_NO_FILE = "must be a file (a part with a file name)"
+_LARGE_FIELD = f"has more than {_MAX_FIELD_BYTES} bytes, the limit of a field"
 _UTF_8 = b"utf-8"
 
 # Settings that limit an upload.
@@ -193,6 +197,10 @@ async def read_parts(
         if repeated and error.message.startswith(_TOO_MANY_FILES):
             faults = [(name, repeats.fault(f"more than {repeats.most}")) for name, repeats in repeated.items()]
             raise errors.InvalidRequestError(faults) from error
+        if error.message.startswith(_TOO_LARGE_PART):
+            name = parser._current_part.field_name[:50]
+            is_file = aliases.get(name, name) in {*files, *repeated, *substitutes}
+            raise errors.InvalidRequestError([(name, _NO_FILE if is_file else _LARGE_FIELD)]) from error
         raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
     except FormParserError as error:
         raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
@@ -262,7 +270,7 @@ def _sort(
                 raise errors.UploadTooLargeError(limits.name, limits.max_bytes, len(value))
             found.files[name] = value
         else:
-            faults.append((label, "must be a file (a part with a file name)"))
+            faults.append((label, _NO_FILE))
     substituted = {name for other, name in substitutes.items() if other in given}
     faults.extend((name, "is missing") for name in sorted(needed - given - substituted))
     faults.extend(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.localise.belief import Posterior, photograph_heading, pose_uncertainty, probability_map
+from lalaloc_core.localise.belief import Posterior, photograph_heading, pose_uncertainty, probability_map, reason_for
 from lalaloc_core.localise.query import KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
@@ -49,7 +49,7 @@ def compose_answer(
         known: the heading that was known before the search.
         timings_ms: durations (ms) by stage.
         bundle: the model.
-        warnings: warnings besides the one about the heading.
+        warnings: warnings besides those about the heading and the photograph.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view)
     final, uncertainty = found.best[found.stage], None
@@ -62,6 +62,10 @@ def compose_answer(
         for index, candidate in enumerate(found.candidates)
     ]
     best, place = candidates[0], ground.place(found.candidates[0])
+    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
+    if confidence is not None and not warnings:
+        reason = reason_for(confidence.position, confidence.elsewhere)
+        warnings = [] if reason is None else [reason]
     return LocaliseAnswer(
         floorplan_id=place.plan_id,
         floorplan_revision=place.revision_id,
@@ -74,7 +78,7 @@ def compose_answer(
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
         probability_elsewhere=None if confidence is None else confidence.elsewhere,
-        warnings=[*_heading_warnings(found, known), *warnings],
+        warnings=warnings,
         covariance_m2=None if uncertainty is None else uncertainty.position_m2.tolist(),
         heading_std_deg=None
         if uncertainty is None or uncertainty.heading_std is None
@@ -158,12 +162,19 @@ def compose_sequence_answer(
             for answer in answers
         ],
         confidence=found.confidence(manifest, share),
-        warnings=[_motion_warning(index, motions[index]) for index in found.motions_contradicted],
+        warnings=[
+            *(_motion_warning(index, motions[index]) for index in found.motions_contradicted),
+            *(f"photo[{index}]: {text}" for index, answer in enumerate(answers) for text in _about_photograph(answer)),
+        ],
         stage=found.stage,
         camera_height_m=found.camera_height_m,
         timings_ms=first.timings_ms,
         model=first.model,
     )
+
+
+def _about_photograph(answer: LocaliseAnswer) -> list[str]:
+    return [] if answer.view is None else answer.view.warnings
 
 
 def _motion_warning(index: int, motion: Motion) -> str:

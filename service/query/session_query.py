@@ -150,7 +150,7 @@ class SessionSearch:
             camera_height_m=camera_height_m,
             candidates=rivals,
             motion_contradicted=list(found.contradicted),
-            warnings=[*_warnings(found, form), *ground.warnings],
+            warnings=[*_warnings(found, form), *ground.warnings, *spot.photograph.warnings],
             geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
             view=read_view(spot),
             timings_ms=TimingsAnswer(**totals),

@@ -162,7 +162,8 @@ class LocaliseAnswer(ResponseModel):
         "candidate. Null if `confidence` is null.",
     )
     warnings: list[str] = Field(
-        description="Parts of the request that were not followed, such as a hint that the photograph contradicts."
+        description="Parts of the request that were not followed, such as a hint that the photograph contradicts; what "
+        "the photograph was taken for, also in `view`; or the reason of a very low confidence."
     )
     heading_source: Literal["given", "panorama", "searched"] = Field(
         description="Source of the heading: the request, the photograph's metadata, or the search."

@@ -242,8 +242,8 @@ class SequenceAnswer(ResponseModel):
         "times the lowest probability that a photograph shows this plan. Null for a model without confidence."
     )
     warnings: list[str] = Field(
-        description="Motions in the request that were ignored, because the photographs contradict them, and plans of a "
-        "venue that were not searched."
+        description="Motions in the request that were ignored, because the photographs contradict them, plans of a "
+        "venue that were not searched, and warnings about photographs, such as `photo[0]: …`."
     )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
     camera_height_m: Metres = Field(description="Camera height of the first photograph that fits all photographs best.")

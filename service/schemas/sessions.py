@@ -193,7 +193,8 @@ class TrackedPoseAnswer(ResponseModel):
         description="Components of the stated motion that the photographs contradict by more than 4 deviations."
     )
     warnings: list[str] = Field(
-        description="Contradicted motions, odometry that is wrong again and again, and plans that were not searched."
+        description="Contradicted motions, odometry that is wrong again and again, plans that were not searched, and "
+        "warnings about the photograph, also in `view`."
     )
     geopose: GeoPose | None = Field(None, description="Pose on Earth; null for a plan without an anchor.")
     view: ReadView | None = Field(

@@ -293,7 +293,7 @@ def test_invalid_plan_is_refused_in_linear_time(kind: str) -> None:
 def test_metadata_are_read_in_linear_time(packet: Callable[[int], bytes]) -> None:
     def read(size: int) -> Callable[[], object]:
         content = packet(size)
-        return lambda: read_photo_sphere(content, width=512, height=256)
+        return lambda: read_photo_sphere([content], width=512, height=256)
 
     assert_no_worse_than_linear(read, _PACKET)
 

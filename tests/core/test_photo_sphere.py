@@ -113,6 +113,14 @@ FULL = world(directions(FULL_HEIGHT, FULL_WIDTH))
 LEVEL = world(directions(HEIGHT, WIDTH)).astype(int)
 
 
+def level_world(left: int, width: int) -> np.ndarray:
+    """Return the level sphere whose centre is that of a part of the full sphere, by its columns."""
+    turn = math.tau * ((left + 0.5 * width) / FULL_WIDTH - 0.5)
+    azimuth, elevation = np.meshgrid(column_azimuths(WIDTH) + turn, row_elevations(HEIGHT))
+    across = np.cos(elevation)
+    return world(np.stack([across * np.sin(azimuth), across * np.cos(azimuth), np.sin(elevation)], axis=-1)).astype(int)
+
+
 class TestParts:
     @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
     @pytest.mark.parametrize("write", [xmp, xmp_of_elements])
@@ -125,12 +133,14 @@ class TestParts:
     ) -> None:
         packet = write(**crop(left, top, width, height))
         pixels = opened(encoded(FULL[top : top + height, left : left + width], kind, packet)).astype(int)
-        scale = FULL_WIDTH // WIDTH
+        scale, shown = FULL_WIDTH // WIDTH, level_world(left, width)
+        # The picture's centre is the sphere's.
+        left = (FULL_WIDTH - width) // 2
         inner = (
             slice(-(-top // scale) + 1, (top + height) // scale - 1),
             slice(-(-left // scale) + 1, (left + width) // scale - 1),
         )
-        np.testing.assert_allclose(pixels[inner], LEVEL[inner], atol=5)
+        np.testing.assert_allclose(pixels[inner], shown[inner], atol=5)
         outside = np.ones((HEIGHT, WIDTH), bool)
         outside[top // scale : -(-(top + height) // scale), left // scale : -(-(left + width) // scale)] = False
         assert (pixels[outside] == NEUTRAL).all()
@@ -140,7 +150,7 @@ class TestParts:
         packet = xmp(**crop(128, 64, 640, 320))
         small = np.asarray(Image.fromarray(FULL[64:384, 128:768]).resize((320, 160), Image.Resampling.BOX))
         pixels = opened(encoded(small, "PNG", packet)).astype(int)
-        np.testing.assert_allclose(pixels[10:46, 18:94], LEVEL[10:46, 18:94], atol=5)
+        np.testing.assert_allclose(pixels[10:46, 26:102], level_world(128, 640)[10:46, 26:102], atol=5)
 
     def test_explicit_full_sphere_changes_nothing(self) -> None:
         explicit = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512))))
@@ -237,51 +247,73 @@ class TestMetadata:
 
     def test_initial_view_is_ignored(self) -> None:
         packet = xmp(InitialViewHeadingDegrees=90, InitialViewPitchDegrees=20, InitialViewRollDegrees=20)
-        assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
+        assert read_photo_sphere([packet], width=1024, height=512) == PhotoSphere()
 
     @pytest.mark.parametrize(
         "properties",
         [
-            {"PosePitchDegrees": 91, "PoseRollDegrees": 181, "PoseHeadingDegrees": 361},
-            {"PosePitchDegrees": "inf", "PoseRollDegrees": "-nan", "PoseHeadingDegrees": -1},
-            {"PosePitchDegrees": "up", "PoseRollDegrees": "", "PoseHeadingDegrees": "north"},
+            {"PosePitchDegrees": 91, "PoseRollDegrees": 541, "PoseHeadingDegrees": 720.5},
+            {"PosePitchDegrees": "inf", "PoseRollDegrees": "-nan", "PoseHeadingDegrees": 1e300},
+            {"PosePitchDegrees": "up", "PoseRollDegrees": "1,2,3", "PoseHeadingDegrees": "north"},
         ],
     )
-    def test_angles_out_of_range_are_ignored(self, properties: dict[str, object]) -> None:
-        assert read_photo_sphere(xmp(**properties), width=1024, height=512) == PhotoSphere()
+    def test_angles_out_of_range_are_ignored_with_a_warning(self, properties: dict[str, object]) -> None:
+        found = read_photo_sphere([xmp(**properties)], width=1024, height=512)
+        assert (found.pitch, found.roll, found.compass_heading) == (0.0, 0.0, None)
+        assert [text.split(";")[0] for text in found.warnings] == [
+            f"GPano {name} is '{value}'" for name, value in properties.items()
+        ]
+
+    def test_angles_are_reduced_to_half_a_turn(self) -> None:
+        packet = xmp(PosePitchDegrees=340, PoseRollDegrees="348,5", PoseHeadingDegrees=-90)
+        found = read_photo_sphere([packet], width=1024, height=512)
+        assert found.warnings == ()
+        assert np.degrees([found.pitch, found.roll]) == pytest.approx([-20.0, -11.5])
+        assert found.compass_heading == pytest.approx(math.radians(270.0))
+
+    @pytest.mark.parametrize(
+        "packet", [b"", b"<x", b"\0\0\0", b"\xff\xfe<", b'<?xml version="1.0" encoding="nonsense"?>']
+    )
+    def test_unreadable_packet_is_ignored(self, packet: bytes) -> None:
+        assert read_photo_sphere([packet], width=1024, height=512) == PhotoSphere()
+        np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)), opened(encoded(FULL)))
 
     @pytest.mark.parametrize(
         "packet",
         [
-            b"",
-            b"<x",
-            b"\0\0\0",
-            b"\xff\xfe<",
-            b'<?xml version="1.0" encoding="nonsense"?><x/>',
             xmp(PosePitchDegrees=45).replace(b"</rdf:Description>", b""),
+            xmp(PosePitchDegrees=45).replace(f'xmlns:GPano="{NAMESPACE}"'.encode(), b""),
+            xmp_of_elements(PosePitchDegrees=45).replace(f'xmlns:GPano="{NAMESPACE}"'.encode(), b""),
+            xmp(PosePitchDegrees=45).replace(NAMESPACE.encode(), NAMESPACE[:-1].encode()),
             b"<!-- " + b"x" * 300_000 + b" -->" + xmp(PosePitchDegrees=45),
         ],
+        ids=["not closed", "undeclared prefix", "undeclared elements", "other namespace", "large"],
     )
-    def test_unreadable_packet_is_ignored(self, packet: bytes) -> None:
-        assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
-        np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)), opened(encoded(FULL)))
+    def test_properties_of_malformed_packets_are_read(self, packet: bytes) -> None:
+        assert read_photo_sphere([packet], width=1024, height=512).pitch == pytest.approx(math.radians(45.0))
+
+    def test_first_packet_with_a_property_counts(self) -> None:
+        packets = [xmp(PosePitchDegrees=10), xmp(), xmp(PosePitchDegrees=20, PoseRollDegrees=5)]
+        found = read_photo_sphere(packets, width=1024, height=512)
+        assert np.degrees([found.pitch, found.roll]) == pytest.approx([10.0, 5.0])
+        assert found.warnings == ("GPano PosePitchDegrees is stated as '10' and as '20'; the first is used",)
 
     def test_entity_bomb_is_harmless(self) -> None:
         levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
         bomb = f'<!DOCTYPE x [<!ENTITY e0 "{"x" * 100}">{levels}]>'.encode() + xmp(PosePitchDegrees="&e9;")
-        assert read_photo_sphere(bomb, width=1024, height=512) == PhotoSphere()
+        assert read_photo_sphere([bomb], width=1024, height=512) == PhotoSphere()
 
     def test_external_entities_are_not_loaded(self, tmp_path: Path) -> None:
         (tmp_path / "pitch").write_text("45", encoding="ascii")
         packet = f'<!DOCTYPE x [<!ENTITY e SYSTEM "{(tmp_path / "pitch").as_uri()}">]>'.encode()
-        assert read_photo_sphere(packet + xmp(PosePitchDegrees="&e;"), width=1024, height=512) == PhotoSphere()
+        assert read_photo_sphere([packet + xmp(PosePitchDegrees="&e;")], width=1024, height=512) == PhotoSphere()
 
     def test_deep_elements_are_read(self) -> None:
         deep = b"<a>" * 30_000 + b"</a>" * 30_000
-        assert read_photo_sphere(deep, width=1024, height=512) == PhotoSphere()
+        assert read_photo_sphere([deep], width=1024, height=512) == PhotoSphere()
 
     @given(packet=st.binary(max_size=200), cut=st.integers(0, 600))
     @settings(max_examples=100)
     def test_no_packet_raises(self, packet: bytes, cut: int) -> None:
         whole = xmp(**crop(128, 64, 640, 320, PosePitchDegrees=3))
-        read_photo_sphere(whole[:cut] + packet + whole[cut:], width=640, height=320)
+        read_photo_sphere([whole[:cut] + packet + whole[cut:]], width=640, height=320)

@@ -103,7 +103,7 @@ function remarks(answer: Answer): HTMLElement[] {
     advice = adviceWords(answer),
     looks = view == null ? null : roomWords(view),
     elsewhere = answer.probability_elsewhere ?? 0;
-  const warnings = [...answer.warnings, ...(view?.warnings ?? [])].map((warning) =>
+  const warnings = [...new Set([...answer.warnings, ...(view?.warnings ?? [])])].map((warning) =>
     h("p", { class: "warning" }, plainWords(warning)),
   );
   return [

@@ -54,7 +54,8 @@ function answerOf(found: SequenceAnswer, index: number, motion: Group["motion"],
   return {
     ...common,
     ...pose,
-    warnings: [...pose.warnings, ...warnings],
+    // Warnings about photographs are also those of their poses.
+    warnings: [...pose.warnings, ...warnings.filter((text) => !text.startsWith("photo["))],
     floorplan_revision: pose.floorplan_id === found.floorplan_id ? floorplan_revision : undefined,
     level: pose.level ?? null,
     // A sequence has no probabilities of plans.

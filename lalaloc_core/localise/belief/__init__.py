@@ -7,7 +7,7 @@ photograph.
 
 from lalaloc_core.localise.belief.confidence import Confidence, Signals, confidence_of, signals_of
 from lalaloc_core.localise.belief.covariance import PoseUncertainty, marginal_information, pose_uncertainty
-from lalaloc_core.localise.belief.information import CONFIDENT, advice_for, information_bits, union_of_arcs
+from lalaloc_core.localise.belief.information import CONFIDENT, advice_for, information_bits, reason_for, union_of_arcs
 from lalaloc_core.localise.belief.posterior import (
     HEADING_WITHIN,
     NEGLIGIBLE,

@@ -16,6 +16,8 @@ from lalaloc_core.render.sampling import PoseSet
 CONFIDENT = 0.5
 # Azimuths (radians) that usually suffice; a photograph that shows less can lack what tells places apart.
 _ENOUGH = math.radians(240.0)
+# Confidence below which an answer without any warning gets a reason.
+UNSURE = 0.1
 # Arcs that are closer than this (radians) are one.
 _TOUCHING = math.radians(0.5)
 
@@ -64,4 +66,20 @@ def advice_for(arcs: list[tuple[float, float]], confidence: float) -> str | None
     return (
         f"turn around: {math.degrees(seen):.0f}° of the surroundings are too little to tell the place; take more "
         "photographs from the same spot, and send them as one query with motion=turn"
+    )
+
+
+def reason_for(confidence: float, elsewhere: float) -> str | None:
+    """Return why an answer's confidence is very low; None where it is not.
+
+    `elsewhere` is the probability that the photograph shows no place of the plan.
+    """
+    if confidence >= UNSURE:
+        return None
+    low = f"the confidence is {confidence:.1%}, below {UNSURE:.0%}"
+    if elsewhere < CONFIDENT:
+        return f"{low}: several places look alike; send hints, such as the heading or the room, or more photographs"
+    return (
+        f"{low}: the photograph fits no place of the plan; check that the plan shows these rooms and is in metres, the "
+        "camera height, the projection and the tilt"
     )

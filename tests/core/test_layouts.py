@@ -1,0 +1,205 @@
+"""Pictures that hold a sphere in another layout: converted, or named; ordinary photographs are left alone."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from tests.core.taken import jpeg, sphere, take
+from tests.core.test_photo_sphere import encoded, xmp
+
+PART: dict[str, object] = {
+    "FullPanoWidthPixels": 1024,
+    "FullPanoHeightPixels": 512,
+    "CroppedAreaImageWidthPixels": 600,
+    "CroppedAreaImageHeightPixels": 310,
+    "CroppedAreaTopPixels": 100,
+}
+NAMES = ("bedroom", "kitchen", "living_room", "study")
+
+
+@cache
+def small(name: str) -> np.ndarray:
+    return cv2.resize(sphere(name), (1024, 512), interpolation=cv2.INTER_AREA)
+
+
+def opened(content: bytes, stated: StatedCamera | None = None) -> Photograph:
+    return open_photograph(content, sphere_size=(128, 256), stated=stated)
+
+
+def faces(panorama: np.ndarray) -> list[np.ndarray]:
+    """Return front, right, back, left, up and down."""
+    camera = Perspective.of_hfov(256, 256, 0.5 * math.pi)
+    band = [take(panorama, camera, heading_deg=heading) for heading in (0.0, 90.0, 180.0, 270.0)]
+    return [*band, take(panorama, camera, pitch_deg=90.0), take(panorama, camera, pitch_deg=-90.0)]
+
+
+def barred(panorama: np.ndarray, above: int, beside: int, grey: int = 0) -> np.ndarray:
+    return np.pad(panorama, ((above, above), (beside, beside), (0, 0)), constant_values=grey)
+
+
+def usable(panorama: np.ndarray) -> dict[str, np.ndarray]:
+    """Return pictures from which the sphere can be taken, by a word of their warning."""
+    front, right, back, left, up, down = faces(panorama)
+    empty = np.zeros_like(front)
+    white = empty + 255
+    other_eye = np.roll(panorama, 6, axis=1)
+    square, other_square = (cv2.resize(eye, (512, 512)) for eye in (panorama, other_eye))
+    rows = [[empty, up, empty, empty], [left, front, right, back], [empty, down, empty, empty]]
+    column = [[white, up, white], [left, front, right], [white, down, white], [white, np.rot90(back, 2), white]]
+    return {
+        "cross of 4 x 3": np.vstack([np.hstack(row) for row in rows]),
+        "cross of 3 x 4": np.vstack([np.hstack(row) for row in column]),
+        "one eye above the other": np.vstack([panorama, other_eye]),
+        "one eye beside the other": np.hstack([panorama, other_eye]),
+        "stereo sphere, one eye beside": np.hstack([square, other_square]),
+        "bars at its borders, 11%": barred(panorama, 32, 0),
+        "bars at its borders, 33%": barred(panorama, 128, 0, 255),
+        "bars at its borders, 16%": barred(panorama, 0, 100),
+    }
+
+
+def circle(panorama: np.ndarray, heading_deg: float) -> np.ndarray:
+    picture = take(panorama, Fisheye.of_hfov(512, 512, math.radians(190.0)), heading_deg=heading_deg)
+    place = np.arange(512) - 255.5
+    return picture * (np.hypot(*np.meshgrid(place, place)) < 255.0)[..., None].astype(np.uint8)
+
+
+def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
+    """Return pictures that are refused, by a word of the refusal."""
+    front, right, back, left, up, down = faces(panorama)
+    two = [circle(panorama, heading_deg) for heading_deg in (0.0, 180.0)]
+    below = [np.rot90(down), np.rot90(back, -1), np.rot90(up)]
+    return {
+        "cube map, 3 x 2": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
+        "cube map, 3 x 2 faces": np.vstack([np.hstack([left, front, right]), np.hstack(below)]),
+        "cube map, 2 x 3": np.vstack([np.hstack([right, left]), np.hstack([up, down]), np.hstack([front, back])]),
+        "cube map, 6 x 1": np.hstack([right, left, up, down, front, back]),
+        "cube map, 1 x 6": np.vstack([right, left, up, down, front, back]),
+        "dual fisheye": np.hstack(two),
+        "dual fisheye picture": np.vstack(two),
+        "circle of a fisheye": two[0],
+        "circle of a fisheye lens": barred(two[0], 0, 100),
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sphere_is_taken_out_of_its_layout(name: str) -> None:
+    panorama = small(name)
+    whole = opened(jpeg(panorama)).sphere
+    assert whole is not None
+    for words, pixels in usable(panorama).items():
+        view = opened(jpeg(pixels))
+        assert (view.projection, view.projection_source) == ("equirectangular", "estimated"), words
+        assert words in view.warnings[0]
+        assert view.sphere is not None
+        assert np.abs(view.sphere.astype(int) - whole).mean() < 6.0, words
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_layout_that_cannot_be_converted_is_refused_by_name(name: str) -> None:
+    for words, pixels in unusable(small(name)).items():
+        with pytest.raises(InvalidPhotographError, match=words):
+            opened(jpeg(np.ascontiguousarray(pixels)))
+
+
+def test_statement_turns_a_refusal_into_a_warning() -> None:
+    pixels = unusable(small("kitchen"))["dual fisheye"]
+    view = opened(jpeg(pixels), StatedCamera(projection="equirectangular"))
+    assert "two circles that are not stitched" in view.warnings[0]
+    assert opened(jpeg(pixels), StatedCamera(hfov_deg=90.0)).warnings == ()
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_orientation_of_a_sphere_is_ignored(orientation: int) -> None:
+    view = opened(jpeg(small("kitchen"), orientation=orientation))
+    whole = opened(jpeg(small("kitchen"))).sphere
+    assert whole is not None
+    assert view.sphere is not None
+    assert np.abs(view.sphere.astype(int) - whole).mean() < 3.0
+    assert f"Exif orientation {orientation}, which is ignored" in view.warnings[0]
+
+
+def test_left_eye_of_vr180_shows_half_of_the_sphere() -> None:
+    panorama = small("living_room")
+    half, other = panorama[:, 256:768], np.roll(panorama, 6, axis=1)[:, 256:768]
+    view = opened(jpeg(np.hstack([half, other])))
+    whole = opened(jpeg(panorama)).sphere
+    assert "VR180" in view.warnings[0]
+    assert view.azimuths == pytest.approx((-0.5 * math.pi, 0.5 * math.pi))
+    assert view.sphere is not None
+    assert whole is not None
+    assert np.abs(view.sphere[:, 66:190].astype(int) - whole[:, 66:190]).mean() < 6.0
+
+
+def ordinary(panorama: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Yield views of usual lenses and shapes, and crops."""
+    for hfov_deg in (50.0, 67.0, 106.0):
+        for width, height in ((640, 480), (480, 640), (600, 400), (360, 640), (640, 360), (500, 500), (800, 400)):
+            across = 2.0 * math.atan(math.tan(0.5 * math.radians(hfov_deg)) * min(1.0, width / height))
+            tilt = {"heading_deg": rng.uniform(0.0, 360.0), "pitch_deg": rng.uniform(-15.0, 15.0)}
+            yield take(panorama, Perspective.of_hfov(width, height, across), **tilt)
+    for width, height in ((600, 300), (480, 320), (512, 384), (400, 400), (300, 450), (900, 400)):
+        left, top = int(rng.integers(0, 1024 - width)), int(rng.integers(0, 512 - height))
+        yield panorama[top : top + height, left : left + width]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ordinary_photographs_are_left_alone(name: str) -> None:
+    words = ("sphere", "cube map", "fisheye", "VR180")
+    for pixels in (small(name), *ordinary(small(name), np.random.default_rng(0))):
+        try:
+            warnings = opened(jpeg(np.ascontiguousarray(pixels))).warnings
+        except InvalidPhotographError as error:
+            # A crop twice as wide as high, or a strip.
+            warnings = (str(error).replace("a full 360° sphere", "full"),)
+        assert not any(word in text for word in words for text in warnings), warnings
+
+
+class TestParts:
+    """Parts of the sphere by their GPano metadata."""
+
+    def part(self, left: int, **others: float) -> bytes:
+        pixels = small("kitchen")[100:410, left : left + 600]
+        return encoded(pixels, "JPEG", xmp(**PART, CroppedAreaLeftPixels=left, **others))
+
+    @pytest.mark.parametrize("pitch_deg", [0.0, 5.0])
+    def test_heading_is_that_of_the_centre_of_the_picture(self, pitch_deg: float) -> None:
+        views = [opened(self.part(left, PosePitchDegrees=pitch_deg, PoseHeadingDegrees=200)) for left in (100, 212)]
+        turn_deg = (100 + 300 - 512) * 360.0 / 1024.0
+        assert views[0].compass_heading == pytest.approx(math.radians(200.0 + turn_deg))
+        assert views[1].compass_heading == pytest.approx(math.radians(200.0))
+        assert views[0].azimuths == pytest.approx((-math.pi * 600 / 1024, math.pi * 600 / 1024))
+        # The seen part is in the middle: the border is neutral on both sides.
+        assert views[0].sphere is not None
+        seen = np.flatnonzero((views[0].sphere[64] != 128).any(axis=-1))
+        assert abs(seen[0] + seen[-1] - 255) <= 2
+
+    def test_part_beyond_the_seam_is_refused(self) -> None:
+        stated = PART | {"CroppedAreaImageHeightPixels": 300, "CroppedAreaLeftPixels": 800}
+        with pytest.raises(InvalidPhotographError, match=r"600 x 300 at \(800, 100\) is not within .* not a full"):
+            opened(encoded(small("kitchen")[100:400, :600], "JPEG", xmp(**stated)))
+
+    def test_strip_of_a_full_turn_must_close(self) -> None:
+        stated = {"ProjectionType": "cylindrical", "FullPanoWidthPixels": 1024, "CroppedAreaImageWidthPixels": 1024}
+        whole, part = small("kitchen")[128:384], cv2.resize(small("kitchen")[128:384, :600], (1024, 400))
+        assert opened(encoded(whole, "JPEG", xmp(**stated))).hfov.value == math.tau
+        with pytest.raises(InvalidPhotographError, match=r"borders do not continue each other; send hfov_deg"):
+            opened(encoded(part, "JPEG", xmp(**stated)))
+
+
+def test_bars_that_leave_no_sphere_are_kept() -> None:
+    view = take(small("study"), Perspective.of_hfov(640, 320, math.radians(80.0)))
+    buffer = io.BytesIO()
+    Image.fromarray(barred(view, 20, 0)).save(buffer, "PNG")
+    assert opened(buffer.getvalue()).projection == "perspective"

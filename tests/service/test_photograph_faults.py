@@ -1,0 +1,113 @@
+"""Photographs that are damaged, or no photographs, over HTTP: used with a warning, or named as what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from lalaloc_core.photograph.file_segments import END
+from tests.core.taken import EXAMPLES, jpeg, sphere
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.test_photographs import PHONE, ask, shown
+
+KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
+# Words of the libraries that decode, and of their objects.
+LIBRARY_WORDS = ("PIL", "illow", "libheif", "BytesIO", "0x7f", "bomb", "MAX_TEXT", "Traceback", "plugin", "not a TIFF")
+
+
+@pytest.fixture(scope="module")
+def client(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def flat(client: httpx.Client) -> str:
+    return upload(client, FLAT)
+
+
+def test_damaged_photograph_is_used_with_a_warning_at_the_top(client: httpx.Client, flat: str) -> None:
+    assert KITCHEN.endswith(END)
+    whole, cut = (ask(client, flat, content).json() for content in (KITCHEN, KITCHEN[:-2]))
+    assert cut["position"] == whole["position"]
+    text = "the file ends before its picture does: the missing part is grey; send the whole file"
+    assert text in cut["warnings"]
+    assert text in cut["view"]["warnings"]
+    assert text not in whole["warnings"]
+
+
+def test_warnings_about_photographs_of_a_sequence_name_them(client: httpx.Client, flat: str) -> None:
+    answer = ask(client, flat, KITCHEN, KITCHEN[:-2], path="/localise/sequence").json()
+    text = "the file ends before its picture does: the missing part is grey; send the whole file"
+    assert f"photo[1]: {text}" in answer["warnings"]
+    assert text in answer["poses"][1]["warnings"]
+    assert text not in answer["poses"][0]["warnings"]
+
+
+def test_warnings_about_photographs_of_a_session_are_those_of_its_pose(client: httpx.Client, flat: str) -> None:
+    session = client.post("/sessions", json={"floorplan_id": flat}).json()["id"]
+    answer = client.post(f"/sessions/{session}/photographs", files={"photo": KITCHEN[:-2]}).json()
+    assert any("the file ends before" in text for text in answer["pose"]["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (b"\xff\x0a\xfa\x7f", "a JPEG XL picture"),
+        (b"<!doctype html><title>Sign in</title>", "an HTML page"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer; run `git lfs pull`"),
+        (bytes(1000), "a file of zeros"),
+        (jpeg(shown(), PHONE)[:300], "ends before its picture does"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "a PNG picture that is damaged|not a readable JPEG, PNG or WEBP picture"),
+        (b"II*\0" + bytes(100), "a TIFF picture"),
+        (KITCHEN[:200] + bytes(2000), "a JPEG picture that is damaged|ends before its picture does"),
+    ],
+)
+def test_unusable_file_is_named_in_the_words_of_users(
+    client: httpx.Client, flat: str, content: bytes, name: str
+) -> None:
+    detail = assert_problem(ask(client, flat, content), 422, "invalid-panorama")["detail"]
+    assert any(word in detail for word in name.split("|")), detail
+    assert not any(word in detail for word in LIBRARY_WORDS), detail
+
+
+@pytest.mark.parametrize("size", [10, 40_000, 400_000])
+def test_part_without_a_file_name_asks_for_one(client: httpx.Client, flat: str, size: int) -> None:
+    text = "must be a file (a part with a file name)"
+    response = client.post("/localise", files={"floorplan_id": (None, flat), "photo": (None, bytes(size))})
+    assert {"field": "photo", "message": text} in assert_problem(response, 422, "invalid-request")["errors"]
+    large = client.post("/localise", files={"floorplan_id": (None, bytes(40_000)), "photo": ("p", b"")})
+    (fault,) = assert_problem(large, 422, "invalid-request")["errors"]
+    assert fault == {"field": "floorplan_id", "message": "has more than 32768 bytes, the limit of a field"}
+
+
+def test_photograph_as_the_body_asks_for_a_form(client: httpx.Client, flat: str) -> None:
+    response = client.post(f"/localise?floorplan_id={flat}", content=KITCHEN, headers={"Content-Type": "image/jpeg"})
+    (fault,) = assert_problem(response, 422, "invalid-request")["errors"]
+    assert fault["field"] == "floorplan_id"
+    assert "send fields in the body, which is multipart/form-data" in fault["message"]
+    response = client.post("/localise", content=KITCHEN, headers={"Content-Type": "image/jpeg"})
+    assert "send multipart/form-data" in assert_problem(response, 415, "unsupported-media")["detail"]
+
+
+def test_sphere_in_another_layout_is_converted_or_named(client: httpx.Client, flat: str) -> None:
+    pixels = sphere("kitchen")
+    whole = ask(client, flat, jpeg(pixels)).json()
+    height, width = pixels.shape[:2]
+    answer = ask(client, flat, jpeg(np.pad(pixels, ((height // 8, height // 8), (0, 0), (0, 0))))).json()
+    assert answer["view"]["projection"] == "equirectangular"
+    assert any("a sphere with bars at its borders" in text for text in answer["warnings"])
+    assert answer["room"] == whole["room"]
+    place = np.arange(width // 2) + 0.5 - width / 4
+    circle = (np.hypot(*np.meshgrid(place, place)) < width / 4)[..., None].astype(np.uint8)
+    two = np.hstack([pixels[:, : width // 2] * circle, pixels[:, width // 2 :] * circle])
+    detail = assert_problem(
+        ask(client, flat, jpeg(np.maximum(two, 60 * np.hstack([circle] * 2)))), 422, "invalid-panorama"
+    )
+    assert "dual fisheye picture of a 360° camera" in detail["detail"]
