@@ -157,11 +157,13 @@ class View(ReadView):
         information_bits: information about the place.
         ruled_out: share of the searched area that this rules out.
         advice: how to photograph the place for a sure answer; None where it is sure.
+        relative_heading: heading minus that of the first photograph of a turn; None where it was searched.
     """
 
     information_bits: float
     ruled_out: float
     advice: str | None
+    relative_heading: AssumedAngle | None = None
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from lalaloc_core.photograph.levelling import (
     find_segments,
     lines_of,
 )
+from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
@@ -36,6 +37,7 @@ from lalaloc_core.photograph.picture_files import (
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
 from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.photograph.stated_camera import StatedCamera
+from lalaloc_core.photograph.turn_angles import Overview
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
@@ -85,6 +87,7 @@ class Photograph:
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
+        overview: parts that tell its angles to photographs that overlap it, if they were asked for.
         warnings: metadata that were ignored, and estimates to be checked.
     """
 
@@ -100,6 +103,7 @@ class Photograph:
     axes: Float[np.ndarray, "3 3"] | None = None
     features: PhotographFeatures | None = None
     compass_heading: float | None = None
+    overview: Overview | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -162,6 +166,7 @@ def open_photograph(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: PhotographLimits | None = None,
+    overview: bool = False,
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
 
@@ -171,6 +176,7 @@ def open_photograph(
         stated: the caller's statements; None for none.
         patch_size: size of the patches of other photographs.
         limits: limits of the file.
+        overview: find what tells the angle to other photographs from its spot, too (`turned.py`).
 
     Raises:
         InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the
@@ -205,7 +211,7 @@ def open_photograph(
         if lens.is_sphere:
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
-    return _photograph_of_picture(picture, (width, height), lens, stated, size)
+    return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
 
 
 def _photograph_of_sphere(
@@ -230,11 +236,18 @@ def _photograph_of_sphere(
     )
 
 
-def _photograph_of_picture(
-    picture: UInt8[np.ndarray, "h w 3"], full_size: tuple[int, int], lens: Lens, stated: StatedCamera, size: PatchSize
+def photograph_of_picture(
+    picture: UInt8[np.ndarray, "h w 3"],
+    full_size: tuple[int, int],
+    lens: Lens,
+    stated: StatedCamera,
+    size: PatchSize,
+    *,
+    overview: bool = False,
 ) -> Photograph:
+    """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
-    needs_lines = lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
+    needs_lines = overview or lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
     segments = find_segments(picture) if needs_lines else np.zeros((0, 4))
     warnings = lens.warnings
     if lens.camera is None:
@@ -273,6 +286,7 @@ def _photograph_of_picture(
         patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
+        overview=Overview(find_features(picture), segments / (columns, rows, columns, rows)) if overview else None,
         warnings=warnings,
     )
 
