@@ -169,6 +169,7 @@ class View(ReadView):
         room_types: probability of each type of room by recognised objects; None for full spheres, and for services and
             models without objects.
         objects: recognised objects that tell the type of room, the most probable first; None as `room_types`.
+        relative_heading: heading minus that of the first photograph of a turn; None where it was searched.
     """
 
     information_bits: float
@@ -176,6 +177,7 @@ class View(ReadView):
     advice: str | None
     room_types: Mapping[str, float] | None = None
     objects: tuple[SeenObject, ...] | None = None
+    relative_heading: AssumedAngle | None = None
 
 
 @dataclass(frozen=True)

@@ -79,12 +79,16 @@ class Attitude:
         pitch: elevation of the optical axis, radians.
         roll: clockwise rotation about it, radians.
         pitch_sd, roll_sd: standard deviations, radians.
+        yaw: azimuth of one of the two horizontal directions relative to the optical axis, radians; repeats by 90°.
+        yaw_sd: its standard deviation; infinite without lines.
     """
 
     pitch: float
     roll: float
     pitch_sd: float
     roll_sd: float
+    yaw: float = 0.0
+    yaw_sd: float = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +137,7 @@ def lines_of(segments: Float[np.ndarray, "n 4"], camera: Camera) -> Lines:
 def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
     if not len(lines.length):
-        return _attitude([(np.zeros(3), 0.0, np.diag(_PRIOR**2))])
+        return Attitude(pitch=0.0, roll=0.0, pitch_sd=float(_PRIOR[0]), roll_sd=float(_PRIOR[1]))
     return _attitude([_refined(lines, start) for start in _starts(lines)])
 
 
@@ -172,7 +176,16 @@ def _attitude(modes: list[tuple[np.ndarray, float, np.ndarray]]) -> Attitude:
     offsets = np.array([mode[0][:2] - best[:2] for mode in modes])
     spread = (weights[:, None] * offsets**2).sum(axis=0) / weights.sum()
     sd = np.minimum(np.sqrt(np.diag(covariance)[:2] + _FLOOR**2 + spread), _PRIOR)
-    return Attitude(pitch=float(best[0]), roll=float(best[1]), pitch_sd=float(sd[0]), roll_sd=float(sd[1]))
+    apart = np.array([(mode[0][2] - best[2] + 0.25 * math.pi) % (0.5 * math.pi) - 0.25 * math.pi for mode in modes])
+    yaw_sd = math.sqrt(covariance[2, 2] + _FLOOR[1] ** 2 + weights @ apart**2 / weights.sum())
+    return Attitude(
+        pitch=float(best[0]),
+        roll=float(best[1]),
+        pitch_sd=float(sd[0]),
+        roll_sd=float(sd[1]),
+        yaw=float(best[2]),
+        yaw_sd=yaw_sd,
+    )
 
 
 def _directions(angles: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from lalaloc_core.photograph.levelling import (
     find_segments,
     lines_of,
 )
+from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
@@ -37,12 +38,13 @@ from lalaloc_core.photograph.picture_files import (
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_closed, is_sphere
 from lalaloc_core.photograph.spheres import convert_layout, read_layout, read_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
+from lalaloc_core.photograph.turn_angles import Overview
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
-# Overviews have about so many pixels, and sides that are multiples of the step.
-_OVERVIEW_PIXELS, _OVERVIEW_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
+# Thumbnails have about so many pixels, and sides that are multiples of the step.
+_THUMBNAIL_PIXELS, _THUMBNAIL_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
 # Ratios of sides of photographs, and their relative deviation.
 _USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
 # Standard deviation of a stated pitch or roll.
@@ -87,10 +89,11 @@ class Photograph:
         patches: level patches that cover the photograph; empty for a full sphere.
         sphere: (h, w, 3) pixels of the level full sphere; None for other photographs.
         features: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
-        overview: (h, w, 3) pixels of the whole upright picture, small; None for a full sphere.
+        thumbnail: (h, w, 3) pixels of the whole upright picture, small; None for a full sphere.
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
+        overview: parts that tell its angles to photographs that overlap it, if they were asked for.
         warnings: metadata that were ignored, and estimates to be checked.
     """
 
@@ -102,11 +105,12 @@ class Photograph:
     azimuths: tuple[float, float]
     patches: tuple[Patch, ...] = ()
     sphere: UInt8[np.ndarray, "h w 3"] | None = None
-    overview: UInt8[np.ndarray, "h w 3"] | None = None
+    thumbnail: UInt8[np.ndarray, "h w 3"] | None = None
     camera: Camera | None = None
     axes: Float[np.ndarray, "3 3"] | None = None
     features: PhotographFeatures | None = None
     compass_heading: float | None = None
+    overview: Overview | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -168,6 +172,7 @@ def open_photograph(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: PhotographLimits | None = None,
+    overview: bool = False,
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
 
@@ -177,6 +182,7 @@ def open_photograph(
         stated: the caller's statements; None for none.
         patch_size: size of the patches of other photographs.
         limits: limits of the file.
+        overview: find what tells the angle to other photographs from its spot, too (`turned.py`).
 
     Raises:
         InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the
@@ -225,7 +231,7 @@ def open_photograph(
         if lens.is_sphere:
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
-    return _photograph_of_picture(picture, (width, height), lens, stated, size)
+    return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
 
 
 def _photograph_of_sphere(
@@ -294,11 +300,18 @@ def _photograph_of_layout(
     return _photograph_of_sphere(pixels, lens, stated, replace(metadata, part=part))
 
 
-def _photograph_of_picture(
-    picture: UInt8[np.ndarray, "h w 3"], full_size: tuple[int, int], lens: Lens, stated: StatedCamera, size: PatchSize
+def photograph_of_picture(
+    picture: UInt8[np.ndarray, "h w 3"],
+    full_size: tuple[int, int],
+    lens: Lens,
+    stated: StatedCamera,
+    size: PatchSize,
+    *,
+    overview: bool = False,
 ) -> Photograph:
+    """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
-    needs_lines = lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
+    needs_lines = overview or lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
     segments = find_segments(picture) if needs_lines else np.zeros((0, 4))
     warnings = lens.warnings
     if lens.camera is None:
@@ -335,19 +348,20 @@ def _photograph_of_picture(
         roll=roll,
         azimuths=_seen_azimuths(small, tilt, roll.value),
         patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
-        overview=_overview(picture),
+        thumbnail=_thumbnail(picture),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
+        overview=Overview(find_features(picture), segments / (columns, rows, columns, rows)) if overview else None,
         warnings=warnings,
     )
 
 
-def _overview(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _thumbnail(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return the whole picture at the size that objects are recognised in; its aspect changes by rounding only."""
     height, width = picture.shape[:2]
     aspect = min(max(width / height, 1.0 / _MAX_ASPECT), _MAX_ASPECT)
-    rows = max(1, round(math.sqrt(_OVERVIEW_PIXELS / aspect) / _OVERVIEW_STEP))
-    size = max(1, round(aspect * rows)) * _OVERVIEW_STEP, rows * _OVERVIEW_STEP
+    rows = max(1, round(math.sqrt(_THUMBNAIL_PIXELS / aspect) / _THUMBNAIL_STEP))
+    size = max(1, round(aspect * rows)) * _THUMBNAIL_STEP, rows * _THUMBNAIL_STEP
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 

@@ -1,12 +1,12 @@
 """Program of a decoding worker process, which opens uploaded photographs.
 
-It turns an uploaded file into a `Photograph`, a picture to be shown, or a `DecodeRefusal`. It also rasterises drawings,
-which keeps the interpreter busy for as long.
+It turns an uploaded file into a `Photograph`, a picture to be shown, or a `DecodeRefusal`. It also finds the angles
+between photographs and rasterises drawings, which keep the interpreter busy for as long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -18,6 +18,7 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.photograph import open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
+from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_turn
 from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
 
@@ -32,10 +33,18 @@ class DecodeSizes:
 
 @dataclass(frozen=True)
 class DecodeJob:
-    """Uploaded photograph to read for the encoders; the worker gets it as bytes."""
+    """Uploaded photograph to read for the encoders; the worker gets it as bytes. `overview` as in `open_photograph`."""
 
     content: bytes | UploadedFile
     stated: StatedCamera
+    overview: bool = False
+
+
+@dataclass(frozen=True)
+class TurnJob:
+    """Photographs of one spot whose angles to each other are to be found."""
+
+    views: Sequence[TurnView]
 
 
 @dataclass(frozen=True)
@@ -62,8 +71,8 @@ class DecodeRefusal:
     reason: str
 
 
-Job = DecodeJob | ShowJob | RasteriseJob
-Result = Photograph | np.ndarray | DecodeRefusal | bytes
+Job = DecodeJob | TurnJob | ShowJob | RasteriseJob
+Result = Photograph | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -87,11 +96,18 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
     def work(job: Job) -> Result:
         if isinstance(job, RasteriseJob):
             return rasterise(job.svg)
+        if isinstance(job, TurnJob):
+            return angles_of_turn(job.views)
         assert isinstance(job.content, bytes)
         try:
             if isinstance(job, DecodeJob):
                 return open_photograph(
-                    job.content, sphere_size=sizes.sphere, stated=job.stated, patch_size=sizes.patch, limits=limits
+                    job.content,
+                    sphere_size=sizes.sphere,
+                    stated=job.stated,
+                    patch_size=sizes.patch,
+                    limits=limits,
+                    overview=job.overview,
                 )
             return _shown(job, job.content, limits)
         except InvalidPhotographError as error:

@@ -6,6 +6,7 @@ affected. No client keeps all workers busy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from time import monotonic
 
 import numpy as np
@@ -15,6 +16,7 @@ from lalaloc_core.bundle import Manifest
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView
 from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
@@ -25,6 +27,7 @@ from service.decoding.decode_worker import (
     RasteriseJob,
     Result,
     ShowJob,
+    TurnJob,
     run_decoder,
 )
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
@@ -83,7 +86,13 @@ class Decoder:
         return self._pool.state
 
     async def decode(
-        self, content: bytes | UploadedFile | Photograph, stated: StatedCamera, deadline: float, client: str = ""
+        self,
+        content: bytes | UploadedFile | Photograph,
+        stated: StatedCamera,
+        deadline: float,
+        client: str = "",
+        *,
+        overview: bool = False,
     ) -> Photograph:
         """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
 
@@ -92,6 +101,7 @@ class Decoder:
             stated: the request's statements about it.
             deadline: time limit (`monotonic`).
             client: fairness group of the job.
+            overview: as in `open_photograph`.
 
         Raises:
             InvalidPhotographError: see `open_photograph`; or the file stalled a worker, or crashed two.
@@ -102,8 +112,19 @@ class Decoder:
         """
         if isinstance(content, Photograph):
             return content
-        result = await self._run_job(DecodeJob(content, stated), deadline, client)
+        result = await self._run_job(DecodeJob(content, stated, overview), deadline, client)
         assert isinstance(result, Photograph)
+        return result
+
+    async def angles(self, views: Sequence[TurnView], deadline: float, client: str = "") -> list[TurnAngles]:
+        """Return the angles of photographs of one spot, by what they show twice.
+
+        Raises:
+            InvalidPhotographError: the photographs stalled a worker, or crashed two.
+            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
+        """
+        result = await self._run_job(TurnJob(views), deadline, client)
+        assert isinstance(result, list)
         return result
 
     async def picture(

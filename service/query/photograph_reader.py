@@ -9,6 +9,8 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.stated_pose import known_heading
 from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.turn_angles import TurnAngles
+from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from service.capacity.query_context import QueryContext
 from service.decoding.decoder import Decoder
 from service.query.executor import Executor
@@ -40,6 +42,30 @@ class PhotographReader:
             return [
                 await self._decoder.decode(content, stated, context.deadline, context.client) for content in contents
             ]
+
+    async def decode_turn(
+        self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
+    ) -> tuple[list[Photograph], list[TurnAngles] | None]:
+        """Decode photographs of one spot, each with the tilt and field of view that their overlap tells.
+
+        Returns:
+            the photographs, and their angles; None if they are features or a sphere is among them.
+
+        Raises:
+            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
+        """
+        decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)
+        with context.clock.stage("decode"):
+            photographs = [await decode(content, stated, overview=True) for content in contents]
+            if any(photograph.overview is None for photograph in photographs):
+                return photographs, None
+            views = turn_views(photographs)
+            angles = await self._decoder.angles(views, context.deadline, context.client)
+            turned = turned_photographs(photographs, views, stated, angles)
+            for index, found in enumerate(turned):
+                if found.stated is not None:
+                    photographs[index] = found.applied(await decode(contents[index], found.stated))
+        return photographs, angles
 
     def known_heading(
         self, form: LocaliseForm | StatedHeading | PhotographForm, north: float | None, photograph: Photograph

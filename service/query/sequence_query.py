@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.query import CameraHeight, KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn_localisation import found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
 from lalaloc_core.localise.venue.merged_plans import GAP_M
 from lalaloc_core.photograph import Photograph
 from service.query.answers import compose_answer, compose_sequence_answer
@@ -22,7 +24,8 @@ from service.query.query_parts import QueryParts
 from service.query.single_query import VENUE_CONFIG
 from service.query.spots import Spot
 from service.query.stated_pose import heights_of
-from service.schemas import SequenceAnswer
+from service.schemas import LocaliseAnswer, SequenceAnswer, SequenceForm
+from service.schemas.photographs import AssumedAngle
 from service.storage.records import PlanRecord, VenueRecord
 
 # Deviations of a measured motion that are possible.
@@ -51,7 +54,7 @@ class SequenceSearch:
         # Measured motions must not lead from one plan of a venue to its neighbour.
         gap_m = GAP_M + max(map(_reach_m, form.steps(count)))
         site = await self._parts.grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
-        photographs = await self._parts.reader.decode(query.contents, form.stated_camera, context)
+        photographs, linked = await self._decode(query)
         known = [
             self._parts.reader.known_heading(form.heading_of(index), site.north, photograph)
             for index, photograph in enumerate(photographs)
@@ -60,12 +63,12 @@ class SequenceSearch:
         heights = heights_of(form, site.height, count)
         # A sphere shows all that other photographs from its spot could add.
         one_query = form.motion == "turn" and not any(photograph.is_sphere for photograph in photographs)
-        turns = form.known_turns
+        turns = form.known_turns if linked is None else linked.turns
         if one_query and turns is not None:
             ground, joint = await self._search_turn(query, photographs, known, turns, heights[0], site)
             found = localised_turn(joint, turns)
         else:
-            ground, found = await self._search_sequence(query, photographs, known, heights, site)
+            ground, found = await self._search_sequence(query, photographs, known, heights, site, linked)
             if one_query:
                 _, joint = await self._search_turn(query, photographs, known, found_turns(found), heights[0], ground)
                 found = judged_turn(found, joint)
@@ -77,14 +80,24 @@ class SequenceSearch:
                 compose_answer(picture, ground, spot, heading, timings_ms=timings_ms, bundle=self._parts.bundle)
                 for heading, picture, spot in zip(known, found.pictures, spots, strict=True)
             ]
+            answers = _with_relative_headings(answers, form, linked)
             share = min(ground.share(picture) for picture in found.pictures)
             answer = compose_sequence_answer(answers, found, form.steps(count), self._parts.bundle.manifest, share)
-            extras: dict[str, object] = {"warnings": [*answer.warnings, *ground.warnings]}
+            warnings = [*_angle_warnings(photographs, form, linked), *answer.warnings, *ground.warnings]
+            extras: dict[str, object] = {"warnings": warnings}
             if isinstance(where, VenueRecord):
                 extras["venue_id"] = where.id
             return answer.model_copy(update=extras)
 
         return await self._parts.executor.compute(context, compose)
+
+    async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], LinkedTurn | None]:
+        """Return the photographs; of a turn without stated angles also what their overlap tells."""
+        form, reader = query.form, self._parts.reader
+        if form.motion == "walk" or form.relative_heading_deg is not None:
+            return await reader.decode(query.contents, form.stated_camera, query.context), None
+        photographs, angles = await reader.decode_turn(query.contents, form.stated_camera, query.context)
+        return photographs, None if angles is None else LinkedTurn.of(angles)
 
     async def _search_sequence(
         self,
@@ -93,24 +106,27 @@ class SequenceSearch:
         known: Sequence[KnownHeading],
         heights: Sequence[CameraHeight],
         site: Site,
+        linked: LinkedTurn | None,
     ) -> tuple[Ground, SequenceLocalisation]:
-        """Search the places of photographs that are linked by motions; return the ground, too."""
+        """Search the places of photographs that are linked by motions, or by overlap; return the ground, too."""
         form, context = query.form, query.context
         encoded = await self._parts.reader.encode(
             [Spot(photograph) for photograph in photographs], known, heights, context
         )
         ground = await site.ground(encoded, context)
+        order = range(len(encoded)) if linked is None else linked.order
         steps = localise_sequence_steps(
             ground.plan,
             ground.grid,
             self._parts.encoder,
-            encoded,
-            form.steps(len(photographs)),
+            [encoded[index] for index in order],
+            form.steps(len(photographs)) if linked is None else linked.motions,
             refine=form.refine,
             top_k=form.top_k,
             clock=context.clock,
         )
-        return ground, await self._parts.executor.run_search(steps, context)
+        found = await self._parts.executor.run_search(steps, context)
+        return ground, found if linked is None else linked.in_order(found)
 
     async def _search_turn(
         self,
@@ -164,4 +180,53 @@ def _spots(photographs: Sequence[Photograph], found: SequenceLocalisation, *, on
             [(other, heading - headings[index]) for other, heading in zip(photographs, headings, strict=True)],
         )
         for index, photograph in enumerate(photographs)
+    ]
+
+
+def _with_relative_headings(
+    answers: Sequence[LocaliseAnswer], form: SequenceForm, linked: LinkedTurn | None
+) -> list[LocaliseAnswer]:
+    """Return the answers with the relative headings that the request states, or that the overlap tells."""
+    angles: list[AssumedAngle | None] = [None] * len(answers)
+    if linked is not None and len({angle.group for angle in linked.angles}) < len(answers):
+        # Of other groups, only the angles within the group are known.
+        angles = [
+            None
+            if angle.group
+            else AssumedAngle(
+                value_deg=math.degrees(angle.heading), std_deg=math.degrees(angle.heading_sd), source="estimated"
+            )
+            for angle in linked.angles
+        ]
+    elif form.relative_heading_deg is not None and form.relative_heading_deg[0] is not None:
+        first_deg, std_deg = form.relative_heading_deg[0], form.relative_heading_std_deg
+        angles = [
+            None
+            if given_deg is None
+            else AssumedAngle(
+                value_deg=math.degrees(wrap_angle(math.radians(given_deg - first_deg))),
+                std_deg=std_deg if index else 0.0,
+                source="given",
+            )
+            for index, given_deg in enumerate(form.relative_heading_deg)
+        ]
+    return [
+        answer.model_copy(update={"view": answer.view.model_copy(update={"relative_heading": angle})})
+        if answer.view is not None
+        else answer
+        for answer, angle in zip(answers, angles, strict=True)
+    ]
+
+
+def _angle_warnings(photographs: Sequence[Photograph], form: SequenceForm, linked: LinkedTurn | None) -> list[str]:
+    """Return warnings about angles of a turn that were searched."""
+    if form.motion == "walk" or form.relative_heading_deg is not None:
+        return []
+    if linked is not None:
+        return linked.warnings(min(photograph.hfov.value for photograph in photographs))
+    if any(photograph.is_sphere for photograph in photographs):
+        return []
+    return [
+        "features have no pictures that could overlap, so the angles between them were searched: send "
+        "relative_heading_deg"
     ]

@@ -152,6 +152,11 @@ class ViewAnswer(ReadView):
         "searched area, hints included. 0: all places stay equally likely."
     )
     ruled_out: Share = Field(description="Share of the searched area that this rules out: 1 - 2 ** -information_bits.")
+    relative_heading: AssumedAngle | None = Field(
+        default=None,
+        description="Heading minus that of the first photograph of a turn, from the request (`given`) or from what the "
+        "photographs show twice (`estimated`); null where it was searched, and for other queries.",
+    )
     advice: str | None = Field(
         description="How to photograph the place for a sure answer, such as `turn around`; null where it is sure, or "
         "where more of the surroundings would not help."

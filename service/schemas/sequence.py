@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.measured_motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
+from lalaloc_core.localise.sequence.turn_localisation import EXACT, ON_THE_SPOT
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
@@ -21,10 +22,6 @@ from service.schemas.query_fields import CameraFields, PlaceFields
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
 AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
 _UNKNOWN = Motion()
-# Phones move about the person who turns.
-_ON_THE_SPOT_STD_M = 0.15
-# Deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
-_EXACT_DEG = 5.0
 
 
 class StatedMotion(BaseModel):
@@ -114,8 +111,9 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
     relative_heading_deg: list[Angle | None] | None = Field(
         None,
         description="For `turn`: headings of all photographs relative to each other, clockwise seen from above, as a "
-        "JSON array with one angle per photograph, such as `[0, 62, 118]` by a gyroscope. Null, or no list: unknown, "
-        "and searched.",
+        "JSON array with one angle per photograph, such as `[0, 26, 51]` by a gyroscope. Without the list, they follow "
+        "from what the photographs show twice: turn by at most half the field of view from one to the next. Null, and "
+        "photographs that overlap no other: searched.",
     )
     relative_heading_std_deg: AngleStd = Field(
         2.0, description="Standard deviation of the angle between two photographs by `relative_heading_deg`."
@@ -186,17 +184,16 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
         """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
         given = [] if self.motion == "walk" else self.relative_heading_deg or []
         known = [angle for angle in given if angle is not None]
-        if not known or len(known) < len(given) or self.relative_heading_std_deg > _EXACT_DEG:
+        if not known or len(known) < len(given) or math.radians(self.relative_heading_std_deg) > EXACT:
             return None
         return [math.radians(angle - known[0]) for angle in known]
 
     def _turn(self, first_deg: float | None, second_deg: float | None) -> Motion:
         """Return the motion between two photographs from one spot."""
-        on_the_spot = Motion(distance_m=0.0, distance_std_m=_ON_THE_SPOT_STD_M)
         if first_deg is None or second_deg is None:
-            return on_the_spot
+            return ON_THE_SPOT
         std = math.radians(self.relative_heading_std_deg)
-        return replace(on_the_spot, turn=math.radians(second_deg - first_deg), turn_std=std)
+        return replace(ON_THE_SPOT, turn=math.radians(second_deg - first_deg), turn_std=std)
 
     def heading_of(self, index: int) -> StatedHeading:
         """Return the given heading of a photograph."""
@@ -242,8 +239,9 @@ class SequenceAnswer(ResponseModel):
         "times the lowest probability that a photograph shows this plan. Null for a model without confidence."
     )
     warnings: list[str] = Field(
-        description="Motions in the request that were ignored, because the photographs contradict them, plans of a "
-        "venue that were not searched, and warnings about photographs, such as `photo[0]: …`."
+        description="Motions in the request that were ignored, because the photographs contradict them, photographs of "
+        "a turn that do not overlap, plans of a venue that were not searched, and warnings about photographs, such as "
+        "`photo[0]: …`."
     )
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
     camera_height_m: Metres = Field(description="Camera height of the first photograph that fits all photographs best.")

@@ -373,3 +373,9 @@ def test_file_of_the_model_that_ends_too_soon_closes_the_connection(
     )
     with pytest.raises(httpx.RemoteProtocolError):
         client.get("/model/view_encoder.onnx", timeout=20.0)
+
+
+def test_features_of_a_turn_without_angles_are_warned_about(client: httpx.Client, home: str, device: Device) -> None:
+    features = device.features(PHONE)
+    answer = ask(client, "features", features, features, path="/localise/sequence", floorplan_id=home, motion="turn")
+    assert "features have no pictures that could overlap" in answer.json()["warnings"][0]

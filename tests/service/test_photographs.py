@@ -199,6 +199,8 @@ class TestTurn:
         headings = [pose["heading_deg"] for pose in answer["poses"]]
         assert [(heading - headings[0]) % 360.0 for heading in headings] == pytest.approx([0.0, 60.0, 120.0], abs=0.02)
         assert len({json.dumps(pose["position"]) for pose in answer["poses"]}) == 1
+        given = [pose["view"]["relative_heading"] for pose in answer["poses"]]
+        assert given[2] == {"value_deg": 120.0, "std_deg": 2.0, "source": "given"}
         for pose in answer["poses"]:
             (arc,) = pose["view"]["seen"]
             assert arc["to_deg"] - arc["from_deg"] == pytest.approx(187.0, abs=5.0)
@@ -207,6 +209,31 @@ class TestTurn:
         fields = {"relative_heading_deg": "[0, 60, 120]", "headings_deg": "[null, 100, null]"}
         answer = turn(client, flat, *self.PHOTOS, heading_tolerance_deg=0, **fields).json()
         assert [pose["heading_deg"] for pose in answer["poses"]] == pytest.approx([40.0, 100.0, 160.0], abs=0.02)
+
+    def test_overlap_gives_the_angles(self, client: httpx.Client, flat: str) -> None:
+        tilts = (4.0, -5.0, 0.0)
+        photos = [jpeg(shown(30.0 * index, pitch_deg=tilt), PHONE) for index, tilt in enumerate(tilts)]
+        answer = turn(client, flat, *photos).json()
+        assert answer["warnings"] == []
+        headings = [pose["heading_deg"] for pose in answer["poses"]]
+        assert [(heading - headings[0]) % 360.0 for heading in headings] == pytest.approx([0.0, 30.0, 60.0], abs=1.0)
+        for pose, heading_deg, tilt in zip(answer["poses"], (0.0, 30.0, 60.0), tilts, strict=True):
+            view = pose["view"]
+            assert view["relative_heading"]["value_deg"] == pytest.approx(heading_deg, abs=1.0)
+            assert view["relative_heading"]["source"] == "estimated"
+            assert view["pitch"]["value_deg"] == pytest.approx(tilt, abs=1.0)
+            assert (view["pitch"]["source"], view["hfov"]["source"]) == ("estimated", "exif")
+        stds = [pose["view"]["relative_heading"]["std_deg"] for pose in answer["poses"]]
+        assert stds[0] == 0.0
+        assert all(0.0 < std < 5.0 for std in stds[1:])
+
+    def test_photographs_that_do_not_overlap_are_named(self, client: httpx.Client, flat: str) -> None:
+        photos = [jpeg(shown(heading_deg), PHONE) for heading_deg in (0.0, 30.0, 180.0)]
+        answer = turn(client, flat, *photos).json()
+        (warning,) = answer["warnings"]
+        assert "2 groups (photo[0], photo[1]; photo[2])" in warning
+        assert "at most half the field of view, 34°" in warning
+        assert [pose["view"]["relative_heading"] is None for pose in answer["poses"]] == [False, False, True]
 
     @pytest.mark.parametrize("fields", [{}, {"relative_heading_deg": "[0, 60, null]"}])
     def test_unknown_angles_are_searched(self, client: httpx.Client, flat: str, fields: dict[str, str]) -> None:

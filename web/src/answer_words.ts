@@ -69,7 +69,7 @@ export function adviceWords(answer: Answer): string | null {
   const seen = `${seenDeg(view).toFixed(0)}° of the surroundings are too little to tell the place`;
   return together?.motion === "turn"
     ? `Turn further: ${seen}. Add more photographs from the same spot.`
-    : `Turn around: ${seen}. Add photographs from the same spot, and choose “Taken from one spot, turning”.`;
+    : `Turn around: ${seen}. Add photographs from the same spot, each turned by at most half the field of view, and choose “Taken from one spot, turning”.`;
 }
 
 function seenDeg({ seen }: ViewAnswer): number {

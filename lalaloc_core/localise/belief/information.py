@@ -65,7 +65,8 @@ def advice_for(arcs: list[tuple[float, float]], confidence: float) -> str | None
         return None
     return (
         f"turn around: {math.degrees(seen):.0f}° of the surroundings are too little to tell the place; take more "
-        "photographs from the same spot, and send them as one query with motion=turn"
+        "photographs from the same spot, each turned by at most half the field of view, and send them as one query "
+        "with motion=turn"
     )
 
 

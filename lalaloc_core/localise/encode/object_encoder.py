@@ -32,12 +32,12 @@ class ObjectEncoder:
     def outputs(self, photograph: Photograph) -> dict[str, Float[np.ndarray, "n"]]:
         """Return the probability of each object, and its azimuth (radians) relative to the photograph's centre.
 
-        The photograph has an overview, a camera and axes.
+        The photograph has an thumbnail, a camera and axes.
         """
-        overview = photograph.overview
-        assert overview is not None
+        thumbnail = photograph.thumbnail
+        assert thumbnail is not None
         probability, by_column = map(
-            as_array, self._session.run(["probability", "by_column"], {"image": overview[None]})
+            as_array, self._session.run(["probability", "by_column"], {"image": thumbnail[None]})
         )
         return {
             "object_probability": probability[0],

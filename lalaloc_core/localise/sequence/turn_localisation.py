@@ -2,15 +2,80 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, Posterior, photograph_heading
 from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.localise.sequence.measured_motion import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
+from lalaloc_core.photograph.turn_angles import TurnAngles
+
+# Phones move about the person who turns.
+ON_THE_SPOT = Motion(distance_m=0.0, distance_std_m=0.15)
+# Standard deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
+EXACT = math.radians(5.0)
+
+
+@dataclass(frozen=True)
+class LinkedTurn:
+    """Photographs of one spot in groups that overlap.
+
+    Attributes:
+        angles: angles of each photograph.
+        order: numbers of the photographs, group by group.
+    """
+
+    angles: Sequence[TurnAngles]
+    order: tuple[int, ...]
+
+    @classmethod
+    def of(cls, angles: Sequence[TurnAngles]) -> LinkedTurn:
+        """Return the groups of photographs by their angles."""
+        return cls(angles, tuple(sorted(range(len(angles)), key=lambda index: (angles[index].group, index))))
+
+    @property
+    def turns(self) -> list[float] | None:
+        """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
+        if any(angle.group or angle.heading_sd > EXACT for angle in self.angles):
+            return None
+        return [angle.heading for angle in self.angles]
+
+    @property
+    def motions(self) -> list[Motion]:
+        """Motions between successive photographs in `order`, with turns within groups."""
+        pairs = zip(self.order, self.order[1:], strict=False)
+        return [self._motion(self.angles[first], self.angles[second]) for first, second in pairs]
+
+    @staticmethod
+    def _motion(first: TurnAngles, second: TurnAngles) -> Motion:
+        if first.group != second.group:
+            return ON_THE_SPOT
+        turn = float(wrap_angle(second.heading - first.heading))
+        return replace(ON_THE_SPOT, turn=turn, turn_std=math.hypot(first.heading_sd, second.heading_sd))
+
+    def in_order(self, found: SequenceLocalisation) -> SequenceLocalisation:
+        """Return a localisation of the photographs in `order` as one in the order in which they were taken."""
+        pictures = dict(zip(self.order, found.pictures, strict=True))
+        return replace(found, pictures=[pictures[index] for index in range(len(pictures))])
+
+    def warnings(self, hfov: float) -> list[str]:
+        """Return a warning about angles that had to be searched, for a horizontal field of view (radians)."""
+        groups: dict[int, list[int]] = {}
+        for index in self.order:
+            groups.setdefault(self.angles[index].group, []).append(index)
+        if len(groups) == 1:
+            return []
+        names = "; ".join(", ".join(f"photo[{index}]" for index in group) for group in groups.values())
+        return [
+            f"the photographs overlap only within {len(groups)} groups ({names}), so the angles between these were "
+            f"searched: turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph "
+            "to the next, or state the relative headings"
+        ]
 
 
 def localised_turn(found: Localisation, turns: Sequence[float]) -> SequenceLocalisation:

@@ -10,7 +10,7 @@ const PIXELS = 320 * 256,
   MAX_ASPECT = 8;
 
 /** Return the size of the whole picture in which objects are recognised. */
-export function overviewSize({ width, height }: Size): Size {
+export function thumbnailSize({ width, height }: Size): Size {
   const aspect = Math.min(Math.max(width / height, 1 / MAX_ASPECT), MAX_ASPECT),
     rows = Math.max(1, Math.round(Math.sqrt(PIXELS / aspect) / STEP));
   return { width: Math.max(1, Math.round(aspect * rows)) * STEP, height: rows * STEP };

@@ -7,7 +7,7 @@ import { type Header, featuresFile } from "./features_file";
 import { findLens, type Lens, poseAngle, type Stated } from "./lens";
 import { type Metadata, readMetadata } from "./metadata";
 import { type Manifest, Model } from "./model";
-import { columnAzimuths, overviewSize } from "./objects";
+import { columnAzimuths, thumbnailSize } from "./objects";
 import { cutPatch, FINER, patchSteps, seenDeg } from "./patches";
 import { decoded, levelled, looksSpherical, scaled } from "./pixels";
 import { findSegments } from "./segments";
@@ -150,11 +150,11 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
     share = wanted > SMALLEST_REDUCTION ? 1 : wanted;
   const picture = scaled(bitmap, Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height)));
   const steps = patchSteps(hfov, size);
-  const shown = overviewSize(bitmap),
-    overview = scaled(bitmap, shown.width, shown.height);
+  const shown = thumbnailSize(bitmap),
+    thumbnail = scaled(bitmap, shown.width, shown.height);
   const arrays = [
     ...(await encoder.patches(steps.map((step) => cutPatch(picture, view, step * size.step, size)))),
-    ...(await encoder.objects(overview.rgb, shown, columnAzimuths(view, shown.width / OBJECT_COLUMN))),
+    ...(await encoder.objects(thumbnail.rgb, shown, columnAzimuths(view, shown.width / OBJECT_COLUMN))),
   ];
   const header: Header = {
     ...common(lens, encoder),

@@ -1,0 +1,123 @@
+"""Angles of photographs of one spot by what they show twice: turns cut from a sphere, and turns with parallax."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.overlap import Features
+from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn, level_axes
+from lalaloc_core.photograph.turned import turn_views, turned_photographs
+from tests.core.taken import jpeg, sphere, take
+
+PORTRAIT = Perspective.of_hfov(360, 480, math.radians(53.0))
+ONCE_AROUND = [24.0 * index for index in range(15)]
+# Box of a room (m), and the axis of the turn in it.
+ROOM_M, AXIS_M = np.array([5.5, 4.5, 2.5]), np.array([2.9, 2.1, 1.5])
+
+
+def photographs(headings_deg: Sequence[float], room: str = "living_room", **stated: float) -> list[Photograph]:
+    pitches_deg = itertools.cycle([4.0, -6.0, 1.0])
+    pictures = [
+        jpeg(take(sphere(room), PORTRAIT, heading_deg=heading, pitch_deg=pitch))
+        for heading, pitch in zip(headings_deg, pitches_deg, strict=False)
+    ]
+    statement = StatedCamera(projection="perspective", **stated)
+    return [open_photograph(picture, sphere_size=(128, 256), stated=statement, overview=True) for picture in pictures]
+
+
+def misses_deg(angles: Sequence[TurnAngles], headings: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the errors of headings; the common one is the first photograph's."""
+    missed = wrap_angle(np.array([angle.heading for angle in angles]) - headings)
+    return np.degrees(np.abs(wrap_angle(missed - np.median(missed))))
+
+
+def test_overlapping_photographs_give_their_angles() -> None:
+    angles = angles_of_turn(turn_views(photographs(ONCE_AROUND, hfov_deg=53.0)))
+    assert {angle.group for angle in angles} == {0}
+    assert misses_deg(angles, np.radians(ONCE_AROUND)).max() < 0.5
+    assert all(0.0 < angle.heading_sd < math.radians(3.0) for angle in angles[1:])
+    pitches_deg = [math.degrees(angle.attitude.pitch) for angle in angles]
+    assert pitches_deg == pytest.approx([4.0, -6.0, 1.0] * 5, abs=0.8)
+
+
+def test_closed_turn_fixes_the_field_of_view() -> None:
+    taken = photographs(ONCE_AROUND)
+    views = turn_views(taken)
+    turned = turned_photographs(taken, views, StatedCamera(), angles_of_turn(views))
+    alone = np.array([math.degrees(photograph.hfov.value) for photograph in taken])
+    assert np.abs(alone - 53.0).max() > 2.0
+    for found in turned:
+        assert found.hfov.source == "estimated"
+        assert math.degrees(found.hfov.value) == pytest.approx(53.0, abs=0.6)
+        assert found.stated is not None
+        assert found.stated.hfov_deg == pytest.approx(math.degrees(found.hfov.value))
+    assert "estimated from all photographs of the turn" in turned[0].applied(taken[0]).warnings[-1]
+
+
+def test_photographs_without_overlap_form_groups() -> None:
+    angles = angles_of_turn(turn_views(photographs([0.0, 24.0, 120.0, 144.0, 250.0], hfov_deg=53.0)))
+    assert [angle.group for angle in angles] == [0, 0, 1, 1, 2]
+    assert math.degrees(angles[3].heading) == pytest.approx(24.0, abs=0.5)
+    linked = LinkedTurn.of(angles)
+    assert linked.turns is None
+    assert [motion.turn is None for motion in linked.motions] == [False, True, False, True]
+    (warning,) = linked.warnings(math.radians(53.0))
+    assert "3 groups (photo[0], photo[1]; photo[2], photo[3]; photo[4])" in warning
+    assert "half the field of view, 26°" in warning
+
+
+def test_stated_tilt_and_field_are_kept() -> None:
+    taken = photographs([0.0, 24.0], hfov_deg=53.0, pitch_deg=2.0, roll_deg=0.0)
+    views = turn_views(taken)
+    for found in turned_photographs(taken, views, StatedCamera(hfov_deg=53.0), angles_of_turn(views)):
+        assert (found.hfov.source, found.pitch.source, found.roll.source) == ("given", "given", "given")
+        assert found.stated is not None
+        assert (found.stated.hfov_deg, found.stated.pitch_deg) == pytest.approx((53.0, 2.0))
+
+
+def room_view(rng: np.random.Generator, arm_m: float, pose: Float[np.ndarray, "3"]) -> Overview:
+    """Return what a camera on an arm sees in the box: points of its walls, and its edges."""
+    landmarks = np.random.default_rng(5)
+    where = landmarks.uniform(0.0, 1.0, (1500, 3)) * ROOM_M
+    side = landmarks.integers(4, size=1500)
+    where[np.arange(1500), side // 2] = np.where(side % 2, ROOM_M[side // 2], 0.0)
+    descriptor = landmarks.integers(0, 256, (1500, 128)).astype(np.uint8)
+    corners = np.array(list(itertools.product(*((0.0, size) for size in ROOM_M))))
+    edges = [(a, b) for a, b in itertools.combinations(corners, 2) if (a != b).sum() == 1]
+    pieces = np.array([a + (b - a) * np.array([[k], [k + 1]]) / 12.0 for a, b in edges for k in range(12)])
+    centre = AXIS_M + arm_m * np.array([math.sin(pose[0]), math.cos(pose[0]), 0.0]) + rng.normal(0.0, 0.01, 3)
+    (axes,) = level_axes(pose[None])
+
+    def seen(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pixels, shown = PORTRAIT.pixels((points - centre) @ axes.T)
+        return (pixels + rng.normal(0.0, 0.5, pixels.shape)) / (PORTRAIT.width, PORTRAIT.height), shown
+
+    (place, shown), (ends, whole) = seen(where), seen(pieces)
+    kept = np.flatnonzero(shown)
+    return Overview(Features(place[kept], descriptor[kept]), ends[whole.all(axis=1)].reshape(-1, 4))
+
+
+@pytest.mark.parametrize("arm_m", [0.0, 0.3, 0.4, 0.6])
+def test_parallax_of_an_arm_is_tolerated(arm_m: float) -> None:
+    rng = np.random.default_rng(int(10 * arm_m))
+    count = 15
+    heading = TWO_PI * np.arange(count) / count + np.radians(rng.normal(0.0, 2.0, count)) * (np.arange(count) > 0)
+    poses = np.column_stack([heading, np.radians(rng.normal(0.0, 6.0, count)), np.radians(rng.normal(0.0, 2.0, count))])
+    views = [TurnView(overview=room_view(rng, arm_m, pose), camera=PORTRAIT, focal_sd=0.0) for pose in poses]
+    angles = angles_of_turn(views)
+    assert {angle.group for angle in angles} == {0}
+    missed = misses_deg(angles, heading)
+    assert np.median(missed) < 1.5
+    assert missed.max() < 5.0
+    tilt = np.degrees([angle.attitude.pitch for angle in angles] - poses[:, 1])
+    assert np.median(np.abs(tilt)) < 0.7
