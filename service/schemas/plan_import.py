@@ -89,3 +89,6 @@ class ImportReport(ResponseModel):
         description="Outlines (m) of areas inside the drawn walls of a picture that became no room, the largest first; "
         "marked in `preview.svg`.",
     )
+    turned_deg: float = Field(
+        default=0.0, description="Clockwise rotation about its centre that straightened a picture before it was read."
+    )

@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import ImportLimits
 from lalaloc_core.importers.common.import_options import ImportOptions
@@ -26,7 +26,6 @@ from lalaloc_core.importers.common.plausibility import check_document
 from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
-DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 # Tolerances (m) tried in turn for outlines with more vertices than allowed, such as curved walls.
@@ -106,8 +105,10 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
-    document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
-    document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, shift) for room in rooms]
+    ceiling_m = _usual_ceiling(rooms, options, builder)
+    if ceiling_m is not None:
+        document["ceiling_height_m"] = ceiling_m
+    document["rooms"] = [_room(room, ceiling_m, sketch, shift) for room in rooms]
     if placed.openings:
         document["openings"] = [_opening(opening) for opening in placed.openings]
     if sketch.opening_kinds is not None:
@@ -294,19 +295,26 @@ def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> Sket
     return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
 
 
-def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:
+def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float | None:
+    """Return the ceiling height of rooms without their own; None if no height is known, so that plans assume one."""
     known = [room.ceiling_height_m for room in rooms if room.ceiling_height_m is not None]
     if options.ceiling_height_m is not None:
         return options.ceiling_height_m
     if known:
-        return round(float(np.median(known)), 4)
+        usual_m = round(float(np.median(known)), 4)
+        if len(known) < len(rooms):
+            builder.unsure.append(
+                f"{len(rooms) - len(known)} of {len(rooms)} rooms give no ceiling height; {usual_m:g} m, the median of "
+                "the others, is assumed (set ceiling_height_m)"
+            )
+        return usual_m
     builder.unsure.append(
-        f"the file gives no ceiling height; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
+        f"no ceiling height is given; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
     )
-    return DEFAULT_CEILING_HEIGHT_M
+    return None
 
 
-def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
+def _room(room: SketchedRoom, ceiling_m: float | None, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
     entry: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
     if room.name:
         entry = {"name": room.name} | entry
@@ -318,7 +326,7 @@ def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, shift: tuple[flo
     inner_walls = [wall for wall in walls if room.shape.contains(wall)]
     if inner_walls:
         entry["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
-    if room.ceiling_height_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
+    if room.ceiling_height_m is not None and ceiling_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
         entry["ceiling_height_m"] = round(room.ceiling_height_m, 4)
     return entry
 

@@ -42,6 +42,7 @@ class ImportReport:
         layers: use of the entities, by layer.
         unsure: guesses and their reasons.
         no_room: outlines (m) of the largest areas inside the drawn walls that became no room.
+        turned_deg: clockwise rotation about its centre that straightened a picture.
     """
 
     format: str
@@ -53,6 +54,7 @@ class ImportReport:
     warnings: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
     no_room: tuple[Outline, ...] = ()
+    turned_deg: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -63,7 +65,8 @@ class ImportReport:
 class ReportBuilder:
     """Report under construction while a file is read.
 
-    The first four fields are those of `ImportReport`; `no_room` are areas in metres inside walls, largest first.
+    The first four fields and `turned_deg` are those of `ImportReport`; `no_room` are areas in metres inside walls, the
+    largest first.
     """
 
     format: str = ""
@@ -75,6 +78,7 @@ class ReportBuilder:
     unsure: list[str] = field(default_factory=list)
     uses: Counter[tuple[str, str]] = field(default_factory=Counter)
     no_room: list[shapely.Polygon] = field(default_factory=list)
+    turned_deg: float = 0.0
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -93,6 +97,7 @@ class ReportBuilder:
             warnings=_limit_lines(self.warnings),
             unsure=_limit_lines(self.unsure),
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
+            turned_deg=self.turned_deg,
         )
 
 
