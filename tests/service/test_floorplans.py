@@ -42,18 +42,6 @@ BAD_PLANS = {
 
 
 @pytest.mark.parametrize(("plan", "message"), BAD_PLANS.values(), ids=BAD_PLANS.keys())
-def test_assumed_ceiling_is_not_stored(client: httpx.Client) -> None:
-    plan = client.post("/floorplans", json={"name": "No ceiling", "rooms": [{"name": "den", "polygon": SQUARE}]}).json()
-    assert plan["warnings"] == ["no ceiling height is given; 2.5 m is assumed (set ceiling_height_m)"]
-    assert "ceiling_height_m" not in plan["plan"]["rooms"][0]
-    assert plan["plan"].get("ceiling_height_m") is None
-    assert plan["rooms"][0]["ceiling_height_m"] == 2.5
-    # The plan's height applies to all rooms without their own.
-    low = plan["plan"] | {"ceiling_height_m": 2.2}
-    changed = client.put(f"/floorplans/{plan['id']}", json=low).json()
-    assert (changed["warnings"], changed["rooms"][0]["ceiling_height_m"]) == ([], 2.2)
-
-
 def test_invalid_plan_is_rejected_with_its_fault(client: httpx.Client, plan: Any, message: str) -> None:
     before = client.get("/floorplans").json()
     response = client.post("/floorplans", content=json.dumps(plan), headers={"content-type": "application/json"})
@@ -255,3 +243,15 @@ def _panorama() -> bytes:
     from tests.service.conftest import encode_picture
 
     return encode_picture(256, 128, "JPEG")
+
+
+def test_assumed_ceiling_is_not_stored(client: httpx.Client) -> None:
+    plan = client.post("/floorplans", json={"name": "No ceiling", "rooms": [{"name": "den", "polygon": SQUARE}]}).json()
+    assert plan["warnings"] == ["no ceiling height is given; 2.5 m is assumed (set ceiling_height_m)"]
+    assert "ceiling_height_m" not in plan["plan"]["rooms"][0]
+    assert plan["plan"].get("ceiling_height_m") is None
+    assert plan["rooms"][0]["ceiling_height_m"] == 2.5
+    # The plan's height applies to all rooms without their own.
+    low = plan["plan"] | {"ceiling_height_m": 2.2}
+    changed = client.put(f"/floorplans/{plan['id']}", json=low).json()
+    assert (changed["warnings"], changed["rooms"][0]["ceiling_height_m"]) == ([], 2.2)

@@ -2,6 +2,7 @@
 
 import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
+import { captionWords } from "./answer_words";
 import { api } from "./api";
 import { device } from "./device/device";
 import { byId, scrollTo } from "./dom";
@@ -139,7 +140,12 @@ export class AnswerController {
     this.panorama.setView(photo === null ? null : (answer?.view ?? null));
     showAnswer(answer, photo, {
       select: (index) => this.select(index),
-      save: (answered) => savePicture(answered, this.fields),
+      save: async (shown, answered) => {
+        clearError(this.error, this.fields);
+        await savePicture(answered.file.name, this.panorama.toCanvas(), this.scene.svg, captionWords(shown)).catch(
+          (error: unknown) => showError(this.error, error),
+        );
+      },
     });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
     this.draw();
