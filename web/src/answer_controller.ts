@@ -9,7 +9,7 @@ import { byId, scrollTo } from "./dom";
 import { hideGuide } from "./guide";
 import { HintForm } from "./hints";
 import { layoutLines, roomAt } from "./layout";
-import { clearError, showError } from "./notices";
+import { clearError, clearErrors, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
@@ -229,6 +229,7 @@ export class AnswerController {
       else await askTogether(place, group, signal);
       // The user may have chosen another plan in the meantime.
       if (signal.aborted || photo.answer === null) return;
+      clearErrors();
       const { floorplan_id, floorplan_revision } = photo.answer;
       if (floorplan_revision !== undefined && floorplan_revision !== this.scene.plan?.revision)
         await this.actions.showPlan(floorplan_id, floorplan_revision);

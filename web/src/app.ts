@@ -8,7 +8,7 @@ import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
-import { clearError, InputError, showError } from "./notices";
+import { clearError, clearErrors, InputError, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
@@ -118,6 +118,7 @@ class Page {
   }
 
   private onExample(example: PlanDocument): void {
+    clearErrors();
     this.scene.setPlan(null, example);
     showCaption(null, example);
     this.answers.offerHints();
@@ -143,6 +144,7 @@ class Page {
     const before = this.scene.plan;
     if (plan === null) this.answers.cancelQuery();
     const isOther = plan !== null && plan.revision !== before?.revision;
+    if (isOther && !this.editor.isOpen) clearErrors();
     this.scene.setPlan(plan);
     showCaption(plan);
     if (plan !== null && !isOther) return;
