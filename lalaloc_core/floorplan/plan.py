@@ -28,6 +28,7 @@ from lalaloc_core.floorplan.reading import (
     DEFAULT_CAMERA_HEIGHT_M,
     MAX_CAMERA_HEIGHT_STD_M,
     TOLERANCES_M,
+    ceiling_warnings,
     read_camera_height,
     read_ceiling,
     read_opening_trust,
@@ -69,6 +70,7 @@ class FloorPlan:
         opening_faces: the parts of walls that openings occupy.
         camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
         states_camera_height: True if the plan gives `camera_height_m`; otherwise the height is estimated per query.
+        ceiling_height_m: ceiling height of rooms without their own; None if the plan gives none and it is assumed.
     """
 
     name: str
@@ -84,6 +86,7 @@ class FloorPlan:
     states_camera_height: bool = False
     anchor: Anchor | None = None
     fixtures: tuple[Fixture, ...] = ()
+    ceiling_height_m: float | None = None
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -143,7 +146,8 @@ class FloorPlan:
             north = heading_from_degrees(anchor.north_deg)
         if warnings is None:
             off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
-            warnings = (*overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
+            ceilings = ceiling_warnings(rooms, default_ceiling_m)
+            warnings = (*ceilings, *overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
         return cls(
             name=name,
             rooms=rooms,
@@ -160,6 +164,7 @@ class FloorPlan:
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
             fixtures=read_fixtures(document.get("fixtures"), limits),
+            ceiling_height_m=default_ceiling_m,
         )
 
     def anchor_within(self, venue_anchor: Anchor | None) -> Anchor | None:
@@ -189,6 +194,8 @@ class FloorPlan:
             if doubted:
                 document["opening_trust"] = doubted
             document["opening_tolerance_m"] = self.opening_tolerance_m
+        if self.ceiling_height_m is not None:
+            document["ceiling_height_m"] = self.ceiling_height_m
         document["rooms"] = [_room_document(room) for room in self.rooms]
         if self.openings:
             document["openings"] = [_opening_document(opening) for opening in self.openings]
@@ -283,7 +290,9 @@ def _room_document(room: Room) -> dict[str, Any]:
         document["holes"] = [hole.tolist() for hole in room.holes_m]
     if len(room.inner_walls_m):
         document["walls"] = room.inner_walls_m.reshape(-1, 2, 2).tolist()
-    return document | {"ceiling_height_m": room.ceiling_height_m}
+    if room.states_ceiling:
+        document["ceiling_height_m"] = room.ceiling_height_m
+    return document
 
 
 def _opening_document(opening: Opening) -> dict[str, Any]:

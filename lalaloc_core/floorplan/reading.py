@@ -30,7 +30,7 @@ from lalaloc_core.floorplan.values import (
     read_segment,
 )
 
-DEFAULT_CAMERA_HEIGHT_M = 1.5
+DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M = 1.5, 2.5
 MAX_CAMERA_HEIGHT_STD_M = 2.0
 _ROOM_KEYS = {"id", "name", "type", "polygon", "holes", "walls", "ceiling_height_m"}
 # Free-standing walls can reach this far outside the floor: drawings let a stub begin on the axis of another wall.
@@ -68,6 +68,15 @@ def read_ceiling(value: Any, room: str | None, limits: PlanLimits) -> float:
     return read_number_between(value, "ceiling_height_m", low, high, " m", room)
 
 
+def ceiling_warnings(rooms: Sequence[Room], default_ceiling_m: float | None) -> list[str]:
+    """Return a warning if the ceiling height of some rooms is assumed."""
+    assumed = sum(not room.states_ceiling for room in rooms) if default_ceiling_m is None else 0
+    if assumed == 0:
+        return []
+    some = "" if assumed == len(rooms) else f" for {assumed} of {len(rooms)} rooms"
+    return [f"no ceiling height is given{some}; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"]
+
+
 def _count_vertices(raw: Mapping[str, Any]) -> int:
     """Count the vertices of outline and holes, and one for each free-standing wall, before reading them."""
     holes = raw.get("holes")
@@ -82,10 +91,9 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     check_keys(raw, _ROOM_KEYS, room=name)
     key = read_name(raw["id"], limits, "the id", room=name) if raw.get("id") is not None else ""
     kind = read_choice(raw.get("type", ROOM_TYPES[0]), ROOM_TYPES, "the type", room=name)
-    ceiling = raw.get("ceiling_height_m", default_ceiling_m)
-    if ceiling is None:
-        raise InvalidFloorPlanError("ceiling_height_m is missing; set it for the room or for the plan", room=name)
-    height_m = read_ceiling(ceiling, name, limits)
+    ceiling = raw.get("ceiling_height_m")
+    usual_m = DEFAULT_CEILING_HEIGHT_M if default_ceiling_m is None else default_ceiling_m
+    height_m = usual_m if ceiling is None else read_ceiling(ceiling, name, limits)
     if (vertices := _count_vertices(raw)) > limits.max_vertices_per_room:
         raise InvalidFloorPlanError(
             f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (LALALOC_MAX_VERTICES); simplify its "
@@ -109,6 +117,7 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
         type=kind,
         holes_m=holes_m,
         inner_walls_m=_read_walls(raw.get("walls"), shape, name, limits),
+        states_ceiling=ceiling is not None,
     )
 
 

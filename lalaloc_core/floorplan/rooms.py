@@ -61,6 +61,7 @@ class Room:
         holes_m: areas inside the outline that are no floor, such as columns and shafts: each (k, 2), clockwise, not
             closed.
         inner_walls_m: (k, 4) free-standing walls up to the ceiling, segments (x0, y0, x1, y1).
+        states_ceiling: the height is the room's own, not that of the plan or an assumed one.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Room:
     type: str = ROOM_TYPES[0]
     holes_m: tuple[Float[np.ndarray, "_ 2"], ...] = ()
     inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=_no_walls)
+    states_ceiling: bool = True
 
     @cached_property
     def shape(self) -> shapely.Polygon:

@@ -88,7 +88,11 @@ class FloorPlanDocument(BaseModel):
     )
 
     name: str = Field("floor plan", description="Name of the plan.")
-    ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling height of rooms without their own.")
+    ceiling_height_m: float | None = Field(
+        None,
+        gt=0,
+        description="Ceiling height of rooms without their own. Without either, 2.5 m is assumed, with a warning.",
+    )
     camera_height_m: float = Field(
         1.5, ge=MIN_CAMERA_HEIGHT_M, description="Camera height of photographs of this plan."
     )

@@ -101,3 +101,6 @@ class ImportReport(ResponseModel):
     opening_trust: list[OpeningTrustAnswer] = Field(
         default=[], description="Estimated `opening_trust` of the plan; empty if the file states it."
     )
+    turned_deg: float = Field(
+        default=0.0, description="Clockwise rotation about its centre that straightened a picture before it was read."
+    )

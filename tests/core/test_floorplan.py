@@ -160,10 +160,16 @@ def test_non_object_room_error_names_its_number(room: Any) -> None:
     assert refused(document).room == "room 2"
 
 
-def test_missing_ceiling_height_is_refused() -> None:
+def test_missing_ceiling_height_is_assumed_and_not_stored() -> None:
     document = plan_document(rectangle(3.0, 3.0))
     del document["ceiling_height_m"]
-    assert refused(document).room == "room 1"
+    plan = FloorPlan.from_dict(document)
+    assert plan.rooms[0].ceiling_height_m == 2.5
+    assert plan.warnings == ("no ceiling height is given; 2.5 m is assumed (set ceiling_height_m)",)
+    stored = plan.to_dict()
+    assert "ceiling_height_m" not in stored | stored["rooms"][0]
+    own = FloorPlan.from_dict(document | {"ceiling_height_m": 2.8}).to_dict()
+    assert (own["ceiling_height_m"], "ceiling_height_m" in own["rooms"][0]) == (2.8, False)
 
 
 def test_camera_must_be_below_the_lowest_ceiling() -> None:

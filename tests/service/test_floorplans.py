@@ -31,7 +31,6 @@ BAD_PLANS = {
     "three coordinates": (_room([[0, 0, 0], [4, 0, 0], [4, 4, 0]]), "vertex 0"),
     "an integer beyond floats": (_room([[0, 0], [4, 0], [4, 10**400]]), "vertex 2"),
     "a ceiling beyond floats": (_room(SQUARE, ceiling_height_m=10**400), "ceiling_height_m"),
-    "no ceiling": ({"rooms": [{"polygon": SQUARE}]}, "ceiling_height_m is missing"),
     "no rooms": ({"name": "x", "rooms": []}, "at least one room"),
     "a list": ([1, 2], "must be an object"),
     "an unknown key": ({**FLAT, "scale": 2}, "'scale'"),
@@ -244,3 +243,15 @@ def _panorama() -> bytes:
     from tests.service.conftest import encode_picture
 
     return encode_picture(256, 128, "JPEG")
+
+
+def test_assumed_ceiling_is_not_stored(client: httpx.Client) -> None:
+    plan = client.post("/floorplans", json={"name": "No ceiling", "rooms": [{"name": "den", "polygon": SQUARE}]}).json()
+    assert plan["warnings"] == ["no ceiling height is given; 2.5 m is assumed (set ceiling_height_m)"]
+    assert "ceiling_height_m" not in plan["plan"]["rooms"][0]
+    assert plan["plan"].get("ceiling_height_m") is None
+    assert plan["rooms"][0]["ceiling_height_m"] == 2.5
+    # The plan's height applies to all rooms without their own.
+    low = plan["plan"] | {"ceiling_height_m": 2.2}
+    changed = client.put(f"/floorplans/{plan['id']}", json=low).json()
+    assert (changed["warnings"], changed["rooms"][0]["ceiling_height_m"]) == ([], 2.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Page, expect
 
 from tests.service.conftest import FLAT, upload
-from tests.web.conftest import Visit
+from tests.web.conftest import Visit, choose_plan
 from tests.web.test_answer import _assert_accessible
 
 
@@ -39,9 +40,9 @@ def _stored(visited: Visit, name: str) -> dict[str, Any]:
     return visited.client.get(f"/floorplans/{listed['id']}").json()
 
 
-def _editing(visited: Visit, name: str) -> Page:
+def _editing(visited: Visit, name: str, **values: Any) -> Page:
     """Store a plan and open the editor on it."""
-    upload(visited.client, FLAT | {"name": name})
+    upload(visited.client, FLAT | {"name": name} | values)
     page = visited.open()
     expect(page.locator("#plan-name")).to_have_text(name)
     page.get_by_role("button", name="Edit", exact=True).click()
@@ -116,6 +117,84 @@ def test_dragging_can_be_undone(desktop: Visit) -> None:
     assert [4.4, 3.4] in [
         pytest.approx(corner) for corner in _stored(desktop, "Dragged")["plan"]["rooms"][0]["polygon"]
     ]
+
+
+def test_form_of_the_whole_plan_is_reachable_again(desktop: Visit, phone: Visit) -> None:
+    for visited, name in ((desktop, "Whole"), (phone, "Whole on a phone")):
+        page = _editing(visited, name, openings=[{"kind": "door", "line": [[4, 1], [4, 2]]}])
+        whole = page.locator("#plan-form-north")
+        for leave in (
+            lambda page=page: page.locator("#whole-plan").click(),
+            lambda page=page: page.keyboard.press("Escape"),
+            lambda page=page: page.mouse.click(*_on_screen(page, 2, 5)),
+        ):
+            page.locator("#plan").evaluate("plan => plan.scrollIntoView({block: 'center'})")
+            _click(page, 2, 1.5)
+            expect(whole).to_have_count(0)
+            leave()
+            expect(whole).to_be_visible()
+        page.locator("#edit-opening-0").focus()
+        page.keyboard.press("Enter")
+        expect(page.locator("#opening-form-kind")).to_be_visible()
+        page.locator("#whole-plan").click()
+        expect(whole).to_be_visible()
+
+
+def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
+    page = _editing(desktop, "Ceilings")
+    expect(page.locator("#plan-form-own-ceilings")).to_contain_text(
+        "1 of 2 rooms have ceilings of their own: kitchen 2.40 m"
+    )
+    page.locator("#plan-form-ceiling").fill("2.7")
+    page.locator("#plan-form-ceiling").press("Tab")
+    page.locator("#one-ceiling").click()
+    expect(page.locator("#plan-form-own-ceilings")).to_have_count(0)
+    page.locator("#save").click()
+    expect(page.locator("#plan-facts")).to_contain_text("revision 2")
+    stored = _stored(desktop, "Ceilings")
+    assert [room["ceiling_height_m"] for room in stored["rooms"]] == [2.7, 2.7]
+
+
+def test_drawn_plan_says_that_its_ceiling_is_assumed(desktop: Visit) -> None:
+    page = desktop.open()
+    page.get_by_role("button", name="Draw", exact=True).click()
+    page.locator("#add-room").click()
+    page.locator("#whole-plan").click()
+    expect(page.locator("#plan-form-ceiling")).to_have_value("")
+    page.locator("#plan-form-name").fill("Drawn")
+    page.locator("#plan-form-name").press("Tab")
+    page.locator("#save").click()
+    expect(page.locator("#plan-warnings")).to_contain_text("2.5 m is assumed")
+    assert _stored(desktop, "Drawn")["plan"].get("ceiling_height_m") is None
+
+
+def _skewed_scan() -> bytes:
+    """Return a scan of two rooms, turned by 1.5°, at 1 cm per pixel."""
+    scan = Image.new("RGB", (900, 700), "white")
+    pen = ImageDraw.Draw(scan)
+    pen.rectangle((100, 100, 800, 600), outline="black", width=14)
+    pen.line((400, 100, 400, 600), fill="black", width=14)
+    content = io.BytesIO()
+    scan.rotate(1.5, fillcolor="white", resample=Image.Resampling.BICUBIC).save(content, "PNG")
+    return content.getvalue()
+
+
+def test_picture_of_a_plan_lies_below_it_again(desktop: Visit) -> None:
+    file, form = ("Skewed.png", _skewed_scan()), {"metres_per_pixel": "0.01"}
+    desktop.client.post("/floorplans", files={"file": file}, data=form).raise_for_status()
+    page = desktop.open()
+    choose_plan(page, "Skewed")
+    page.locator("#edit-plan").click()
+    # The picture was straightened, so it is turned to lie below the rooms.
+    picture = page.locator("#plan image")
+    expect(picture).to_have_attribute("transform", re.compile(r"rotate\(1\.[45]"))
+    page.locator("#plan-form-name").fill("Straight")
+    page.locator("#plan-form-name").press("Tab")
+    page.locator("#save").click()
+    expect(page.locator("#plan-facts")).to_contain_text("revision 2")
+    # The revision of the editor has no picture of its own.
+    page.locator("#edit-plan").click()
+    expect(picture).to_have_attribute("transform", re.compile(r"rotate\(1\.[45]"))
 
 
 def test_plan_is_edited_with_the_keyboard_alone(desktop: Visit) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -13,11 +14,12 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
+from service.security.keys import hash_of, key_text, new_secret
 from service.storage.store import Store
 from tests.importers.test_lettering import AREAS_M2, PrintedPlan
 from tests.importers.test_pictures import open_hall
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
-from tests.service.test_security import make_key
+from tests.service.test_security import EVERYTHING, make_key
 from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
 from tests.web.test_answer import _assert_accessible
 
@@ -163,12 +165,26 @@ def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> No
     (tmp_path / "letter.txt").write_text("Dear landlord")
     page.locator("#plan-file").set_input_files(tmp_path / "letter.txt")
     expect(page.locator("#plan-error")).to_be_visible()
-    # The plan before stays, and giving up removes the error.
+    # The plan before stays; no option would make a plan of a text.
     expect(page.locator("#plan .room")).to_have_count(2)
     expect(page.locator("#plan-name")).to_have_text(name)
-    page.get_by_role("button", name="Cancel").click()
-    expect(page.locator("#plan-error")).to_be_hidden()
     expect(page.locator("#import-form")).to_be_empty()
+    # The error goes with the next thing that works.
+    page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+    expect(page.locator("#plan-error")).to_be_hidden()
+
+
+def test_huge_picture_is_refused_before_its_scale_is_asked(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    Image.new("1", (8000, 5001), 1).save(tmp_path / "huge.png")
+    page.locator("#plan-file").set_input_files(tmp_path / "huge.png")
+    expect(page.locator("#plan-error")).to_contain_text("8000 × 5001 = 40008000 pixels; the limit is 40000000")
+    expect(page.locator("#plan-error")).to_contain_text("LALALOC_MAX_PLAN_PIXELS")
+    expect(page.locator("#import-form")).to_be_empty()
+    _scan().save(tmp_path / "scan.png")
+    page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
+    expect(page.locator("#import-form")).to_contain_text("Set the scale")
+    expect(page.locator("#plan-error")).to_be_hidden()
 
 
 def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
@@ -263,7 +279,10 @@ def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, t
 def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True) as client:
         store = Store(database_of(tmp_path))
-        secret = make_key(store)
+        secret, old = make_key(store), new_secret()
+        expired = key_text(
+            store.keys.create("ours", "old", hash_of(old), EVERYTHING, lifetime=timedelta(seconds=-60)).id, old
+        )
         store.close()
         for visited in visit(browser, client):
             page = visited.open()
@@ -273,6 +292,9 @@ def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of:
             page.locator("#key-field").fill("lalaloc_wrong")
             page.keyboard.press("Enter")
             expect(page.locator("#key-why")).to_contain_text("This key is not valid")
+            page.locator("#key-field").fill(expired)
+            page.keyboard.press("Enter")
+            expect(page.locator("#key-why")).to_contain_text(re.compile(r"expired on \d+ \w+ \d{4}"))
             page.locator("#key-field").fill(secret)
             page.keyboard.press("Enter")
             expect(dialog).to_be_hidden()
@@ -324,6 +346,26 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
             page.goto("about:blank")
             page.goto(f"{link[:-32]}{'0' * 32}")
             expect(page.locator("#plan-error")).to_contain_text("no answer is kept")
+
+
+def test_link_holds_an_answer_that_the_service_does_not_keep(desktop: Visit, phone: Visit) -> None:
+    page = desktop.open_example()
+    desktop.find()
+    where = page.locator("#answer .where").inner_text()
+    page.locator("#copy-link").click()
+    expect(page.locator("#copied")).to_contain_text("#answer-data=")
+    link = page.locator("#copied").inner_text()
+    assert len(link) < 8000
+    other = phone.page
+    asked: list[str] = []
+    other.on("request", lambda request: asked.append(request.url))
+    other.goto(link)
+    expect(other.locator("#answer .where")).to_have_text(where)
+    expect(other.locator("#answer-body")).to_contain_text("did not compute it again")
+    assert not [url for url in asked if "/localise" in url]
+    other.goto("about:blank")
+    other.goto(link[:-40])
+    expect(other.locator("#plan-error")).to_contain_text("damaged or incomplete")
 
 
 def test_photographed_rooms_are_an_example(desktop: Visit) -> None:

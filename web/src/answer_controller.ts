@@ -2,13 +2,14 @@
 
 import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
+import { captionWords } from "./answer_words";
 import { api } from "./api";
 import { device } from "./device/device";
 import { byId, scrollTo } from "./dom";
 import { hideGuide } from "./guide";
 import { HintForm } from "./hints";
 import { layoutLines, roomAt } from "./layout";
-import { clearError, showError } from "./notices";
+import { clearError, clearErrors, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
@@ -139,7 +140,12 @@ export class AnswerController {
     this.panorama.setView(photo === null ? null : (answer?.view ?? null));
     showAnswer(answer, photo, {
       select: (index) => this.select(index),
-      save: (answered) => savePicture(answered, this.fields),
+      save: async (shown, answered) => {
+        clearError(this.error, this.fields);
+        await savePicture(answered.file.name, this.panorama.toCanvas(), this.scene.svg, captionWords(shown)).catch(
+          (error: unknown) => showError(this.error, error),
+        );
+      },
     });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
     this.draw();
@@ -223,6 +229,7 @@ export class AnswerController {
       else await askTogether(place, group, signal);
       // The user may have chosen another plan in the meantime.
       if (signal.aborted || photo.answer === null) return;
+      clearErrors();
       const { floorplan_id, floorplan_revision } = photo.answer;
       if (floorplan_revision !== undefined && floorplan_revision !== this.scene.plan?.revision)
         await this.actions.showPlan(floorplan_id, floorplan_revision);

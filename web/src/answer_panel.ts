@@ -1,5 +1,6 @@
 /** Answer as text: place, confidence, other candidates, timings, and code for the same query. */
 
+import { linkTo } from "./answer_link";
 import {
   accuracyWords,
   adviceWords,
@@ -14,7 +15,7 @@ import {
   viewWords,
 } from "./answer_words";
 import { button, byId, h, show } from "./dom";
-import { say } from "./notices";
+import { say, showError } from "./notices";
 import type { Photo } from "./photos";
 import { type Place, placesOf, remainder } from "./places";
 import { plainWords } from "./plain_words";
@@ -30,7 +31,7 @@ export interface AnswerActions {
   /** Move the marker to a candidate. */
   select: (index: number) => void;
   /** Save the answer to a photograph as a picture. */
-  save: (photo: Photo) => Promise<void>;
+  save: (answer: Answer, photo: Photo) => Promise<void>;
 }
 
 /** Show an answer; null removes the previous one. */
@@ -247,27 +248,33 @@ function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): 
       photo?.asked.fields ??
       (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
   const asked = { fields, files: files.length > 0 ? files : ["photo.jpg"], onDevice };
-  const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
   return h(
     "div",
     { class: "sharing" },
     button("Copy as curl", () => void copy(curlSnippet(asked), "curl command"), { id: "copy-curl" }),
     button("Copy as Python", () => void copy(pythonSnippet(asked), "Python code"), { id: "copy-python" }),
-    // The service draws answers to single photographs in single plans and does not store photographs.
     photo !== null &&
-      answer.venue_id == null &&
-      answer.together === undefined &&
-      button("Save picture", () => void save(photo), {
+      button("Save picture", () => void save(answer, photo), {
         id: "save-picture",
         title: "The photograph with the layout, and the plan with the place, as PNG",
       }),
-    link !== null &&
-      button("Copy link", () => void copy(link, "link"), {
-        id: "copy-link",
-        title: "Opens this answer again while the service stores it",
-      }),
+    button("Copy link", () => void copyLink(answer), {
+      id: "copy-link",
+      title:
+        answer.answer_id == null
+          ? "The link contains this answer without the photograph; it opens as long as the plan is stored"
+          : "Opens this answer again while the service stores it",
+    }),
     h("pre", { class: "copied", id: "copied", tabindex: 0, hidden: true, "aria-label": "Copied text" }),
   );
+}
+
+async function copyLink(answer: Answer): Promise<void> {
+  try {
+    await copy(await linkTo(answer), "link");
+  } catch (error) {
+    showError(byId("photo-error"), error);
+  }
 }
 
 async function copy(text: string, name: string): Promise<void> {

@@ -26,6 +26,19 @@ export function accuracyWords(answer: Answer): string | null {
   return radius < 1 ? `± ${Math.max(1, Math.round(100 * radius))} cm` : `± ${radius.toFixed(1)} m`;
 }
 
+/** Return an answer in two lines, for a picture of it. */
+export function captionWords(answer: Answer): string[] {
+  const { x_m, y_m } = answer.position,
+    accuracy = accuracyWords(answer);
+  const place = `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`;
+  return [
+    `${answer.room}: ${place}, heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}`,
+    answer.confidence === null
+      ? confidenceWords(null)
+      : `${confidenceWords(answer.confidence)}; ${percent(answer.confidence)} probability of an error below 1 m`,
+  ];
+}
+
 /** Return a heading with its 95 % interval. */
 export function headingWords(headingDeg: number, deviationDeg: number | null): string {
   const spread = deviationDeg === null ? 0 : normal95(deviationDeg);

@@ -1,6 +1,6 @@
 /** Connection of the pages to their service: the client of `clients/typescript`, with the API key of this tab. */
 
-import { Client } from "../../clients/typescript/src/index";
+import { Client, type ServiceError } from "../../clients/typescript/src/index";
 
 export { ServiceError } from "../../clients/typescript/src/index";
 
@@ -13,7 +13,7 @@ export const key = {
   remove: (): void => sessionStorage.removeItem(KEY),
 };
 
-type AskForKey = () => Promise<boolean>;
+type AskForKey = (failure: ServiceError) => Promise<boolean>;
 let askForKey: AskForKey = async () => false;
 
 /** Register the dialog that asks for a key; its promise is false if the user gives none. */
@@ -22,7 +22,12 @@ export function onKeyNeeded(ask: AskForKey): void {
 }
 
 // A user waits for each request, so overload is reported early.
-export const api = new Client({ apiKey: key.get, onUnauthenticated: () => askForKey(), attempts: 3, retryMs: 10_000 });
+export const api = new Client({
+  apiKey: key.get,
+  onUnauthenticated: (failure) => askForKey(failure),
+  attempts: 3,
+  retryMs: 10_000,
+});
 
 /** Send a request; after 401, send it again with the key that the user gives. */
 export const request: Client["request"] = (path, init) => api.request(path, init);

@@ -1,13 +1,14 @@
 /** Page at /: one plan or venue, photographs, and where they were taken. */
 
 import { AnswerController } from "./answer_controller";
+import { linkedAnswer } from "./answer_link";
 import { api } from "./api";
 import { byId, named } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
-import { clearError, InputError, showError } from "./notices";
+import { clearError, clearErrors, InputError, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
@@ -98,12 +99,13 @@ class Page {
 
   /** Show the answer or the session that the address names, if any. */
   private async open(): Promise<boolean> {
-    const id = named("answer");
-    if (id === null) return this.session.follow(named("session"));
+    const id = named("answer"),
+      packed = named("answer-data");
+    if (id === null && packed === null) return this.session.follow(named("session"));
     this.answers.cancelQuery();
     clearError(byId("plan-error"));
     try {
-      const answer = await api.answer(id);
+      const answer = packed === null ? await api.answer(id!) : await linkedAnswer(packed);
       if (answer.venue_id != null) await this.venues.choose(answer.venue_id, null);
       else this.venues.leave();
       await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
@@ -116,6 +118,7 @@ class Page {
   }
 
   private onExample(example: PlanDocument): void {
+    clearErrors();
     this.scene.setPlan(null, example);
     showCaption(null, example);
     this.answers.offerHints();
@@ -140,9 +143,11 @@ class Page {
   private onPlan(plan: Plan | null): void {
     const before = this.scene.plan;
     if (plan === null) this.answers.cancelQuery();
+    const isOther = plan !== null && plan.revision !== before?.revision;
+    if (isOther && !this.editor.isOpen) clearErrors();
     this.scene.setPlan(plan);
     showCaption(plan);
-    if (plan !== null && plan.revision === before?.revision) return;
+    if (plan !== null && !isOther) return;
     if (plan !== null && this.venues.current !== null) this.venues.mark(plan.id);
     else this.answers.forget(plan === null || (before !== null && before.id !== plan.id));
     this.draw();

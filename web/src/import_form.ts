@@ -1,7 +1,8 @@
 /** Form for facts that an uploaded file does not state: unit, scale, storey or page. */
 
+import { api } from "./api";
 import { button, byId, h, show } from "./dom";
-import { showError } from "./notices";
+import { InputError, showError } from "./notices";
 import { PictureScale } from "./picture_scale";
 
 const UNITS = ["m", "cm", "mm", "in", "ft"];
@@ -17,6 +18,34 @@ const FIELDS: [string, string, string][] = [
 // The other fields do not apply to pictures.
 const OF_PICTURES = ["metres_per_pixel", "scale", "ceiling_height_m"];
 const PICTURES = /^image\/(png|jpeg)$/;
+
+// Endings of files that can be read, perhaps with other options.
+const PLAN_FILES = /\.(dxf|dwg|svg|pdf|ifc|ifczip|zip|json|geojson|osm|xml|gml|ya?ml|pgm|png|jpe?g)$/i;
+
+/** Return whether options can help to read a file: no option makes a plan of a text. */
+export const hasOptions = (file: File): boolean => PLAN_FILES.test(file.name);
+
+/** Refuse a picture with more pixels than the service reads, before the user measures it. */
+export async function checkPixels(file: File): Promise<void> {
+  const picture = new Image();
+  picture.src = URL.createObjectURL(file);
+  try {
+    await new Promise((resolve) => {
+      picture.onload = picture.onerror = resolve;
+    });
+  } finally {
+    URL.revokeObjectURL(picture.src);
+  }
+  // The browser can show fewer pictures than the service reads, and the limit is the service's to enforce.
+  const { naturalWidth: width, naturalHeight: height } = picture;
+  const limits = width > 0 ? await api.limits().catch(() => null) : null;
+  if (limits === null || width * height <= limits.max_plan_pixels) return;
+  const share = Math.floor(100 * Math.sqrt(limits.max_plan_pixels / (width * height)));
+  throw new InputError(
+    `“${file.name}” has ${width} × ${height} = ${width * height} pixels; the limit is ${limits.max_plan_pixels} ` +
+      `(LALALOC_MAX_PLAN_PIXELS). Make it smaller, to ${share} % of its width.`,
+  );
+}
 
 export class ImportForm {
   private readonly inputs = new Map<string, HTMLInputElement | HTMLSelectElement>();

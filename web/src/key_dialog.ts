@@ -47,9 +47,9 @@ export function connectKeyDialog(): void {
     if (!dialog.open) dialog.showModal();
     field.focus();
   };
-  onKeyNeeded(() => {
+  onKeyNeeded(({ detail }) => {
     opener.dataset.needed = "yes";
-    open(key.get() === null ? "This service requires an API key." : "This key is not valid. Enter another one.");
+    open(key.get() === null ? "This service requires an API key." : refusalWords(detail));
     return new Promise((resolve) => waiting.push(resolve));
   });
   opener.addEventListener("click", () => open("A new key replaces the current one."));
@@ -70,4 +70,12 @@ export function connectKeyDialog(): void {
     dialog.returnValue = "";
   });
   showState();
+}
+
+/** Say why a key was refused: the service tells its holder when it expired. */
+function refusalWords(detail: string): string {
+  const expired = /expired at (\S+Z)/.exec(detail)?.[1];
+  if (expired === undefined) return "This key is not valid. Enter another one.";
+  const date = new Date(expired).toLocaleString("en-GB", { dateStyle: "long", timeStyle: "short" });
+  return `This key expired on ${date}. Enter its successor, or ask the operator for one.`;
 }

@@ -60,6 +60,14 @@ export function clearError(place: HTMLElement, fields: Record<string, HTMLElemen
   }
 }
 
+/** Remove all errors after something worked: they are about what the user did before. */
+export function clearErrors(): void {
+  for (const place of document.querySelectorAll<HTMLElement>(".error:not([hidden])")) {
+    const marked = document.querySelectorAll<HTMLElement>(`[aria-describedby="${place.id}"]`);
+    clearError(place, Object.fromEntries([...marked].entries()));
+  }
+}
+
 /** Return plain words for frequent errors; the service's own messages are written for developers. */
 function plainText(failure: ServiceError | null): string | null {
   if (failure === null) return null;

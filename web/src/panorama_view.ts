@@ -21,6 +21,8 @@ const STROKES: Record<"edge" | OpeningKind, { variable: string; dash: number[]; 
 const TURN_BY = radians(10);
 // Photo sphere metadata stand before the pixels.
 const METADATA_BYTES = 2 ** 18;
+// Pixels of the longer side of a saved photograph.
+const SAVED_PIXELS = 2400;
 
 export class PanoramaView {
   private readonly canvas = h("canvas", { class: "overlay", "aria-hidden": "true" });
@@ -124,6 +126,20 @@ export class PanoramaView {
     else this.draw();
   }
 
+  /** Draw the whole photograph with the layout; null if the browser cannot show it. */
+  toCanvas(): HTMLCanvasElement | null {
+    const { naturalWidth, naturalHeight } = this.picture;
+    if (this.url === null || naturalWidth === 0 || this.stage.classList.contains("empty")) return null;
+    const share = Math.min(1, SAVED_PIXELS / Math.max(naturalWidth, naturalHeight));
+    const size: Size = { width: Math.round(share * naturalWidth), height: Math.round(share * naturalHeight) };
+    const canvas = h("canvas", { width: size.width, height: size.height }),
+      context = canvas.getContext("2d")!;
+    context.drawImage(this.picture, 0, 0, size.width, size.height);
+    const shape = this.shape === "flat" ? "flat" : "whole";
+    if (this.shown) this.stroke(context, shape, size, Math.max(1, size.width / 800));
+    return canvas;
+  }
+
   private setShape(shape: Shape): void {
     this.shape = shape;
     void this.refresh();
@@ -193,15 +209,20 @@ export class PanoramaView {
       const { width, height } = this.flatSize(size);
       context.translate(0.5 * (size.width - width), 0.5 * (size.height - height));
     }
+    this.stroke(context, this.shape, size);
+  }
+
+  /** Stroke the lines of the layout, `scale` times as thick as on the screen. */
+  private stroke(context: CanvasRenderingContext2D, shape: Shape, size: Size, scale = 1): void {
     context.lineJoin = context.lineCap = "round";
     const style = getComputedStyle(this.canvas);
-    const paths = this.lines.map((line) => ({ line, paths: this.projected(line, gaze, size) }));
+    const paths = this.lines.map((line) => ({ line, paths: this.projected(line, shape, size) }));
     for (const halo of [true, false]) {
       for (const { line, paths: pieces } of paths) {
         const { variable, dash } = STROKES[line.kind];
         context.strokeStyle = halo ? "rgba(0, 0, 0, 0.55)" : style.getPropertyValue(variable).trim();
-        context.lineWidth = halo ? 5 : 2.5;
-        context.setLineDash(halo ? [] : dash);
+        context.lineWidth = scale * (halo ? 5 : 2.5);
+        context.setLineDash(halo ? [] : dash.map((length) => scale * length));
         for (const piece of pieces) {
           context.beginPath();
           piece.forEach(([x, y], index) => (index === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
@@ -211,11 +232,10 @@ export class PanoramaView {
     }
   }
 
-  private projected(line: LayoutLine, gaze: Gaze, size: Size): Point[][] {
+  private projected(line: LayoutLine, shape: Shape, size: Size): Point[][] {
     const relative = line.points.map(([azimuth, elevation]): Point => [azimuth - this.heading, elevation]);
-    if (this.shape === "flat")
-      return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
-    return this.shape === "around" ? perspective([relative], gaze, size) : equirectangular([relative], size);
+    if (shape === "flat") return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
+    return shape === "around" ? perspective([relative], this.gaze(), size) : equirectangular([relative], size);
   }
 
   /** Return the size of a flat photograph, which the stage contains. */

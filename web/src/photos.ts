@@ -3,7 +3,7 @@
 import { Compass } from "./compass";
 import { byId, h, show } from "./dom";
 import { NO_HINTS } from "./hints";
-import { clearError, InputError, showError } from "./notices";
+import { clearErrors, InputError, showError } from "./notices";
 import type { Answer, Hints, Together } from "./types";
 
 export interface Photo {
@@ -93,11 +93,7 @@ export class Photos {
   /** Add pictures and choose the first of them. */
   add(files: File[]): void {
     const rejected = files.filter((file) => !isPicture(file));
-    clearError(this.error);
-    if (rejected.length > 0) {
-      const names = rejected.map((file) => `“${file.name}”`).join(", ");
-      showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
-    }
+    clearErrors();
     const added = files
       .filter(isPicture)
       .map((file): Photo => ({
@@ -111,6 +107,9 @@ export class Photos {
     if (added.length > 0) this.forgetGroup();
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
+    if (rejected.length === 0) return;
+    const names = rejected.map((file) => `“${file.name}”`).join(", ");
+    showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
   }
 
   /** Choose a photograph, or none. */

@@ -1,10 +1,7 @@
-/** Pictures to save: the map as it is shown, and the answer to a photograph. */
+/** Pictures to save: the map as it is shown, and an answer with its photograph. */
 
-import { api } from "./api";
-import { device } from "./device/device";
 import { byId, download } from "./dom";
 import { clearError, InputError, showError } from "./notices";
-import type { Photo } from "./photos";
 
 // Pixels of the longer side, and properties that style sheets set.
 const PIXELS = 2400;
@@ -36,21 +33,45 @@ export function connectSaveMap(map: SVGSVGElement, name: () => string): void {
   });
 }
 
-/** Save the answer to a photograph, drawn by the service. */
-export async function savePicture(photo: Photo, fields: Record<string, HTMLElement>): Promise<void> {
-  clearError(byId("photo-error"), fields);
-  try {
-    const picture = await device.send([photo.file], photo.asked.fields, ([sent], own) => api.picture(own, sent!));
-    download(picture, `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
-  } catch (error) {
-    showError(byId("photo-error"), error, fields);
-  }
+/** Save an answer as the page shows it: the photograph with the layout, null without one, the map, and a caption. */
+export async function savePicture(
+  fileName: string,
+  photo: HTMLCanvasElement | null,
+  map: SVGSVGElement,
+  caption: string[],
+): Promise<void> {
+  const below = await mapCanvas(map, PIXELS / 2),
+    width = Math.max(photo?.width ?? 0, below.width);
+  const parts = photo === null ? [below] : [photo, below];
+  const heights = parts.map((part) => Math.round((part.height * width) / part.width));
+  const line = Math.round(width / 40);
+  const canvas = document.createElement("canvas");
+  canvas.width = width;
+  canvas.height = heights.reduce((sum, height) => sum + height, 0) + Math.round((caption.length + 0.6) * 1.4 * line);
+  const context = canvas.getContext("2d")!,
+    { color, fontFamily } = getComputedStyle(document.documentElement);
+  context.fillStyle = getComputedStyle(map.parentElement!).backgroundColor;
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  let y = 0;
+  parts.forEach((part, index) => {
+    context.drawImage(part, 0, y, width, heights[index]!);
+    y += heights[index]!;
+  });
+  context.fillStyle = color;
+  context.font = `${line}px ${fontFamily}`;
+  caption.forEach((text, index) => context.fillText(text, line, y + 1.4 * line * (index + 1), width - 2 * line));
+  await save(canvas, `lalaloc-${fileName.replace(/\.[^.]*$/, "")}.png`);
 }
 
 /** Save the visible part of the map as PNG. */
 async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
+  await save(await mapCanvas(map, PIXELS), `${name.replace(/[^\p{L}\p{N} _-]/gu, "").trim() || "plan"}.png`);
+}
+
+/** Draw the visible part of the map, `pixels` at its longer side. */
+async function mapCanvas(map: SVGSVGElement, pixels: number): Promise<HTMLCanvasElement> {
   const { width, height } = map.getBoundingClientRect(),
-    scale = PIXELS / Math.max(width, height);
+    scale = pixels / Math.max(width, height);
   const picture = new Image();
   picture.src = URL.createObjectURL(new Blob([standalone(map, scale)], { type: "image/svg+xml" }));
   try {
@@ -67,9 +88,13 @@ async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
   context.fillStyle = getComputedStyle(map.parentElement!).backgroundColor;
   context.fillRect(0, 0, canvas.width, canvas.height);
   context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+  return canvas;
+}
+
+async function save(canvas: HTMLCanvasElement, name: string): Promise<void> {
   const content = await new Promise<Blob | null>((done) => canvas.toBlob(done));
-  if (content === null) throw new InputError("The browser cannot save the map as a picture.");
-  download(content, `${name.replace(/[^\p{L}\p{N} _-]/gu, "").trim() || "plan"}.png`);
+  if (content === null) throw new InputError("The browser cannot save this as a picture.");
+  download(content, name);
 }
 
 /** Return the map as SVG that needs no style sheet, larger than on the screen by `scale`. */

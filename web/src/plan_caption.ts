@@ -29,7 +29,10 @@ export function showCaption(plan: Plan | null, example: PlanDocument | null = nu
 /** Show the warnings about a plan; the rest of a long list opens with a click. */
 function showWarnings(plan: Plan | null): void {
   const report = plan?.import_report;
-  const texts = [...(report?.is_draft ? [DRAFT] : []), ...(plan?.warnings ?? []), ...(report?.unsure ?? [])];
+  // An assumed ceiling is a warning of the plan and a guess of the import.
+  const texts = [
+    ...new Set([...(report?.is_draft ? [DRAFT] : []), ...(plan?.warnings ?? []), ...(report?.unsure ?? [])]),
+  ];
   const items = texts.map((text) => h("li", {}, plainWords(text)));
   const rest = items.splice(MAX_WARNINGS);
   show(

@@ -4,7 +4,7 @@ import { api, ServiceError } from "./api";
 import { button, byId, h, show } from "./dom";
 import { followPlan } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
-import { ImportForm } from "./import_form";
+import { checkPixels, hasOptions, ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
 import { acceptDrops } from "./photos";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
@@ -67,10 +67,10 @@ export class Plans {
     input.addEventListener("change", () => {
       const file = input.files?.[0];
       input.value = "";
-      if (file !== undefined) this.begin(file);
+      if (file !== undefined) void this.begin(file);
     });
     acceptDrops(byId("plan-panel"), (files) => {
-      if (files[0] !== undefined) this.begin(files[0]);
+      if (files[0] !== undefined) void this.begin(files[0]);
     });
   }
 
@@ -143,13 +143,22 @@ export class Plans {
     if (plan !== null && plan.status === "preparing") void this.follow(plan);
   }
 
-  /** Pictures seldom state their scale, so the form asks for it first. */
-  private begin(file: File): void {
+  /** Pictures seldom state their scale, so the form asks for it first, unless the service would refuse the file. */
+  private async begin(file: File): Promise<void> {
     this.actions.started();
-    this.discardPending();
+    const request = this.discardPending(),
+      isPicture = PICTURES.test(file.type);
     clearError(this.error, this.importing.fields);
-    if (PICTURES.test(file.type)) this.importing.ask(file, true);
-    else void this.upload(file);
+    try {
+      if (isPicture) await checkPixels(file);
+    } catch (error) {
+      this.importing.close();
+      showError(this.error, error);
+      return;
+    }
+    if (request !== this.requests) return;
+    if (isPicture) this.importing.ask(file, true);
+    else await this.upload(file);
   }
 
   private cancelImport(): void {
@@ -177,7 +186,7 @@ export class Plans {
       say(`“${plan.name}” is stored.`);
     } catch (error) {
       const levels = error instanceof ServiceError ? error.levels : [];
-      this.importing.ask(file, true, levels);
+      if (levels.length > 0 || hasOptions(file)) this.importing.ask(file, true, levels);
       if (levels.length === 0 && !this.importing.askForScale(error))
         showError(this.error, error, this.importing.fields);
     } finally {

@@ -32,8 +32,8 @@ export interface ClientOptions {
   attempts?: number;
   /** Time after which no further attempt begins. Default: 60 s. */
   retryMs?: number;
-  /** Called after 401; the request is sent again with the current key if it returns true. */
-  onUnauthenticated?: () => Promise<boolean>;
+  /** Called after 401 with its error; the request is sent again with the current key if it returns true. */
+  onUnauthenticated?: (failure: ServiceError) => Promise<boolean>;
 }
 
 export interface CallOptions {
@@ -56,7 +56,7 @@ export class Client {
       const response = await this.send(path, init, sent);
       if (response.ok || response.status === 304) return response;
       const failure = await ServiceError.of(response);
-      if (response.status === 401 && (await this.hasNewKey(sent))) continue;
+      if (response.status === 401 && (await this.hasNewKey(sent, failure))) continue;
       const waitMs = this.waitMs(failure, attempt++, Date.now() - begin);
       if (waitMs === null) throw failure;
       await pause(waitMs, init.signal);
@@ -135,9 +135,9 @@ export class Client {
   private key = (): string | null =>
     typeof this.options.apiKey === "function" ? this.options.apiKey() : (this.options.apiKey ?? null);
 
-  private async hasNewKey(sent: string | null): Promise<boolean> {
+  private async hasNewKey(sent: string | null, failure: ServiceError): Promise<boolean> {
     const ask = this.options.onUnauthenticated;
-    return ask !== undefined && ((this.key() !== null && this.key() !== sent) || ask());
+    return ask !== undefined && ((this.key() !== null && this.key() !== sent) || ask(failure));
   }
 
   private async send(path: string, init: RequestInit & CallOptions, key: string | null): Promise<Response> {

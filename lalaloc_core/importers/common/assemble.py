@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
 from lalaloc_core.importers.common.completeness import estimate_trust
 from lalaloc_core.importers.common.crossings import check_network, distinct
 from lalaloc_core.importers.common.fixtures import place_fixtures, type_rooms
@@ -37,7 +37,6 @@ from lalaloc_core.importers.common.sketch import (
 )
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
-DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 # Tolerances (m) tried in turn for outlines with more vertices than allowed, such as curved walls.
@@ -121,10 +120,12 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
-    document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
     fixtures = place_fixtures([_shift_fixture(fixture, shift) for fixture in sketch.fixtures], rooms, builder)
     rooms = type_rooms(rooms, fixtures, builder)
-    document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, shift) for room in rooms]
+    ceiling_m = _usual_ceiling(rooms, options, builder)
+    if ceiling_m is not None:
+        document["ceiling_height_m"] = ceiling_m
+    document["rooms"] = [_room(room, ceiling_m, sketch, shift) for room in rooms]
     if placed.openings:
         document["openings"] = [_opening(opening) for opening in placed.openings]
     if fixtures:
@@ -334,19 +335,26 @@ def _shift_fixture(fixture: SketchedFixture, shift: tuple[float, float]) -> Sket
     return replace(fixture, shape=affinity.translate(fixture.shape, *shift))
 
 
-def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:
+def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float | None:
+    """Return the ceiling height of rooms without their own; None if no height is known, so that plans assume one."""
     known = [room.ceiling_height_m for room in rooms if room.ceiling_height_m is not None]
     if options.ceiling_height_m is not None:
         return options.ceiling_height_m
     if known:
-        return round(float(np.median(known)), 4)
+        usual_m = round(float(np.median(known)), 4)
+        if len(known) < len(rooms):
+            builder.unsure.append(
+                f"{len(rooms) - len(known)} of {len(rooms)} rooms give no ceiling height; {usual_m:g} m, the median of "
+                "the others, is assumed (set ceiling_height_m)"
+            )
+        return usual_m
     builder.unsure.append(
-        f"the file gives no ceiling height; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
+        f"no ceiling height is given; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
     )
-    return DEFAULT_CEILING_HEIGHT_M
+    return None
 
 
-def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
+def _room(room: SketchedRoom, ceiling_m: float | None, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
     entry: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
     if room.name:
         entry = {"name": room.name} | entry
@@ -358,7 +366,7 @@ def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, shift: tuple[flo
     inner_walls = [wall for wall in walls if room.shape.contains(wall)]
     if inner_walls:
         entry["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
-    if room.ceiling_height_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
+    if room.ceiling_height_m is not None and ceiling_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
         entry["ceiling_height_m"] = round(room.ceiling_height_m, 4)
     return entry
 

@@ -45,6 +45,7 @@ class ImportReport:
         unsure: guesses and their reasons.
         no_room: outlines (m) of the largest areas inside the drawn walls that became no room.
         opening_trust: trust in each kind of openings; empty if the file states it.
+        turned_deg: clockwise rotation about its centre that straightened a picture.
     """
 
     format: str
@@ -57,6 +58,7 @@ class ImportReport:
     unsure: tuple[str, ...] = ()
     no_room: tuple[Outline, ...] = ()
     opening_trust: tuple[OpeningTrust, ...] = ()
+    turned_deg: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -67,7 +69,8 @@ class ImportReport:
 class ReportBuilder:
     """Report under construction while a file is read.
 
-    The first four fields are those of `ImportReport`; `no_room` are areas in metres inside walls, largest first.
+    The first four fields and `turned_deg` are those of `ImportReport`; `no_room` are areas in metres inside walls, the
+    largest first.
     """
 
     format: str = ""
@@ -80,6 +83,7 @@ class ReportBuilder:
     uses: Counter[tuple[str, str]] = field(default_factory=Counter)
     no_room: list[shapely.Polygon] = field(default_factory=list)
     opening_trust: tuple[OpeningTrust, ...] = ()
+    turned_deg: float = 0.0
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -99,6 +103,7 @@ class ReportBuilder:
             unsure=_limit_lines(self.unsure),
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
             opening_trust=self.opening_trust,
+            turned_deg=self.turned_deg,
         )
 
 

@@ -169,7 +169,8 @@ def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dic
     for number, room in enumerate(document["rooms"]):
         properties = {"feature_type": "unit", "name": room.get("name", f"room {number + 1}")}
         properties |= {key: room[key] for key in ("type", "ceiling_height_m") if key in room and room[key] != "unknown"}
-        properties.setdefault("ceiling_height_m", document.get("ceiling_height_m"))
+        if (ceiling_m := document.get("ceiling_height_m")) is not None:
+            properties.setdefault("ceiling_height_m", ceiling_m)
         rings = projector.polygon([room["polygon"], *room.get("holes", ())])
         feature = _to_feature("Polygon", rings, properties)
         if "id" in room:

@@ -31,7 +31,7 @@ class Ink:
         gray: grey picture with white paper; rows from the top.
         warmth: 128 without colour, higher towards red, lower towards blue; None for a grey picture.
         lines: `mask`, and faint lines that are darker than their surroundings.
-        skew_deg: clockwise rotation that straightened the picture.
+        skew_deg: counter-clockwise rotation about the centre that straightened the picture.
         size: rows and columns of the picture before the rotation, at this resolution.
     """
 

@@ -219,6 +219,7 @@ def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: Repor
     style = "dark and thick" if reading.is_dark else "drawn with two lines"
     builder.notes.append(f"walls are {style}, usually {reading.walls.thickness_m:.2f} m thick")
     if ink.skew_deg:
+        builder.turned_deg = -ink.skew_deg
         builder.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to straighten it")
     if metres_per_pixel > _COARSE_M:
         builder.unsure.append(

@@ -141,6 +141,11 @@ export function changeRoom(plan: PlanDocument, index: number, change: Partial<Ro
   return withRoom(plan, index, (room) => ({ ...room, ...change }));
 }
 
+/** Give all rooms the ceiling height of the plan. */
+export function withOneCeiling(plan: PlanDocument): PlanDocument {
+  return { ...plan, rooms: plan.rooms.map(({ ceiling_height_m: _, ...room }) => room) };
+}
+
 export function removeRoom(plan: PlanDocument, index: number): PlanDocument {
   const removed = plan.rooms[index]?.id;
   const openings = (plan.openings ?? []).map((opening) =>

@@ -10,6 +10,7 @@ import { setFormPlan, showForm } from "./forms";
 import { Handles, type Selection } from "./handles";
 import { History } from "./history";
 import { type Tool, Tools } from "./tools";
+import { TracedPictures } from "./traced_pictures";
 import { Underlay } from "./underlay";
 
 export interface EditorHost {
@@ -22,10 +23,10 @@ export interface EditorHost {
   ended: (stored: Plan | null) => void;
 }
 
-const EMPTY: PlanDocument = { name: "New plan", ceiling_height_m: 2.5, rooms: [], openings: [] };
-// Note of the importer that its coordinates are not those of the picture.
-const TURNED = /\b(turned|rotated)\b/;
+const EMPTY: PlanDocument = { name: "New plan", rooms: [], openings: [] };
 const NEW_ROOM_M: Point = [4, 3];
+// Movement of the pointer from which on a click is a drag.
+const CLICK_PX = 4;
 const TOOLS: [Tool, string][] = [
   ["select", "Select"],
   ["room", "Draw a room"],
@@ -49,6 +50,7 @@ export class Editor {
   private base: Plan | null = null;
   private selection: Selection = { kind: "none" };
   private measured = 0;
+  private readonly traced = new TracedPictures();
 
   constructor(
     svg: SVGSVGElement,
@@ -73,6 +75,7 @@ export class Editor {
         this.hint.textContent = text;
       },
     });
+    svg.addEventListener("pointerdown", (event) => this.onGround(event));
     addEventListener("keydown", (event) => this.onKey(event));
     addEventListener("beforeunload", (event) => {
       if (this.isChanged) event.preventDefault();
@@ -107,19 +110,12 @@ export class Editor {
     if (plan !== null) void this.layOriginal(plan);
   }
 
-  /** Lay the picture that a plan was read from under it, unless the importer turned it. */
+  /** Lay the picture under a plan that it was drawn over before, or read from. */
   private async layOriginal(plan: Plan): Promise<void> {
-    const report = plan.import_report;
-    if (
-      report?.format !== "picture" ||
-      report.metres_per_unit == null ||
-      report.notes.some((note) => TURNED.test(note))
-    )
-      return;
     try {
-      const original = await api.original(plan.id);
-      if (this.base?.revision !== plan.revision) return;
-      await this.underlay.lay(original, plan.name, report.metres_per_unit);
+      const traced = await this.traced.of(plan);
+      if (traced === null || this.base?.revision !== plan.revision) return;
+      await this.underlay.lay(traced);
       this.drawBar();
     } catch {
       // The picture is optional.
@@ -154,6 +150,7 @@ export class Editor {
 
   private close(stored: Plan | null): void {
     if (stored !== null) say(`“${stored.name}” is stored, revision ${stored.revision_number}.`);
+    if (stored !== null) this.traced.keep(stored.id, this.underlay.traced);
     this.history = null;
     this.underlay.remove();
     this.tools.choose("select");
@@ -255,7 +252,7 @@ export class Editor {
   private async lay(file: File): Promise<void> {
     clearError(this.error);
     try {
-      await this.underlay.lay(file, file.name);
+      await this.underlay.lay({ file, name: file.name });
       const { width, height } = this.underlay.box!;
       this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
       say("Set the scale next: click two points with a known distance.");
@@ -374,7 +371,24 @@ export class Editor {
     );
   }
 
+  /** Show the form of the whole plan after a click beside the rooms; a drag there moves the drawing. */
+  private onGround(event: PointerEvent): void {
+    if (this.history === null || event.defaultPrevented || this.handles.element.contains(event.target as Node)) return;
+    addEventListener(
+      "pointerup",
+      (end) => {
+        const isClick = Math.hypot(end.clientX - event.clientX, end.clientY - event.clientY) < CLICK_PX;
+        if (isClick && this.history !== null) this.select({ kind: "none" });
+      },
+      { once: true },
+    );
+  }
+
   private onKey(event: KeyboardEvent): void {
+    if (this.history !== null && event.key === "Escape" && this.tools.current === "select") {
+      this.select({ kind: "none" });
+      return;
+    }
     if (this.history === null || event.target instanceof HTMLInputElement || !(event.ctrlKey || event.metaKey)) return;
     const key = event.key.toLowerCase();
     if (key === "z") this.step(event.shiftKey ? "redo" : "undo");

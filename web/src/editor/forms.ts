@@ -25,6 +25,10 @@ const ROOM_TYPES: RoomType[] = [
   "office",
   "meeting",
 ];
+// Height (m) that the service assumes for plans without one, as a field shows it.
+const ASSUMED = "2.5 assumed";
+// Rooms that a hint names.
+const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
 export interface FormActions {
@@ -54,12 +58,19 @@ export function setFormPlan(plan: PlanDocument): void {
   current = plan;
 }
 
-function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
+function planForm(plan: PlanDocument, { edit }: FormActions): (HTMLElement | null)[] {
   const set = (values: Partial<PlanDocument>): void => edit({ ...current, ...values });
   return [
     h("h3", {}, "The whole plan"),
     text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
-    number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
+    number(
+      "plan-form-ceiling",
+      "Ceiling, m",
+      plan.ceiling_height_m,
+      (value) => set({ ceiling_height_m: value }),
+      ASSUMED,
+    ),
+    ownCeilings(plan, edit),
     number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) =>
       set({ camera_height_m: value ?? undefined }),
     ),
@@ -71,6 +82,22 @@ function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
       `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click an element to change it.`,
     ),
   ];
+}
+
+/** Name the rooms with ceilings of their own, to which the height of the plan does not apply. */
+function ownCeilings({ rooms }: PlanDocument, edit: FormActions["edit"]): HTMLElement | null {
+  const own = rooms.flatMap(({ name, ceiling_height_m: height }, index) =>
+    height == null ? [] : [`${name || `room ${index + 1}`} ${height.toFixed(2)} m`],
+  );
+  if (own.length === 0) return null;
+  const rest = own.length - MAX_NAMED;
+  const named = own.slice(0, MAX_NAMED).join(", ") + (rest > 0 ? ` and ${rest} more` : "");
+  return h(
+    "p",
+    { class: "hint", id: "plan-form-own-ceilings" },
+    `${own.length} of ${rooms.length} rooms have ceilings of their own: ${named}. `,
+    button("Give all rooms the plan’s ceiling", () => edit(change.withOneCeiling(current)), { id: "one-ceiling" }),
+  );
 }
 
 /** Checkboxes for the kinds that are shown completely, whose absence then counts as well. */
@@ -98,11 +125,18 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: FormActio
     h("h3", {}, "Room"),
     text("room-form-name", "Name", room.name ?? "", (name) => set({ name })),
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) => set({ type })),
-    number("room-form-ceiling", "Ceiling, m", room.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
+    number(
+      "room-form-ceiling",
+      "Ceiling, m",
+      room.ceiling_height_m,
+      (value) => set({ ceiling_height_m: value }),
+      current.ceiling_height_m == null ? ASSUMED : `${current.ceiling_height_m} of the plan`,
+    ),
     button("Remove this room", () => {
       select({ kind: "none" });
       edit(change.removeRoom(current, index));
     }),
+    wholePlan(select),
   ];
 }
 
@@ -120,8 +154,13 @@ function openingForm(opening: OpeningDocument, index: number, { edit, select }: 
       select({ kind: "none" });
       edit(change.removeOpening(current, index));
     }),
+    wholePlan(select),
   ];
 }
+
+/** Return the way back to the form of the plan. */
+const wholePlan = (select: FormActions["select"]): HTMLElement =>
+  button("The whole plan", () => select({ kind: "none" }), { id: "whole-plan" });
 
 function field(id: string, label: string, input: HTMLElement): HTMLElement {
   input.id = id;
@@ -139,11 +178,12 @@ function number(
   label: string,
   value: number | null | undefined,
   set: (value: number | null) => void,
+  absent = "unknown",
 ): HTMLElement {
   const input = h("input", {
     type: "number",
     step: "any",
-    placeholder: "unknown",
+    placeholder: absent,
     value: value == null ? null : String(Math.round(value * 1000) / 1000),
   });
   input.addEventListener("change", () => set(input.value.trim() === "" ? null : input.valueAsNumber));

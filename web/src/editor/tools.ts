@@ -19,7 +19,8 @@ export interface ToolActions {
 }
 
 const HINTS: Record<Tool, string> = {
-  select: "Drag corners, walls and openings; double-click a wall for a new corner, a corner to remove it.",
+  select:
+    "Drag corners, walls and openings; double-click a wall for a new corner, a corner to remove it. A click beside the rooms shows the form of the whole plan.",
   room: "Click the corners of the room along the inner faces of its walls; click the first corner again to close the room. Escape cancels.",
   door: "Click a wall where the door is.",
   window: "Click a wall where the window is.",

@@ -6,11 +6,21 @@ import { InputError } from "../notices";
 const FIRST_WIDTH_M = 12;
 const FIRST_SHARE = 0.6;
 
+/** A picture and its place below a plan; without a scale it is 12 m wide. */
+export interface Traced {
+  file: Blob;
+  name: string;
+  metresPerPixel?: number;
+  /** Clockwise rotation about its centre. */
+  turnedDeg?: number;
+}
+
 export class Underlay {
   readonly element = s("g", { class: "underlay" });
   private url: string | null = null;
   private size = { width: 0, height: 0 };
   private metresPerPixel = 0;
+  private laid: Traced | null = null;
   /** Form for the share of the picture that shows through the rooms. */
   readonly slider = h("input", { type: "range", min: 0, max: 1, step: 0.05, value: FIRST_SHARE, id: "see-through" });
 
@@ -24,8 +34,14 @@ export class Underlay {
       : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
   }
 
-  /** Lay a picture under the plan, 12 m wide if its scale is unknown. Rejects if the file is not a picture. */
-  async lay(file: Blob, name: string, metresPerPixel: number | null = null): Promise<void> {
+  /** The picture as it lies, to lay it again. */
+  get traced(): Traced | null {
+    return this.laid && { ...this.laid, metresPerPixel: this.metresPerPixel };
+  }
+
+  /** Lay a picture under the plan. Rejects if the file is not a picture. */
+  async lay(traced: Traced): Promise<void> {
+    const { file, name, metresPerPixel } = traced;
     const url = URL.createObjectURL(file);
     const picture = new Image();
     picture.src = url;
@@ -37,6 +53,7 @@ export class Underlay {
     }
     this.remove();
     this.url = url;
+    this.laid = traced;
     this.size = { width: picture.naturalWidth, height: picture.naturalHeight };
     this.metresPerPixel = metresPerPixel ?? FIRST_WIDTH_M / picture.naturalWidth;
     this.draw();
@@ -49,7 +66,7 @@ export class Underlay {
 
   remove(): void {
     if (this.url !== null) URL.revokeObjectURL(this.url);
-    this.url = null;
+    this.url = this.laid = null;
     show(this.element);
     this.mix();
   }
@@ -72,6 +89,7 @@ export class Underlay {
         width: box.width,
         height: box.height,
         preserveAspectRatio: "none",
+        transform: `rotate(${this.laid?.turnedDeg ?? 0} ${0.5 * box.width} ${-0.5 * box.height})`,
       }),
     );
     this.mix();
