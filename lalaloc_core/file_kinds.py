@@ -20,6 +20,11 @@ _MAGIC = (
     (b"{\\rtf", "an RTF document"),
     (b"AC10", "a DWG drawing"),
     (b"ISO-10303-21;", "an IFC or STEP model"),
+    (b"PXR-USDC", "a USD model"),
+    (b"#usda", "a USD model"),
+    (b"glTF", "a glTF model"),
+    (b"\xff\xfe\xff\x0eS\x00k\x00e\x00t\x00c\x00h\x00U\x00p", "a SketchUp model"),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file, such as a Revit model"),
 )
 HEIC = "a HEIC picture"
 # Bytes 8 to 12 of an ISO media file are its brand; unlisted brands are videos.
@@ -28,6 +33,7 @@ _BRANDS = {
     **dict.fromkeys((b"avif", b"avis"), "an AVIF picture"),
 }
 _GEOJSON = re.compile(rb'"type"\s{0,20}:\s{0,20}"(FeatureCollection|Feature|GeometryCollection|MultiPolygon|Polygon)"')
+_CITY_GML = re.compile(rb"<(?:[A-Za-z]+:)?CityModel[\s>]")
 _HEAD_BYTES = 4096
 
 
@@ -43,4 +49,6 @@ def describe_file(content: bytes) -> str | None:
     head = content[:_HEAD_BYTES]
     if b"<svg" in head:
         return "an SVG drawing"
+    if _CITY_GML.search(head):
+        return "a CityGML model"
     return "GeoJSON" if _GEOJSON.search(head) else None
