@@ -30,6 +30,11 @@ _MAGIC = (
     (b"8BPS", "a Photoshop document"),
     (b"bplist00", _PLACEHOLDER),
     (b"version https://git-lfs.github.com/spec/", "a Git LFS pointer"),
+    (b"PXR-USDC", "a USD model"),
+    (b"#usda", "a USD model"),
+    (b"glTF", "a glTF model"),
+    (b"\xff\xfe\xff\x0eS\x00k\x00e\x00t\x00c\x00h\x00U\x00p", "a SketchUp model"),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file, such as a Revit model"),
 )
 HEIC = "a HEIC picture"
 AVIF = "an AVIF picture"
@@ -52,6 +57,7 @@ _ANY_CODEC = {b"mif1", b"msf1"}
 _GEOJSON = re.compile(rb'"type"\s{0,20}:\s{0,20}"(FeatureCollection|Feature|GeometryCollection|MultiPolygon|Polygon)"')
 _HTML = re.compile(rb"(<\?xml[^>]{0,200}>|<!--.{0,1000}?-->|\s){0,8}<(!doctype html|html|head|body)\b", re.I | re.S)
 _PROPERTY_LIST = re.compile(rb"<!doctype plist|<plist\b", re.I)
+_CITY_GML = re.compile(rb"<(?:[A-Za-z]+:)?CityModel[\s>]")
 _HEAD_BYTES = 4096
 
 
@@ -74,4 +80,6 @@ def describe_file(content: bytes) -> str | None:
         return _ZEROS
     if b"<svg" in head:
         return "an SVG drawing"
+    if _CITY_GML.search(head):
+        return "a CityGML model"
     return "GeoJSON" if _GEOJSON.search(head) else None

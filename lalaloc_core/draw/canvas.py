@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -28,7 +29,14 @@ Box = tuple[Number, Number, Number, Number]
 
 FONT_FAMILY = "DejaVu Sans, Verdana, sans-serif"
 
-_FONTS = [str(path) for path in sorted((Path(__file__).parent / "fonts").glob("*.ttf"))]
+_FONT_FOLDER = Path(__file__).parent / "fonts"
+_FONTS = [str(path) for path in sorted(_FONT_FOLDER.glob("DejaVu*.ttf"))]
+# Chinese and Japanese characters, and those of scripts that no bundled font has.
+_EAST_ASIAN = re.compile("[\u2e80-\ua4cf\uf900-\ufaff\uff00-\uffef]")
+_EAST_ASIAN_FONT = str(_FONT_FOLDER / "DroidSansFallback-subset.ttf")
+_OTHER_SCRIPTS = re.compile(
+    "[\u0700-\u07bf\u0800-\u0e7f\u0f00-\u109f\u1100-\u13ff\u1680-\u1cff\u3130-\u318f\ua4d0-\ud7ff\U00010000-\U0010ffff]"
+)
 _JPEG_QUALITY = 90
 
 
@@ -49,11 +57,17 @@ def document(width: Number, height: Number, title: str, parts: Iterable[str]) ->
 def rasterise(svg: str) -> bytes:
     """Rasterise a drawing as PNG.
 
-    The bundled fonts cover Latin, Greek, Cyrillic and a few more scripts; other characters are drawn as boxes. External
-    references are not loaded.
+    The bundled fonts cover Latin, Greek, Cyrillic, Arabic, Hebrew, Chinese, Japanese and a few more scripts, so that
+    pictures are the same on every machine. For others, such as Korean, Thai and Devanagari, the system's fonts are
+    used; without one, the characters are boxes. External references are not loaded.
     """
+    # Reading the font takes as long as drawing a plan.
+    east_asian = [_EAST_ASIAN_FONT] if _EAST_ASIAN.search(svg) else []
     return resvg_py.svg_to_bytes(
-        svg_string=svg, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"
+        svg_string=svg,
+        skip_system_fonts=_OTHER_SCRIPTS.search(svg) is None,
+        font_files=[*_FONTS, *east_asian],
+        sans_serif_family="DejaVu Sans",
     )
 
 

@@ -41,7 +41,7 @@ class Format:
         media_type: media type of its files.
         suffix: suffix of its files, without a dot.
         options: import options that the format uses, besides `name` and `ceiling_height_m`.
-        magic: pattern that matches at the start of its files; None for JSON.
+        magic: pattern that matches at the start of its files; None for JSON and for archives by their members.
         keys: members that recognise a JSON document of the format; without them it is GeoJSON or native.
         extra: optional dependency of this package that installs its libraries.
     """
@@ -107,6 +107,7 @@ _FORMATS = (
     _format("imdf", "IMDF", "application/zip", "imdf.zip", "level layers", magic=re.compile(rb"PK\x03\x04")),
     _format("ros", "ROS map (zip archive of YAML and PGM)", "application/zip", "map.zip", "metres_per_pixel",
             magic=re.compile(_ROS)),
+    _format("sweethome3d", "Sweet Home 3D", "application/zip", "sh3d", "level"),
     _format("dxf", "DXF", "image/vnd.dxf", "dxf", f"units layers y_axis {_SCALE}", magic=re.compile(_DXF, re.DOTALL)),
     _format("dwg", "DWG (with a converter)", "image/vnd.dwg", "dwg", f"units layers y_axis {_SCALE}",
             magic=re.compile(rb"AC10\d\d")),

@@ -14,7 +14,7 @@ from lalaloc_core.file_kinds import STAND_INS, describe_file
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.importers.common.archive import read_archive
+from lalaloc_core.importers.common.archive import member_names, read_archive
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
 from lalaloc_core.importers.common.import_options import DEFAULT_OPTIONS, ImportOptions
@@ -27,7 +27,19 @@ _GEOJSON_TYPES = {
 }  # fmt: skip
 _NO_MEMORY = ("bad_alloc", "Insufficient memory", "Failed to allocate", "bad allocation")
 # Advice for files of other kinds, by the last word of their description.
-_ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": "unpack it"}
+_ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": "unpack it",
+           "model": "export the floor plan as IFC or DXF from the program that made it"}  # fmt: skip
+_USDZ = (
+    "the file is a USDZ archive, a 3D model without rooms as RoomPlan apps share it; export the scan's JSON instead: "
+    "apps call it 'JSON', 'raw data' or 'CapturedRoom', and developers encode CapturedRoom or CapturedStructure with "
+    "JSONEncoder"
+)
+# JSON files of other programs, by a member or type.
+_OTHER_JSON = {
+    "CityJSON": "CityJSON, a city model; convert the building with its rooms to IndoorGML, or export its plan as DXF",
+    "floors": "FML, a project of Floorplanner; export the floor plan there as DXF, SVG, PDF or PNG",
+    "meshes": "a glTF model, which has no rooms; export the floor plan as IFC or DXF from the program that made it",
+}
 # Suffixes of plan files, such as .imdf.zip.
 _SUFFIXES = re.compile(r"(?:(?<=.)\.imdf)?(?<=.)\.[A-Za-z0-9]{1,10}$")
 # Members of a JSON document of no known format that are named.
@@ -37,6 +49,8 @@ PLANS = "plans"
 _SEVERAL_PLANS = re.compile(rb"(?:\xef\xbb\xbf)?\s*\{\s*\"plans\"\s*:")
 # Files of IMDF, zipped IFC models and ROS maps.
 _IN_ARCHIVES = (".geojson", ".json", ".ifc", ".yaml", ".yml", ".pgm", ".png")
+# Members of USDZ files, and of homes of Sweet Home 3D; names that are looked at.
+_USD, _HOME, _MAX_MEMBER_NAMES = (".usdc", ".usda", ".usd"), {"Home", "Home.xml"}, 5000
 _OPTIONS_OF_ALL_FORMATS = {"name", "ceiling_height_m"}
 
 
@@ -206,6 +220,12 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
         return format, content
     from lalaloc_core.importers.formats.ros import YAML_SUFFIXES
 
+    names = member_names(content, _MAX_MEMBER_NAMES)
+    if any(name.casefold().endswith(_USD) for name in names):
+        raise InvalidFloorPlanError(_USDZ)
+    # Homes have a member for every model of a piece of furniture.
+    if _HOME.intersection(names):
+        return FORMATS["sweethome3d"], read_archive(content, limits, suffixes=("home.xml",))
     files = read_archive(content, limits, suffixes=_IN_ARCHIVES)
     if any(name.casefold().endswith(YAML_SUFFIXES) for name in files):
         return FORMATS["ros"], files
@@ -229,6 +249,10 @@ def _json_format(document: Any) -> Format:
             return FORMATS["native"]
         if document.get("type") in _GEOJSON_TYPES:
             return FORMATS["geojson"]
+        kind = str(document.get("type"))
+        other = "CityJSON" if kind.startswith("CityJSON") else next((key for key in _OTHER_JSON if key in document), "")
+        if other:
+            raise InvalidFloorPlanError(f"the file is {_OTHER_JSON[other]}")
         members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
         raise InvalidFloorPlanError(
             f"the JSON has the members {members}, of no known format; the native format has 'rooms' or 'plans', "

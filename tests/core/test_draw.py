@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
-from lalaloc_core.draw import rasterise
+from lalaloc_core.draw import canvas, rasterise
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
 from lalaloc_core.draw.outline import layout_outline
@@ -249,3 +249,15 @@ def test_ellipse_axes_match_the_covariance() -> None:
 def test_confidence_words_are_distinct() -> None:
     descriptions = [confidence_words(value) for value in (1.0, 0.9, 0.6, 0.3, 0.0)]
     assert len(set(descriptions)) == 5
+
+
+@pytest.mark.parametrize("names", [("台所", "寝室"), ("厨房间", "卧室床"), ("مطبخ", "حمام"), ("κουζίνα", "λουτρό!")])
+def test_names_in_any_bundled_script_are_drawn_and_not_boxes(names: tuple[str, str]) -> None:
+    def drawn(text: str) -> np.ndarray:
+        return np.asarray(canvas.pixels(canvas.document(200, 60, "", [canvas.words(5, 45, text, 40)])))
+
+    first, second, boxes = drawn(names[0]), drawn(names[1]), drawn("\ue000" * len(names[0]))
+    # Two words of equal length without their characters are the same boxes.
+    assert np.any(first != second)
+    assert np.any(first != boxes)
+    assert (first < 128).sum() > 100

@@ -203,7 +203,7 @@ def test_unknown_layers_are_rejected_with_the_known_ones():
 
 
 def test_dxf_without_unit_is_rejected_with_the_likely_one():
-    with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like mm: units=mm"):
+    with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like millimetres: units=mm"):
         import_plan(dxf_file(_german_walls(insunits=0)))
     assert len(import_plan(dxf_file(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
 

@@ -111,7 +111,7 @@ def test_objects_of_a_roomplan_scan_become_fixtures() -> None:
 
 
 def test_features_of_equipment_become_fixtures() -> None:
-    def feature(kind: str, box: tuple[float, ...], **properties: str) -> dict[str, Any]:
+    def feature(kind: str, box: tuple[float, float, float, float], **properties: str) -> dict[str, Any]:
         shape = shapely.geometry.mapping(shapely.box(*box))
         return {"type": "Feature", "properties": {"feature_type": kind, **properties}, "geometry": shape}
 

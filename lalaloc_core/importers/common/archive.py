@@ -30,6 +30,15 @@ def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, .
         raise InvalidFloorPlanError(f"the archive is damaged: {error}; pack it again") from error
 
 
+def member_names(content: bytes, most: int) -> list[str]:
+    """Return the names of the first members of a zip archive; none if it is damaged."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return archive.namelist()[:most]
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError):
+        return []
+
+
 def pack(files: Mapping[str, bytes]) -> bytes:
     """Return a zip archive of files."""
     stream = io.BytesIO()
@@ -40,17 +49,17 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    members = archive.infolist()
+    members = [
+        member for member in archive.infolist() if not member.is_dir() and member.filename.casefold().endswith(suffixes)
+    ]
     if len(members) > limits.max_archive_files:
         raise InvalidFloorPlanError(
-            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files); "
-            "pack only the files of the plan"
+            f"the archive has {len(members)} files ({', '.join(suffixes)}); the limit is {limits.max_archive_files} "
+            "(max_archive_files); pack only the files of the plan"
         )
     found: dict[str, bytes] = {}
     remaining = limits.max_unpacked_bytes
     for member in members:
-        if member.is_dir() or not member.filename.casefold().endswith(suffixes):
-            continue
         if member.flag_bits & 0x1:
             raise InvalidFloorPlanError(f"'{member.filename[:100]}' is encrypted; send the archive without a password")
         # The sizes in the archive's directory can be forged, so the read itself is bounded.

@@ -19,8 +19,11 @@ USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
 # Largest distance of two rooms that share a wall, and reach of an opening to either side (m).
 _USUAL_WALL_M, _REACH_M = 0.6, 0.45
+# Usual door leaves, sides of rooms and buildings in drawings without a unit (m).
+_USUAL_LEAF_M, _USUAL_SIDE_M, _USUAL_EXTENT_M = (0.55, 1.3), (1.0, 40.0), (4.0, 120.0)
+_IMPERIAL = 0.7
 _MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
-_UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
+UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
 
 
 def check_document(document: Mapping[str, Any], *, is_scale_certain: bool = False) -> list[str]:
@@ -53,6 +56,28 @@ def likely_unit(value: float, usual_m: tuple[float, float]) -> str | None:
     return min(fitting, key=lambda unit: abs(math.log(value * METRES_PER_UNIT[unit] / usual)), default=None)
 
 
+def unit_by_parts(doors: Sequence[float], extent: float, sides: Sequence[float] = ()) -> str | None:
+    """Return the unit of a drawing in which door leaves, rooms and the whole have usual sizes, None if none does.
+
+    `doors` are the widths of leaves, `sides` those of typical rooms, and `extent` the size of the drawing, all in its
+    units. Of the units in which all are usual, the one in which they are nearest to the middle is chosen; imperial
+    ones are less frequent.
+    """
+    measures = [(doors, _USUAL_LEAF_M), (sides, _USUAL_SIDE_M), ([extent], _USUAL_EXTENT_M)]
+
+    def score(unit: str) -> tuple[int, float]:
+        fitting, off = 0, _IMPERIAL if unit in ("in", "ft") else 0.0
+        for values, (low, high) in measures:
+            if values:
+                value = float(np.median(values)) * METRES_PER_UNIT[unit]
+                fitting += low <= value <= high
+                off += abs(math.log(max(value, 1e-9) / math.sqrt(low * high)))
+        return fitting, -off
+
+    best = max(METRES_PER_UNIT, key=score)
+    return best if score(best)[0] == sum(bool(values) for values, _ in measures) else None
+
+
 def _unit_hints(subject: str, value: float, usual_m: tuple[float, float]) -> list[str]:
     """Return a warning about a length if it is unusual in metres."""
     low, high = usual_m
@@ -60,7 +85,7 @@ def _unit_hints(subject: str, value: float, usual_m: tuple[float, float]) -> lis
         return []
     unit = likely_unit(value, usual_m)
     advice = (
-        f"it looks like {_UNIT_NAMES[unit]} (with units={unit} it is {value * METRES_PER_UNIT[unit]:.2f} m)"
+        f"it looks like {UNIT_NAMES[unit]} (with units={unit} it is {value * METRES_PER_UNIT[unit]:.2f} m)"
         if unit is not None
         else "check the scale"
     )

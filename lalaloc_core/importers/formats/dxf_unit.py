@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from itertools import islice
 
+import numpy as np
 from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dimension import Dimension as DimensionEntity
 from ezdxf.lldxf.const import DXFError
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import side_lengths
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.plausibility import likely_unit
+from lalaloc_core.importers.common.plausibility import UNIT_NAMES, unit_by_parts
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
 from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
@@ -37,10 +39,12 @@ def find_unit(
         )
     extent = drawing.extent
     measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
-    fitting = likely_unit(extent, _USUAL_EXTENT_M)
+    sides = [float(np.sqrt(area.shape.area)) for area in drawing.areas if area.role == "room"]
+    doors = [side_lengths(area.shape)[1] for area in drawing.areas if area.role == "door"]
+    fitting = unit_by_parts([*doors, *(swing.radius for swing in drawing.swings)], extent, sides)
     given = (options.units, options.known_distance, options.metres_per_pixel, own_unit, measured)
     if all(scale is None for scale in given):
-        hint = f" and looks like {fitting}: units={fitting}" if fitting else ""
+        hint = f" and looks like {UNIT_NAMES[fitting]}: units={fitting}" if fitting else ""
         raise InvalidFloorPlanError(
             f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
             "set units to mm, cm, m, in or ft"
@@ -48,8 +52,9 @@ def find_unit(
     own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     factor, source = drawing_scale(options, "the DXF", own=own)
     if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
-        is_other = fitting and own_unit and fitting != own_unit[1]
-        hint = f"it looks like {fitting}: set units={fitting}" if is_other else "check units"
+        hint = "check units"
+        if fitting is not None and own_unit and fitting != own_unit[1]:
+            hint = f"it looks like {UNIT_NAMES[fitting]}: set units={fitting}"
         builder.warnings.append(f"the drawing is {extent * factor:.4g} m across; {hint}")
     return factor, source
 

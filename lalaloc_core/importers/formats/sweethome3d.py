@@ -1,0 +1,228 @@
+"""Sweet Home 3D: `Home.xml` of a `.sh3d` archive, with lengths in centimetres and y down.
+
+Rooms are the areas that walls enclose, with the names of the rooms drawn in them, and drawn rooms that walls do not
+enclose. Format: `HomeXMLHandler` of https://www.sweethome3d.com.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.fixtures import fixture_from_name
+from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.safe_xml import local_name, read_xml
+from lalaloc_core.importers.common.sketch import (
+    ROOM_HEIGHT_M,
+    Level,
+    OpeningKind,
+    Sketch,
+    SketchedFixture,
+    SketchedOpening,
+    SketchedRoom,
+)
+from lalaloc_core.importers.common.vocabulary import role_from_name
+from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
+
+MEMBER = "Home.xml"
+_CM = 0.01
+_DEFAULT_HEIGHT_CM = 250.0
+# Sills from here on (m) are of windows, for openings whose name is not known.
+_WINDOW_SILL_M = 0.3
+# Steps of round walls; share of a drawn room or an enclosed area that the other covers if both are one room.
+_ARC_STEPS, _SAME = 24, 0.5
+_MIN_ROOM_M2 = 0.5
+
+
+@dataclass
+class _Storey:
+    level: Level
+    height_m: float
+    walls: list[Element] = field(default_factory=list)
+    rooms: list[Element] = field(default_factory=list)
+    pieces: list[Element] = field(default_factory=list)
+
+
+def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per level of a home.
+
+    Raises:
+        InvalidFloorPlanError: the archive has no `Home.xml`, or the home has neither walls nor rooms.
+    """
+    name = next((name for name in files if name.rpartition("/")[2].casefold() == MEMBER.casefold()), None)
+    if name is None:
+        raise InvalidFloorPlanError(
+            f"the Sweet Home 3D file has no {MEMBER}; open it in Sweet Home 3D 5.3 or later and save it again"
+        )
+    root = read_xml(files[name], budget)
+    if local_name(root) != "home":
+        raise InvalidFloorPlanError(f"the root element of {MEMBER} is <{local_name(root)[:50]}>; it must be <home>")
+    storeys = _storeys(root)
+    if not storeys:
+        raise InvalidFloorPlanError(
+            "the home has no walls and no rooms; draw them in Sweet Home 3D, or export the plan"
+        )
+    compass = next((element for element in root if local_name(element) == "compass"), None)
+    north_deg = None if compass is None else math.degrees(_number(compass, "northDirection", 0.0))
+
+    def make(level: Level, storey: _Storey) -> ImportedPlan:
+        builder = ReportBuilder("sweethome3d", _CM, "the format: centimetres")
+        sketch = Sketch(name=str(root.get("name") or "")[:200].removesuffix(".sh3d") or None, north_deg=north_deg)
+        if len(storeys) > 1:
+            sketch.level, sketch.name = level, level.name
+        _add_rooms(storey, sketch, builder, budget)
+        _add_pieces(storey, sketch, builder, budget)
+        return assemble(sketch, builder, options, budget.limits.plan)
+
+    return assemble_levels(storeys, options, budget.limits, make)
+
+
+def _storeys(root: Element) -> dict[str, tuple[Level, _Storey]]:
+    """Return the levels with walls or rooms, by id; a home without levels has one."""
+    usual_m = _CM * _number(root, "wallHeight", _DEFAULT_HEIGHT_CM)
+    found = {"": _Storey(Level("0", 0.0), usual_m)}
+    for number, element in enumerate(child for child in root if local_name(child) == "level"):
+        level = Level(
+            str(element.get("name") or f"level {number}")[:200], None, _CM * _number(element, "elevation", 0.0)
+        )
+        found[str(element.get("id"))] = _Storey(level, _CM * _number(element, "height", 100.0 * usual_m))
+    for element in root.iter():
+        kind = local_name(element)
+        storey = found.get(element.get("level") or "", found[""])
+        if kind == "wall":
+            storey.walls.append(element)
+        elif kind == "room":
+            storey.rooms.append(element)
+        elif kind in ("doorOrWindow", "pieceOfFurniture") and element.get("visible", "true") != "false":
+            storey.pieces.append(element)
+    return {key: (storey.level, storey) for key, storey in found.items() if storey.walls or storey.rooms}
+
+
+def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
+    bodies = [body for wall in storey.walls for body in _wall(wall, builder, budget)]
+    enclosed: Enclosed | None = enclose(bodies, [], check_time=budget.check_time) if bodies else None
+    walls = shapely.union_all(bodies)
+    drawn: list[tuple[shapely.Polygon, str | None]] = []
+    for room in storey.rooms:
+        outline = _points(room, budget)
+        name = str(room.get("name") or "") or None
+        parts = polygons_from_geometry(shapely.Polygon(outline)) if len(outline) >= 3 else []
+        builder.use("room", "rooms" if parts else "ignored (no area)")
+        drawn += [(part, name) for part in parts]
+    height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
+    found = [] if enclosed is None else [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
+    for area in found:
+        names = [name for part, name in drawn if shapely.intersection(part, area).area > _SAME * part.area]
+        if len(names) <= 1:
+            sketch.rooms.append(SketchedRoom(area, names[0] if names else None, None, height_m))
+        # Several drawn rooms divide an open area.
+    taken = shapely.union_all([room.shape for room in sketch.rooms])
+    for part, name in drawn:
+        if shapely.intersection(part, taken).area <= _SAME * part.area:
+            free = polygons_from_geometry(part.difference(walls))
+            sketch.rooms += [SketchedRoom(free_part, name, None, height_m) for free_part in free]
+    if enclosed is not None:
+        sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
+        sketch.drawn = enclosed.walls.envelope
+
+
+def _wall(wall: Element, builder: ReportBuilder, budget: Budget) -> list[shapely.Polygon]:
+    """Return the body of a wall, also of a round one: its ends lie on a circle with an angle `arcExtent`."""
+    start, end = (np.array([_number(wall, f"x{key}"), -_number(wall, f"y{key}")]) * _CM for key in ("Start", "End"))
+    thickness_m, arc = _CM * _number(wall, "thickness", 0.0), -_number(wall, "arcExtent", 0.0)
+    points = np.array([start, end])
+    if 1e-3 < abs(arc) < 2.0 * math.pi and np.any(start != end):
+        budget.spend(_ARC_STEPS)
+        points = _arc(start, end, arc)
+    if not np.isfinite(points).all() or thickness_m <= 0.0 or np.all(start == end):
+        builder.use("wall", "ignored (no length or thickness)")
+        return []
+    builder.use("wall", "walls")
+    body = shapely.LineString(points).buffer(0.5 * thickness_m, cap_style="square", join_style="mitre")
+    return polygons_from_geometry(body)
+
+
+def _arc(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], angle: float) -> Float[np.ndarray, "n 2"]:
+    """Return the points from `start` to `end` on a circle, counter-clockwise by `angle`."""
+    chord = end - start
+    left = np.array([-chord[1], chord[0]])
+    centre = 0.5 * (start + end) + 0.5 * left / math.tan(0.5 * angle)
+    away = start - centre
+    turn = np.linspace(0.0, angle, _ARC_STEPS + 1)
+    c, s = np.cos(turn), np.sin(turn)
+    return centre + np.column_stack([c * away[0] - s * away[1], s * away[0] + c * away[1]])
+
+
+def _add_pieces(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
+    """Add doors, windows and fixtures."""
+    for piece in storey.pieces:
+        budget.spend()
+        catalogue = str(piece.get("catalogId") or "")[:200].rpartition("#")[2]
+        name = str(piece.get("name") or "")[:200]
+        if local_name(piece) == "doorOrWindow":
+            opening = _opening(piece, catalogue, name)
+            builder.use("doorOrWindow", "ignored (no width)" if opening is None else opening.kind)
+            sketch.openings += [] if opening is None else [opening]
+            continue
+        kind = "stairs" if piece.get("staircaseCutOutShape") else fixture_from_name(catalogue, name)
+        box = None if kind is None else _box(piece)
+        builder.use("pieceOfFurniture", f"fixtures: {kind}" if box is not None else "ignored")
+        if kind is not None and box is not None:
+            sketch.fixtures.append(SketchedFixture(kind, box))
+
+
+def _opening(piece: Element, catalogue: str, name: str) -> SketchedOpening | None:
+    box = _box(piece)
+    if box is None:
+        return None
+    sill_m, height_m = _CM * _number(piece, "elevation", 0.0), _CM * _number(piece, "height", 0.0)
+    roles = [role for text in (catalogue, name) if (role := role_from_name(text)) in ("door", "window", "passage")]
+    kind: OpeningKind = "window" if sill_m >= _WINDOW_SILL_M else "door"
+    if "frame" in catalogue.casefold() or "passage" in roles:
+        kind = "passage"
+    elif roles:
+        kind = roles[0]  # type: ignore[assignment]
+    corners = np.asarray(box.exterior.coords)[:4]
+    # The width runs along the wall, from the first corner to the second.
+    start, end = point_xy(0.5 * (corners[0] + corners[3])), point_xy(0.5 * (corners[1] + corners[2]))
+    return SketchedOpening(kind, start, end, name or None, sill_m if kind == "window" else None, sill_m + height_m)
+
+
+def _box(piece: Element) -> shapely.Polygon | None:
+    """Return the rectangle of a piece of furniture, which begins along its width; None without an area."""
+    width_m, depth_m = _CM * _number(piece, "width", 0.0), _CM * _number(piece, "depth", 0.0)
+    centre = np.array([_number(piece, "x"), -_number(piece, "y")]) * _CM
+    angle = -_number(piece, "angle", 0.0)
+    if width_m <= 0.0 or depth_m <= 0.0 or not np.isfinite([*centre, width_m, depth_m, angle]).all():
+        return None
+    along = 0.5 * width_m * np.array([math.cos(angle), math.sin(angle)])
+    across = 0.5 * depth_m * np.array([-math.sin(angle), math.cos(angle)])
+    corners = [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
+    return shapely.Polygon(corners)
+
+
+def _points(room: Element, budget: Budget) -> Float[np.ndarray, "n 2"]:
+    points = [(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"]
+    budget.spend(len(points))
+    found = _CM * np.array(points, dtype=float).reshape(-1, 2)
+    return found if np.isfinite(found).all() else found[:0]
+
+
+def _number(element: Element, key: str, default: float = math.nan) -> float:
+    """Return an attribute as a number, or the default if it is missing or none."""
+    try:
+        value = float(element.get(key) or default)
+    except ValueError:
+        return default
+    return value if math.isfinite(value) else default
