@@ -356,7 +356,7 @@ def photograph_of_picture(
     )
 
 
-def _thumbnail(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _thumbnail(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
     """Return the whole picture at the size that objects are recognised in; its aspect changes by rounding only."""
     height, width = picture.shape[:2]
     aspect = min(max(width / height, 1.0 / _MAX_ASPECT), _MAX_ASPECT)

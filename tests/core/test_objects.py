@@ -1,0 +1,149 @@
+"""Objects in photographs of real rooms, which tell the type of the room, with the shipped model."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import struct
+from functools import cache
+
+import numpy as np
+import pytest
+
+from lalaloc_core.bundle import Bundle, MatchingWeights, default_bundle
+from lalaloc_core.conventions import ROOM_TYPES
+from lalaloc_core.errors import InvalidFeaturesError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.match.matching_cost import MatchingCost
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.taken import jpeg, sphere, take
+
+FIELD_DEG = 80.0
+# Bed of the hotel room: azimuth from the sphere's centre.
+BED_DEG = 90.0
+HEIGHT = CameraHeight(1.5)
+
+
+@cache
+def bundle() -> Bundle:
+    return Bundle.open(default_bundle())
+
+
+@cache
+def encoder() -> PhotographEncoder:
+    return PhotographEncoder(bundle(), threads=1)
+
+
+def view(name: str, heading_deg: float, width: int = 640, height: int = 480) -> Photograph:
+    """Return a level view of a real room."""
+    camera = Perspective.of_hfov(width, height, math.radians(FIELD_DEG))
+    return open_photograph(
+        jpeg(take(sphere(f"real/{name}"), camera, heading_deg=heading_deg)),
+        sphere_size=sphere_size(bundle().manifest),
+        patch_size=patch_size(bundle().manifest),
+        stated=StatedCamera(projection="perspective", hfov_deg=FIELD_DEG, pitch_deg=0.0, roll_deg=0.0),
+    )
+
+
+def query(*views: tuple[Photograph, float]) -> Query:
+    (first, _), *others = views
+    return encoder().query(first, None, HEIGHT, others=others)
+
+
+def plan(*types: str) -> FloorPlan:
+    """Return a plan of equal rooms."""
+    rooms = [
+        {"name": f"room {k}", "type": kind, "polygon": [[5 * k, 0], [5 * k + 4, 0], [5 * k + 4, 3], [5 * k, 3]]}
+        for k, kind in enumerate(types)
+    ]
+    return FloorPlan.from_document({"rooms": rooms})
+
+
+def test_bed_is_seen_where_it_stands() -> None:
+    shown = query((view("hotel_room", BED_DEG - 15.0), 0.0)).objects
+    assert shown is not None
+    beds = [seen for seen in shown.objects if seen.name in ("four-poster bed", "quilt", "pillows", "couch")]
+    assert beds
+    assert math.degrees(beds[0].azimuth) == pytest.approx(15.0, abs=25.0)
+    assert next(iter(shown.room_type.shares())) == "bedroom"
+
+
+def test_room_of_the_seen_type_wins_among_equal_rooms() -> None:
+    types = ("kitchen", "bathroom", "bedroom", "unknown")
+    equal = plan(*types)
+    asked = query((view("hotel_room", BED_DEG), 0.0))
+    grid = build_grid(equal, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    assert types[localise(equal, grid, encoder(), asked, refine="none").candidates[0].room_index] == "bedroom"
+
+
+def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
+    asked = query((view("hotel_room", BED_DEG), 0.0))
+    assert asked.objects is not None
+    cost = MatchingCost(plan("bedroom", "bathroom", "unknown"), asked, 0.1, MatchingWeights(), MatchingConfig())
+    bedroom, bathroom, unknown = cost.room_costs[0]
+    share = asked.objects.room_type.shares()["bedroom"]
+    assert bedroom < unknown < bathroom
+    # A log likelihood: the odds against a room without a type, over the temperature.
+    ratio = 0.03 + 0.97 * share * len(ROOM_TYPES)
+    assert unknown - bedroom == pytest.approx(math.log(ratio) / MatchingWeights().temperature, rel=1e-3)
+
+
+def test_views_of_one_spot_share_their_objects() -> None:
+    bed, wall = view("hotel_room", BED_DEG), view("hotel_room", 0.0)
+    alone, both = query((bed, 0.0)).objects, query((wall, 0.0), (bed, math.radians(BED_DEG))).objects
+    assert alone is not None
+    assert both is not None
+    turned = {seen.name: seen.azimuth for seen in both.objects}
+    for seen in alone.objects:
+        assert turned[seen.name] == pytest.approx(seen.azimuth + math.radians(BED_DEG), abs=1e-6)
+    shares = alone.room_type.shares()["bedroom"], both.room_type.shares()["bedroom"]
+    assert shares[0] > shares[1] > 1.0 / len(ROOM_TYPES)
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (1280, 320), (200, 900)])
+def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
+    thumbnail = view("hotel_room", BED_DEG, width, height).thumbnail
+    assert thumbnail is not None
+    rows, columns = thumbnail.shape[:2]
+    assert rows % 32 == columns % 32 == 0
+    assert 0.7 < rows * columns / (320 * 256) < 1.3
+    assert columns / rows == pytest.approx(width / height, rel=0.2)
+
+
+def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
+    photograph = view("hotel_room", BED_DEG)
+    content = FeatureEncoder(bundle(), threads=1).features(photograph)
+    expected, found = (query((read, 0.0)).objects for read in (photograph, read_features(content, bundle())))
+    assert expected is not None
+    assert found is not None
+    assert found.objects == tuple(
+        dataclasses.replace(seen, azimuth=pytest.approx(seen.azimuth), probability=pytest.approx(seen.probability))
+        for seen in expected.objects
+    )
+    assert bundle().manifest.objects is not None
+    arrays = 2 * 4 * len(bundle().manifest.objects.names)
+    first = content[:4] + struct.pack("<H", 1) + content[6:-arrays]
+    assert query((read_features(first, bundle()), 0.0)).objects is None
+    with pytest.raises(InvalidFeaturesError, match="bytes"):
+        read_features(content[:4] + struct.pack("<H", 1) + content[6:], bundle())
+
+
+def test_features_with_impossible_objects_are_refused() -> None:
+    content = FeatureEncoder(bundle(), threads=1).features(view("hotel_room", BED_DEG))
+    with pytest.raises(InvalidFeaturesError, match="object_azimuth"):
+        read_features(content[:-4] + np.float32(9.0).tobytes(), bundle())
+
+
+def test_manifest_states_objects_and_types() -> None:
+    objects = json.loads(bundle().manifest.to_json())["objects"]
+    assert len(objects["names"]) == len(objects["shares"])
+    kitchen = objects["shares"][objects["names"].index("stove")]
+    assert ROOM_TYPES[int(np.argmax(kitchen))] == "kitchen"
