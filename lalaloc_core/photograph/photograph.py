@@ -36,6 +36,7 @@ from lalaloc_core.photograph.picture_files import (
 from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_sphere
 from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.photograph.stated_camera import StatedCamera
+from lalaloc_core.picture_kinds import is_drawing
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
@@ -203,9 +204,24 @@ def open_photograph(
             looks_spherical=lambda: is_sphere(sphere() if is_fine else sphere(*COARSEST)),
         )
         if lens.is_sphere:
+            _refuse_drawing(sphere())
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(image, orientation, _decoded_size(width, height, lens, size), oversampling=1))
+    _refuse_drawing(picture)
     return _photograph_of_picture(picture, (width, height), lens, stated, size)
+
+
+def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Refuse a plan or a page of text.
+
+    Raises:
+        InvalidPhotographError: the picture is ink on white paper.
+    """
+    if is_drawing(picture):
+        raise InvalidPhotographError(
+            "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
+            "photograph taken in one of its rooms"
+        )
 
 
 def _photograph_of_sphere(
