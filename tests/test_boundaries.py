@@ -24,6 +24,7 @@ LAYERS = {
     "lalaloc_core.conventions": 0,
     "lalaloc_core.conditions": 0,
     "lalaloc_core.file_kinds": 0,
+    "lalaloc_core.picture_kinds": 0,
     "lalaloc_core.files": 0,
     "lalaloc_core.configuration": 1,
     # The query side.

@@ -39,6 +39,7 @@ from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Sourc
 from lalaloc_core.photograph.spheres import convert_layout, read_layout, read_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
+from lalaloc_core.picture_kinds import is_drawing
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
@@ -229,9 +230,24 @@ def open_photograph(
         named = () if layout is None else (layout.text,)
         lens = replace(lens, warnings=(*named, *file.warnings, *metadata.warnings, *lens.warnings))
         if lens.is_sphere:
+            _refuse_drawing(sphere())
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
+    _refuse_drawing(picture)
     return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
+
+
+def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Refuse a plan or a page of text.
+
+    Raises:
+        InvalidPhotographError: the picture is ink on white paper.
+    """
+    if is_drawing(picture):
+        raise InvalidPhotographError(
+            "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
+            "photograph taken in one of its rooms"
+        )
 
 
 def _photograph_of_sphere(

@@ -60,6 +60,10 @@ _RANGE = re.compile(r"(-?\d{1,3})\s*-\s*(-?\d{1,3})")
 _MAX_LEVELS = 200
 # Further levels of all features together: shafts and stairs are on all levels.
 _REPEATS, _REPEATS_PER_FEATURE = 1000, 5
+# Properties of outdoor features in OpenStreetMap, and properties of features inside buildings.
+_OUTDOOR = {"highway", "landuse", "waterway", "natural", "railway", "boundary", "leisure"}
+_INSIDE = {"indoor", "feature_type", "room", "door", "window", "level", "level_id", "ordinal", "floor", "storey",
+           "kind", "layer", "opening"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ def import_features(
     """
     if not features:
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
+    _refuse_map(features, format)
     project, anchor, metres_per_unit, source = projection([feature.shape for feature in features], crs, options)
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
@@ -139,6 +144,20 @@ def import_features(
         return assemble(sketch, builder, options, budget.limits.plan)
 
     return assemble_levels(by_level, options, budget.limits, make)
+
+
+def _refuse_map(features: Sequence[Feature], format: str) -> None:
+    """Refuse a map of streets, whose buildings would become rooms.
+
+    Raises:
+        InvalidFloorPlanError: there are outdoor features, and none says that it is part of a building's inside.
+    """
+    outdoor = sum(not _OUTDOOR.isdisjoint(feature.properties) for feature in features)
+    if outdoor and all(_INSIDE.isdisjoint(feature.properties) for feature in features):
+        raise InvalidFloorPlanError(
+            f"the {format} file is a map with {outdoor} outdoor features such as streets, not a floor plan; export the "
+            "rooms, tagged with indoor=room or feature_type=unit"
+        )
 
 
 def _levels_of(feature: Feature) -> list[str]:

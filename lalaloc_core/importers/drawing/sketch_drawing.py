@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import opening_line, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
@@ -39,6 +41,8 @@ from lalaloc_core.importers.drawing.readings import (
 )
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing
 
+# Letters of a line of prose, and the least number of such lines on a page of text.
+_LINE_LETTERS, _MIN_LINES_OF_TEXT = 25, 8
 # Names in a room besides its own that are listed.
 _MAX_OTHERS = 5
 _OPENING_M = (0.3, 8.0)
@@ -52,6 +56,24 @@ _OFF_WALL_M = 0.03
 _TRACED: Mapping[Role | None, TracePart] = {None: "line", "wall": "wall line", "room": "line", "door": "door",
                                             "window": "window", "passage": "passage", "obstacle": "other",
                                             "ignored": "other", "text": "other"}  # fmt: skip
+
+
+@contextmanager
+def naming_text(letterings: Sequence[Lettering], subject: str) -> Iterator[None]:
+    """Say in errors that a file is a page of text if most of its texts are lines of prose.
+
+    Raises:
+        InvalidFloorPlanError: the error within the context.
+    """
+    try:
+        yield
+    except InvalidFloorPlanError as error:
+        prose = sum(len(lettering.text) >= _LINE_LETTERS for lettering in letterings)
+        if prose < max(_MIN_LINES_OF_TEXT, 0.5 * len(letterings)):
+            raise
+        raise InvalidFloorPlanError(
+            f"{subject} is a page of text with {prose} lines, not a floor plan; send the page with the plan ({error})"
+        ) from error
 
 
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:

@@ -21,7 +21,7 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
-from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text, sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
@@ -46,29 +46,41 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     document, page = open_page(content, options.page)
     try:
         found = read_page(page, budget)
-        builder = ReportBuilder("pdf", is_draft=True)
-        if found.out_of_range:
-            builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
-        scan = _read_scan(page, found, builder, budget)
-        # A unit of a PDF is always a point.
-        without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
-        factor, source = drawing_scale(
-            without_units, "the PDF", drawings, budget.check_time, paper_m_per_unit=_METRES_PER_POINT
-        )
-        # Marks of dimensions can be read as letters, so these are removed after the scale is known.
-        _remove_letters(found)
-        notes = list(builder.notes)
-        sketch = _as_drawing(found, factor, builder, budget)
-        if sketch is None or not sketch.rooms:
-            notes.append(f"page {options.page} was read as a picture")
-            builder = ReportBuilder("pdf", is_draft=True, notes=notes)
-            sketch = _as_picture(page, found, factor, builder, budget)
-            # Searchable scans contain text over the picture.
-            own = found.drawing.scaled(factor, flip_y=False).letterings
-            rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-            sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
+        with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
+            return _read_plan(page, found, options, budget)
     finally:
         document.close()
+
+
+def _read_plan(
+    page: pypdfium2.PdfPage, found: PageContent, options: ImportOptions, budget: Budget
+) -> tuple[ImportedPlan, ...]:
+    """Read the plan on a page.
+
+    Raises:
+        InvalidFloorPlanError: neither the page nor the options give its scale, or there are no rooms.
+    """
+    builder = ReportBuilder("pdf", is_draft=True)
+    if found.out_of_range:
+        builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
+    scan = _read_scan(page, found, builder, budget)
+    # A unit of a PDF is always a point.
+    without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
+    factor, source = drawing_scale(
+        without_units, "the PDF", drawings, budget.check_time, paper_m_per_unit=_METRES_PER_POINT
+    )
+    # Marks of dimensions can be read as letters, so these are removed after the scale is known.
+    _remove_letters(found)
+    notes = list(builder.notes)
+    sketch = _as_drawing(found, factor, builder, budget)
+    if sketch is None or not sketch.rooms:
+        notes.append(f"page {options.page} was read as a picture")
+        builder = ReportBuilder("pdf", is_draft=True, notes=notes)
+        sketch = _as_picture(page, found, factor, builder, budget)
+        # Searchable scans contain text over the picture.
+        own = found.drawing.scaled(factor, flip_y=False).letterings
+        rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
+        sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
     builder.metres_per_unit, builder.scale_source = factor, source
     return (assemble(sketch, builder, options, budget.limits.plan),)
 

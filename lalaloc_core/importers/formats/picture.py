@@ -16,10 +16,11 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import check_scale, drawing_scale, drawn_scale
-from lalaloc_core.importers.drawing.sketch_drawing import name_rooms
+from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.lettering import read_texts
+from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
+from lalaloc_core.picture_kinds import Tones
 
 _MIN_SIDE_PX = 64
 # A larger picture has a wrong scale.
@@ -34,7 +35,26 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """
     gray, warmth, paper_m_per_pixel = _open(content, budget)
     builder = ReportBuilder("picture", is_draft=True)
+    tones = Tones.of(gray)
+    if tones is not None and tones.is_photograph:
+        raise InvalidFloorPlanError(
+            "the picture is a photograph, not a floor plan: send it to be localised, or send a drawn or scanned plan"
+        )
     texts = read_texts(gray, builder, budget)
+    with naming_text(texts.drawing.letterings, "the picture"):
+        return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)
+
+
+def _read_plan(
+    gray: UInt8[np.ndarray, "h w"],
+    warmth: UInt8[np.ndarray, "h w"] | None,
+    texts: PictureTexts,
+    paper_m_per_pixel: float | None,
+    options: ImportOptions,
+    builder: ReportBuilder,
+    budget: Budget,
+) -> tuple[ImportedPlan, ...]:
+    """Read the plan, after its texts."""
     # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
     measured = drawn_scale(texts.drawing, budget.check_time)
     factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(

@@ -1,0 +1,94 @@
+"""Photographs and drawings, told apart by their tones, for error messages.
+
+Drawings and scans of them are ink on paper: almost everywhere most pixels of a small block have the tone of the paper,
+also where light is uneven. In photographs this holds for at most four fifths of the blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+# Longer side that pictures are reduced to, and side of a block (pixels).
+_SIDE, _BLOCK = 512, 32
+# Tone of the paper in a block, by its percentile; difference that noise makes, and the share of such pixels.
+_PAPER_PERCENTILE, _NOISE, _MOSTLY = 80, 10, 0.5
+# Bounds, with a margin to scans and photographs of rooms (spheres, views, renderings) that were measured.
+_MAX_FLAT_OF_PHOTOGRAPHS, _MIN_SPREAD_OF_PHOTOGRAPHS = 0.72, 90.0
+_MIN_FLAT_OF_DRAWINGS, _MAX_SPREAD_OF_DRAWINGS, _MIN_PAPER, _MIN_UNIFORM = 0.94, 40.0, 230.0, 0.36
+# Step of the sample of a photograph, and the smallest share of its most frequent tone in drawings.
+_SAMPLE, _MIN_SAMPLED = 4, 0.3
+_INK, _INK_SHARES = 70, (0.005, 0.4)
+
+
+@dataclass(frozen=True)
+class Tones:
+    """Tones of a picture.
+
+    Attributes:
+        flat: share of blocks in which most pixels have the tone of the paper.
+        spread: difference of the paper's tone between dark and bright blocks (of 255).
+        darkest: tone of the paper in a dark block.
+        uniform: share of pixels of the most frequent tone.
+        ink: share of pixels that are much darker than the paper around them.
+    """
+
+    flat: float
+    spread: float
+    darkest: float
+    uniform: float
+    ink: float
+
+    @classmethod
+    def of(cls, gray: UInt8[np.ndarray, "h w"]) -> Tones | None:
+        """Return the tones of a grey picture; None if it is smaller than a block."""
+        picture = Image.fromarray(gray)
+        picture.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
+        small = np.asarray(picture).astype(np.int16)
+        rows, columns = small.shape[0] // _BLOCK, small.shape[1] // _BLOCK
+        if not rows or not columns:
+            return None
+        blocks = small[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+        blocks = blocks.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+        paper = np.percentile(blocks, _PAPER_PERCENTILE, axis=1)
+        is_paper = np.abs(blocks - paper[:, None]) <= _NOISE
+        dark, bright = np.percentile(paper, [5, 95])
+        counts = np.bincount(small.ravel(), minlength=256)
+        frequent = int(counts.argmax())
+        return cls(
+            flat=float((is_paper.mean(axis=1) > _MOSTLY).mean()),
+            spread=float(bright - dark),
+            darkest=float(dark),
+            uniform=float(counts[max(frequent - 3, 0) : frequent + 4].sum() / small.size),
+            ink=float((blocks < paper[:, None] - _INK).mean()),
+        )
+
+    @property
+    def is_photograph(self) -> bool:
+        """True for photographs of rooms and landscapes, and for no drawing; pale photographs give False."""
+        return self.flat < _MAX_FLAT_OF_PHOTOGRAPHS and self.spread > _MIN_SPREAD_OF_PHOTOGRAPHS
+
+    @property
+    def is_drawing(self) -> bool:
+        """True for ink on white paper, as a plan or a text, and for no photograph of a room; scans can give False."""
+        return (
+            self.flat >= _MIN_FLAT_OF_DRAWINGS
+            and self.spread <= _MAX_SPREAD_OF_DRAWINGS
+            and self.darkest >= _MIN_PAPER
+            and self.uniform >= _MIN_UNIFORM
+            and _INK_SHARES[0] <= self.ink <= _INK_SHARES[1]
+        )
+
+
+def is_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> bool:
+    """Return whether an RGB picture is a drawing (`Tones.is_drawing`), quickly for photographs."""
+    # A sample suffices to see that no tone is frequent.
+    counts = np.bincount(picture[::_SAMPLE, ::_SAMPLE, 1].ravel(), minlength=256)
+    frequent = int(counts.argmax())
+    if counts[max(frequent - 6, 0) : frequent + 7].sum() < _MIN_SAMPLED * counts.sum():
+        return False
+    tones = Tones.of(np.asarray(Image.fromarray(picture).convert("L")))
+    return tones is not None and tones.is_drawing

@@ -1,0 +1,91 @@
+"""Photographs given as plans, plans given as photographs, and maps and texts given as either."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.plan_drawing import STYLES, Style, draw_plan
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
+from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers.drawing.sketch_drawing import naming_text
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
+from lalaloc_core.photograph import StatedCamera, open_photograph
+from lalaloc_core.picture_kinds import Tones, is_drawing
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])
+
+
+def test_photographs_are_not_taken_for_drawings() -> None:
+    pictures = [np.asarray(Image.open(path).convert("RGB")) for path in PHOTOGRAPHS]
+    assert len(pictures) > 5
+    assert not any(map(is_drawing, pictures))
+
+
+@pytest.mark.parametrize("shade", [255, 128, 0])
+def test_plain_pictures_are_neither(shade: int) -> None:
+    tones = Tones.of(np.full((300, 400), shade, np.uint8))
+    assert tones is not None
+    assert not tones.is_drawing
+    assert not tones.is_photograph
+    assert Tones.of(np.zeros((8, 900), np.uint8)) is None
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> None:
+    drawn = draw_plan(style, 3)
+    content = drawn.jpeg() if style == "scanned" else drawn.png()
+    tones = Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L")))
+    assert tones is not None
+    assert not tones.is_photograph
+
+
+def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:
+    with pytest.raises(InvalidFloorPlanError, match="is a photograph, not a floor plan"):
+        import_plan((EXAMPLES / "real/hotel_room.jpg").read_bytes())
+
+
+@pytest.mark.parametrize("stated", [StatedCamera(projection="perspective", hfov_deg=70.0), None])
+def test_plan_given_as_a_photograph_is_refused(stated: StatedCamera | None) -> None:
+    picture = Image.open(io.BytesIO(draw_plan("thick", 1).png())).convert("RGB")
+    # Also one that is twice as wide as high, like a sphere.
+    wide = Image.new("RGB", (2 * picture.height, picture.height), "white")
+    wide.paste(picture.resize((picture.height, picture.height)))
+    stream = io.BytesIO()
+    (picture if stated is not None else wide).save(stream, "PNG")
+    stated = stated or StatedCamera(projection="equirectangular")
+    with pytest.raises(InvalidPhotographError, match="is a drawing or a page of text, not a photograph"):
+        open_photograph(stream.getvalue(), sphere_size=(256, 512), stated=stated)
+
+
+def test_errors_name_a_page_of_text() -> None:
+    prose = [Lettering("The tenant pays the rent until the third day", (0.0, 20.0 * line)) for line in range(20)]
+    named = r"the picture is a page of text with 20 lines.*\(no scale\)"
+    with pytest.raises(InvalidFloorPlanError, match=named), naming_text(prose, "the picture"):
+        raise InvalidFloorPlanError("no scale")
+    labels = [Lettering(name, (0.0, 0.0)) for name in ("Kitchen", "Hall", "4.20")] * 10
+    with pytest.raises(InvalidFloorPlanError, match=r"^no scale$"), naming_text([*labels, *prose[:9]], "the picture"):
+        raise InvalidFloorPlanError("no scale")
+
+
+def test_map_of_streets_is_refused() -> None:
+    ring = [[[11, 48], [11.0002, 48], [11.0002, 48.0001], [11, 48]]]
+    shapes = [({"building": "yes"}, "Polygon", ring), ({"highway": "residential"}, "LineString", ring[0][:2])]
+    features = [
+        {"type": "Feature", "properties": tags, "geometry": {"type": kind, "coordinates": points}}
+        for tags, kind, points in shapes
+    ]
+    with pytest.raises(InvalidFloorPlanError, match="is a map with 1 outdoor features"):
+        import_plan(json.dumps({"type": "FeatureCollection", "features": features}).encode())
+
+
+def test_scanned_plan_is_read_as_before() -> None:
+    drawn = draw_plan("scanned", 3)
+    plan = import_plan(drawn.jpeg(), ImportOptions(metres_per_pixel=drawn.metres_per_pixel))
+    assert len(plan.document["rooms"]) >= 2
