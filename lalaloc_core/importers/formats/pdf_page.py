@@ -68,7 +68,7 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
         pages = len(document)
     except pypdfium2.PdfiumError as error:
         raise InvalidFloorPlanError(
-            f"the PDF cannot be read: {error}; it is damaged or encrypted, save it again without a password"
+            "the PDF cannot be read: it is damaged or encrypted; save it again without a password"
         ) from error
     if number > pages:
         document.close()
@@ -78,7 +78,7 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
     except pypdfium2.PdfiumError as error:
         document.close()
         raise InvalidFloorPlanError(
-            f"page {number} of the PDF cannot be read: {error}; save it again or set page"
+            f"page {number} of the PDF is damaged and cannot be read; save it again or set page"
         ) from error
 
 
