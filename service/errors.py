@@ -469,7 +469,7 @@ class ExpectedTooLateError(OverloadedError):
     def __init__(self, others: int, retry_after_s: int) -> None:
         ServiceError.__init__(
             self,
-            f"Beside your {others} queries in progress, one more is expected to miss its deadline. Send fewer at a time. "
+            f"Beside your {others} queries in progress, one more is expected to miss its deadline. Send fewer at once. "
             f"Retry after {retry_after_s} s.",
         )
         self.retry_after_s = retry_after_s
