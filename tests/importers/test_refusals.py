@@ -8,6 +8,7 @@ import random
 import re
 from collections.abc import Iterator
 
+import pypdfium2
 import pytest
 from PIL import Image
 
@@ -99,3 +100,9 @@ def test_damage_is_named(content: bytes, words: str):
     with pytest.raises(InvalidInputError, match=words) as caught:
         import_plans(content, _SCALE)
     assert INTERNAL.search(str(caught.value)) is None
+
+
+def test_page_that_is_painted_over_and_over_is_refused_before_it_is_rendered(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pypdfium2.PdfPage, "render", pytest.fail)
+    with pytest.raises(InvalidInputError, match="cover it more than 1000 times"):
+        import_plans(pdf(b"0 0 800 800 re f " * 1100), _SCALE)
