@@ -199,9 +199,29 @@ class Caller:
         self._count(answer.status)
         return answer
 
+    def send_bytes(self, head: str, content: bytes) -> Answer:
+        """Send a head, which is completed, and bytes after it on a connection of its own; return the status."""
+        lines = [head, f"Host: {self._connection.host}", *(f"{name}: {value}" for name, value in self._headers.items())]
+        answer = b""
+        address = (self._connection.host, self._connection.port)
+        with suppress(OSError), socket.create_connection(address, _REQUEST_TIMEOUT_S) as connection:
+            connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            # The service may answer and close before everything is sent.
+            with suppress(ConnectionError):
+                connection.sendall(content)
+            while b"\r\n" not in answer and (part := connection.recv(4096)):
+                answer += part
+        status = int(answer.split(b" ", 2)[1]) if answer.startswith(b"HTTP/") else 0
+        self._count(status)
+        return Answer(status)
+
 
 class Rehearsal(Caller):
     """Caller that sends nothing."""
+
+    def send_bytes(self, head: str, content: bytes) -> Answer:
+        """Return a broken connection."""
+        return Answer(0)
 
     def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
         """Return a broken connection."""

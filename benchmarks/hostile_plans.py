@@ -37,7 +37,7 @@ from service.workers.process import limit_memory
 # CPU time that a file may take: the libraries of its format, and its content.
 MAX_S, MAX_S_PER_100_KB = 4.0, 4.0
 _LARGEST_NUMBER = 1e308
-_WALL_TIMEOUT_S = 200.0
+_WALL_TIMEOUT_S = 300.0
 Point = tuple[float, float]
 
 
@@ -382,7 +382,7 @@ def pdf(content: bytes, width: float = 800.0, height: float = 800.0, resources: 
         f"<</Length {len(packed)}/Filter/FlateDecode>>stream\n".encode() + packed + b"\nendstream",
     ]
     objects[2] += f"/Resources<<{resources}>>>>".encode()
-    body = b"%PDF-1.4\n" + b"".join(b"%d 0 obj" % k + part + b"endobj\n" for k, part in enumerate(objects, 1))
+    body = b"%PDF-1.4\n" + b"".join(b"%d 0 obj\n" % k + part + b"\nendobj\n" for k, part in enumerate(objects, 1))
     return body + more.encode("latin-1") + b"trailer<</Root 1 0 R>>\n%%EOF"
 
 

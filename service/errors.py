@@ -45,7 +45,8 @@ LaLaLocError
     ├── RateLimitedError            the API key exceeded its rate limit
     ├── TooManyRefusedKeysError     too many invalid API keys from one client
     ├── OverloadedError             all slots are in use
-    │   └── ShareExceededError      one tenant's share of the slots is in use
+    │   ├── ShareExceededError      one tenant's share of the slots is in use
+    │   └── ExpectedTooLateError    one tenant's queries leave too little time for one more
     ├── IndexTooLargeError          the index of a venue exceeds its memory
     ├── DrawingFailedError          a drawing could not be rasterised
     ├── DecoderNotReadyError        no decoder process is running
@@ -458,6 +459,18 @@ class ShareExceededError(OverloadedError):
             self,
             f"{held} of your requests are in progress, and the rest of the {limit} slots is reserved for other tenants."
             f" Retry after {retry_after_s} s.",
+        )
+        self.retry_after_s = retry_after_s
+
+
+class ExpectedTooLateError(OverloadedError):
+    """The client's queries in progress leave too little time for one more."""
+
+    def __init__(self, others: int, retry_after_s: int) -> None:
+        ServiceError.__init__(
+            self,
+            f"Beside your {others} queries in progress, one more is expected to miss its deadline. Send fewer at once. "
+            f"Retry after {retry_after_s} s.",
         )
         self.retry_after_s = retry_after_s
 

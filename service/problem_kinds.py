@@ -89,6 +89,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     errors.TooManyRefusedKeysError: ProblemKind(429, "too-many-refused-keys", "Too many invalid API keys"),
     errors.OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
     errors.ShareExceededError: ProblemKind(503, "overloaded", "Overloaded"),
+    errors.ExpectedTooLateError: ProblemKind(503, "overloaded", "Overloaded"),
     errors.IndexTooLargeError: ProblemKind(503, "overloaded", "Overloaded"),
     errors.DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
     errors.ConverterNotReadyError: ProblemKind(503, "converter-not-ready", "Converter not ready"),

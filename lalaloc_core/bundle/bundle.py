@@ -44,6 +44,10 @@ class Bundle:
             text = path.read_text(encoding="utf-8")
         except OSError as error:
             raise BundleError(f"no model bundle at '{folder}': {error.strerror} ({MANIFEST_NAME})") from error
+        except UnicodeDecodeError as error:
+            raise BundleError(
+                f"byte {error.start} of '{path}' is not UTF-8; download or export the bundle again"
+            ) from error
         manifest = Manifest.from_json(text)
         return cls(folder, manifest, manifest.sha256)
 

@@ -35,7 +35,13 @@ def read_json(text: str | bytes, max_depth: int, max_values: int | None = None) 
         return json.loads(text, object_pairs_hook=_object)
     except InvalidFloorPlanError:
         raise
-    except (ValueError, RecursionError) as error:
+    except UnicodeDecodeError as error:
+        raise InvalidFloorPlanError(
+            f"not valid JSON: byte {error.start} of the text is not {error.encoding.upper()}; save it as UTF-8"
+        ) from error
+    except RecursionError as error:
+        raise InvalidFloorPlanError(f"not valid JSON: nested too deep; the limit is {max_depth} levels") from error
+    except ValueError as error:
         raise InvalidFloorPlanError(f"not valid JSON: {error}") from error
 
 

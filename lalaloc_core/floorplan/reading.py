@@ -36,6 +36,7 @@ _ROOM_KEYS = {"id", "name", "type", "polygon", "holes", "walls", "ceiling_height
 # Free-standing walls can reach this far outside the floor: drawings let a stub begin on the axis of another wall.
 _WALL_OVERSHOOT_M = 0.01
 _KINDS = OPENING_CLASSES[1:]
+_PLACE = re.compile(r"\[(\S+) (\S+)\]")
 _OPENING_KEYS = {"kind", "line", "sill_m", "head_m", "name", "rooms"}
 # Distances of openings from their walls, from the rounding of drawings to the thickest walls.
 TOLERANCES_M = (0.01, 1.5)
@@ -135,8 +136,14 @@ def _read_ring(raw: Any, field: str, room: str, limits: PlanLimits, *, is_hole: 
         raise InvalidFloorPlanError(f"all vertices of {subject} lie on one line", room=room)
     shape = shapely.Polygon(ring)
     if not shape.is_valid:
-        raise InvalidFloorPlanError(f"{subject} crosses itself ({shapely.is_valid_reason(shape)})", room=room)
+        raise InvalidFloorPlanError(f"{subject} crosses itself{_place_of_fault(shape)}", room=room)
     return frozen(ring if shape.exterior.is_ccw != is_hole else ring[::-1].copy())
+
+
+def _place_of_fault(shape: shapely.Polygon) -> str:
+    """Return the place where an invalid outline meets itself, in words; the library states it in brackets."""
+    found = _PLACE.search(shapely.is_valid_reason(shape))
+    return "" if found is None else f" at ({float(found[1]):.6g}, {float(found[2]):.6g})"
 
 
 def _is_collinear(ring: Float[np.ndarray, "n 2"]) -> bool:
@@ -159,8 +166,7 @@ def _read_holes(
     if not inside.all():
         raise InvalidFloorPlanError(f"hole {np.argmin(inside)} does not lie inside the polygon", room=room)
     if rings and not (floor := shapely.Polygon(outline_m, rings)).is_valid:
-        reason = shapely.is_valid_reason(floor)
-        raise InvalidFloorPlanError(f"the holes cross or cut off parts of the floor ({reason})", room=room)
+        raise InvalidFloorPlanError(f"the holes cross or cut off parts of the floor{_place_of_fault(floor)}", room=room)
     return rings
 
 

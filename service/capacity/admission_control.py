@@ -9,15 +9,24 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any
+from weakref import WeakKeyDictionary
 
 from service.capacity.bytes_in_flight import BytesInFlight
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairQueue, FairSemaphore, Shares
-from service.errors import DeadlineExceededError, OverloadedError, ShareExceededError, StoppingError
+from service.errors import (
+    DeadlineExceededError,
+    ExpectedTooLateError,
+    OverloadedError,
+    ShareExceededError,
+    StoppingError,
+)
 from service.settings import Settings
 from service.telemetry import Telemetry
 
@@ -32,6 +41,8 @@ _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
 _MAX_RETRY_AFTER_S = 30
+# Weight of the newest query of a client, and clients whose durations are known.
+_NEWEST_OF_CLIENT, _MAX_PACES = 0.3, 10_000
 
 
 def is_read(method: str, path: str) -> bool:
@@ -54,6 +65,27 @@ def bounds_itself(method: str, path: str) -> bool:
     return is_stream(method, path) or path == BATCH
 
 
+class _Pace:
+    """Running means of the share of its time limit that a query of each client would take without the others.
+
+    A client whose queries wait behind one another is refused at once, not when the deadline has passed.
+    """
+
+    def __init__(self) -> None:
+        self._shares: OrderedDict[str, float] = OrderedDict()
+
+    def exceeds_deadline(self, client: str, others: int) -> bool:
+        """Return whether one more query beside others of the client is expected to miss its deadline."""
+        return others > 0 and (others + 1) * self._shares.get(client, 0.0) > 1.0
+
+    def note(self, client: str, share: float, others: int) -> None:
+        """Note the share of its time limit that a query took beside others of its client."""
+        mean = self._shares.pop(client, 0.0)
+        self._shares[client] = mean + _NEWEST_OF_CLIENT * (share / (others + 1) - mean)
+        if len(self._shares) > _MAX_PACES:
+            self._shares.popitem(last=False)
+
+
 class Slots:
     """Slots for requests of one kind, shared between clients (`Shares`); for one event loop.
 
@@ -68,6 +100,9 @@ class Slots:
         self._places = Shares(max_waiting)
         self._waiting: FairQueue[asyncio.Future[None]] = FairQueue(accounts or CpuAccounts())
         self._held_s = 0.0
+        self._pace = _Pace()
+        # Time (s) that the query of a task was without its slot.
+        self._away_s: WeakKeyDictionary[asyncio.Task[Any], float] = WeakKeyDictionary()
 
     @property
     def in_use(self) -> int:
@@ -101,19 +136,31 @@ class Slots:
             deadline: end of the wait (`monotonic`).
 
         Raises:
-            OverloadedError: the queue, or the client's share of it, is full, or no slot became free in time.
+            OverloadedError: the queue, or the client's share of it, is full, the client's other queries leave too
+                little time for one more, or no slot became free in time.
         """
-        await self._take_turn(client, deadline)
-        with self._held(client):
-            yield
+        begin, others = monotonic(), self._others(client)
+        if self._pace.exceeds_deadline(client, others):
+            raise ExpectedTooLateError(others, self._retry_after_s())
+        try:
+            await self._take_turn(client, deadline)
+            with self._held(client):
+                yield
+        finally:
+            task = asyncio.current_task()
+            spent_s = monotonic() - begin - (self._away_s.pop(task, 0.0) if task is not None else 0.0)
+            self._pace.note(client, spent_s / max(deadline - begin, 1e-3), max(others, self._others(client)))
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
         """Release the held slot during the block, and take it back afterwards."""
         self._give_back(client)
+        begin, task = monotonic(), asyncio.current_task()
         try:
             yield
         finally:
+            if task is not None:
+                self._away_s[task] = self._away_s.get(task, 0.0) + monotonic() - begin
             # Taken without a check, so for a while more slots than the limit can be in use.
             self._shares.take(client)
 
@@ -125,6 +172,10 @@ class Slots:
         """
         if not self._shares.may_take(client) and not self._places.may_take(client):
             raise self._refusal(client)
+
+    def _others(self, client: str) -> int:
+        """Return the number of queries of a client that hold a slot or wait for one."""
+        return self._shares.held_by(client) + self._places.held_by(client)
 
     @contextmanager
     def _held(self, client: str) -> Iterator[None]:
@@ -167,9 +218,12 @@ class Slots:
                 self._shares.take(next_client)
                 turn.set_result(None)
 
-    def _refusal(self, client: str) -> OverloadedError:
+    def _retry_after_s(self) -> int:
         rounds = 1.0 + self.waiting / max(self._shares.limit, 1)
-        retry_after_s = min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
+        return min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
+
+    def _refusal(self, client: str) -> OverloadedError:
+        retry_after_s = self._retry_after_s()
         if self.in_use < self._shares.limit:
             return ShareExceededError(self._shares.held_by(client), self._shares.limit, retry_after_s)
         return OverloadedError(self._shares.limit, retry_after_s)

@@ -214,9 +214,8 @@ class Converter:
         match error.reason:
             case "poisoned":
                 raise InvalidFloorPlanError(
-                    "the file could not be read: it ended two worker processes, possibly for lack of memory; the "
-                    f"limit is {settings.imports.memory_bytes} bytes (import_memory_bytes); export a smaller part, or "
-                    "another format"
+                    "the file could not be read: two attempts ended before the end of it; save it again, export a "
+                    "smaller part, or use another format"
                 ) from error
             case "stalled":
                 raise InvalidFloorPlanError(

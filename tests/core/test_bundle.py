@@ -322,3 +322,9 @@ class TestConfidence:
     def test_probability_is_bounded(self, cost: float) -> None:
         found = present(self.model.fit_probability("lpo", {**self.signals, "cost": cost}, heading_known=True))
         assert 0.0 <= found <= 1.0
+
+
+def test_manifest_that_is_not_utf_8_is_named(tmp_path: Path) -> None:
+    (tmp_path / MANIFEST_NAME).write_bytes(b'{"name": "\xff"}')
+    with pytest.raises(BundleError, match=r"byte 10 of '.*manifest.json' is not UTF-8"):
+        Bundle.open(tmp_path)

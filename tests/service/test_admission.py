@@ -157,6 +157,32 @@ def test_slot_of_a_cancelled_query_goes_to_the_next() -> None:
     asyncio.run(scenario())
 
 
+def test_query_that_would_miss_its_deadline_is_refused_at_once() -> None:
+    async def scenario() -> None:
+        slots = Slots(16, 16)
+
+        async def query(client: str, seconds: float) -> None:
+            async with slots.wait_and_hold(client, monotonic() + 0.4):
+                await asyncio.sleep(seconds)
+
+        # Four at a time take more than their time limit.
+        for _ in range(8):
+            await asyncio.gather(*(query("a", 0.5) for _ in range(4)), return_exceptions=True)
+        begin = monotonic()
+        outcomes = await asyncio.gather(
+            *(query("a", 0.01) for _ in range(12)), query("b", 0.01), return_exceptions=True
+        )
+        assert monotonic() - begin < 0.2
+        refused = [outcome for outcome in outcomes if isinstance(outcome, OverloadedError)]
+        assert 8 <= len(refused) <= 11
+        assert all((error.retry_after_s or 0) >= 1 for error in refused)
+        # A client with a single query at a time, and another client, are served.
+        assert outcomes[-1] is None
+        await query("a", 0.01)
+
+    asyncio.run(scenario())
+
+
 def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, panorama: bytes) -> None:
     ready, preparing = upload(small), upload(small, HALL, wait=False)
     with ThreadPoolExecutor(1) as threads:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -12,6 +13,8 @@ from lalaloc_core.importers.common.import_limits import ImportLimits
 
 # Archives carry no time, so that equal plans give equal bytes.
 _EPOCH = (2000, 1, 1, 0, 0, 0)
+# Errors of the library for damaged archives; a name in an archive can be no text.
+_DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, struct.error, RuntimeError)
 
 
 def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
@@ -26,8 +29,14 @@ def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, .
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return _read_members(archive, limits, suffixes)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError) as error:
-        raise InvalidFloorPlanError(f"the archive is damaged: {error}; pack it again") from error
+    except InvalidFloorPlanError:
+        raise
+    except NotImplementedError as error:
+        raise InvalidFloorPlanError(
+            "the archive is packed by a method that is not supported; pack it again, with deflate"
+        ) from error
+    except _DAMAGES as error:
+        raise InvalidFloorPlanError("the archive is damaged; pack or download it again") from error
 
 
 def member_names(content: bytes, most: int) -> list[str]:

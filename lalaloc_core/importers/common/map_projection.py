@@ -37,7 +37,9 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
             convert = _refuse_infinite(lambda points: to_wgs84(crs, points))
             low, high = (convert(np.array([corner]))[0] for corner in (low, high))
         except ProjError as error:
-            raise InvalidFloorPlanError(f"the crs '{crs}' cannot be used: {error}; export the file in WGS84") from error
+            raise InvalidFloorPlanError(
+                f"the crs '{crs}' is unknown or cannot be used; export the file in WGS84"
+            ) from error
     else:
         convert = _refuse_infinite(lambda points: points)
     if not (np.abs([low, high]) <= [180.0, 90.0]).all():

@@ -30,10 +30,15 @@ def read_xml(content: bytes, budget: Budget) -> Element:
         ) from error
     except defusedxml.DefusedXmlException as error:
         raise InvalidFloorPlanError(
-            f"the XML refers to other files, which are not read: {error}; save a drawing as plain SVG"
+            "the XML refers to other files, which are not read; save a drawing as plain SVG"
         ) from error
-    except (ParseError, ValueError, LookupError) as error:
-        raise InvalidFloorPlanError(f"the XML is not well-formed: {error}; save the file again") from error
+    except ParseError as error:
+        line, column = error.position
+        raise InvalidFloorPlanError(
+            f"the XML is not well-formed in line {line}, column {column + 1}; save the file again"
+        ) from error
+    except (ValueError, LookupError) as error:
+        raise InvalidFloorPlanError("the XML has an unknown encoding; save the file as UTF-8") from error
     pending = [(root, 1)]
     while pending:
         element, depth = pending.pop()

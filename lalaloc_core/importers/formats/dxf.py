@@ -138,7 +138,9 @@ def _open(content: bytes) -> DxfDocument:
         document, _ = recover.read(io.BytesIO(content))
     except (DXFError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
             UnicodeError) as error:  # fmt: skip
-        raise InvalidFloorPlanError(f"the DXF cannot be read: {error}; save it again, as DXF R2010 or later") from error
+        raise InvalidFloorPlanError(
+            "the DXF is damaged and cannot be read; save it again, as DXF R2010 or later"
+        ) from error
     return document
 
 

@@ -55,6 +55,18 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         InvalidFloorPlanError: the model is invalid or has no spaces.
         ModuleNotFoundError: ifcopenshell is not installed.
     """
+    try:
+        return _read(content, options, budget)
+    except (InvalidFloorPlanError, RecursionError):
+        raise
+    # An entity that the file lacks is None, and the library raises errors of all kinds for wrong types.
+    except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
+        raise InvalidFloorPlanError(
+            "the IFC model is damaged: an entity lacks a part, or has one of a wrong type; export it again"
+        ) from error
+
+
+def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
     model = open_model(content)
     budget.check_time()

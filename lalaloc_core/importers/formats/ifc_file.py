@@ -39,7 +39,9 @@ def open_model(content: bytes) -> Any:
         model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
         schema = str(model.schema)
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
-        raise InvalidFloorPlanError(f"the IFC model cannot be read: {error}; export it again as IFC4") from error
+        raise InvalidFloorPlanError(
+            "the IFC model is damaged, so that it cannot be read; export it again as IFC4"
+        ) from error
     if not schema.startswith(("IFC2X3", "IFC4")):
         raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}; export it as IFC2X3 or IFC4")
     _check_placements(model)

@@ -29,6 +29,8 @@ from lalaloc_core.importers.drawing.vector_drawing import (
 )
 
 _MAX_FORM_DEPTH = 8
+# Pages' worth of areas that are painted; each takes some milliseconds.
+_MAX_PAINTED = 1000
 # Opacity (of 255) of fills that can be walls, and of fills that hide what is below them.
 _OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
@@ -39,7 +41,8 @@ Matrix = Float[np.ndarray, "3 3"]
 class PageContent:
     """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts.
 
-    `out_of_range` lines are left out, as their coordinates are out of range.
+    `out_of_range` lines are left out, as their coordinates are out of range. `painted` is the area of all fills and
+    pictures, in pages.
     """
 
     drawing: Drawing = field(default_factory=Drawing)
@@ -47,6 +50,7 @@ class PageContent:
     picture_share: float = 0.0
     letters: list[shapely.Polygon] = field(default_factory=list)
     out_of_range: int = 0
+    painted: float = 0.0
 
 
 @dataclass
@@ -68,7 +72,7 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
         pages = len(document)
     except pypdfium2.PdfiumError as error:
         raise InvalidFloorPlanError(
-            f"the PDF cannot be read: {error}; it is damaged or encrypted, save it again without a password"
+            "the PDF cannot be read: it is damaged or encrypted; save it again without a password"
         ) from error
     if number > pages:
         document.close()
@@ -78,12 +82,16 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
     except pypdfium2.PdfiumError as error:
         document.close()
         raise InvalidFloorPlanError(
-            f"page {number} of the PDF cannot be read: {error}; save it again or set page"
+            f"page {number} of the PDF is damaged and cannot be read; save it again or set page"
         ) from error
 
 
 def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
-    """Return the paths and texts of a page, and the share that pictures cover."""
+    """Return the paths and texts of a page, and the share that pictures cover.
+
+    Raises:
+        InvalidFloorPlanError: the page has too many entities, or is painted over too often.
+    """
     width, height = page.get_size()
     found = PageContent(size_pt=(float(width), float(height)))
     for item, matrix in _objects(
@@ -91,11 +99,19 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     ):
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
-            found.out_of_range += _add_path(item, matrix, found.drawing, budget)
+            found.out_of_range += _add_path(item, matrix, found, budget)
         elif kind == pdfium.FPDF_PAGEOBJ_IMAGE:
             corners = _apply(matrix, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
             area = shapely.Polygon(corners).area if in_range(corners) else 0.0
-            found.picture_share += min(area / max(width * height, 1.0), 1.0)
+            share = min(area / max(width * height, 1.0), 1.0)
+            found.picture_share += share
+            found.painted += share
+        # Rendering the page cannot be stopped.
+        if found.painted > _MAX_PAINTED:
+            raise InvalidFloorPlanError(
+                f"the areas and pictures of the page cover it more than {_MAX_PAINTED} times, the limit; remove areas "
+                "that lie over one another"
+            )
     found.drawing.letterings = _letterings(page)
     return found
 
@@ -119,8 +135,9 @@ def _objects(
             )
 
 
-def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> int:
+def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> int:
     """Add the outlines and lines of a path; return the number of those out of range, which are left out."""
+    drawing, (page_width, page_height) = found.drawing, found.size_pt
     fill, stroke = ctypes.c_int(), ctypes.c_int()
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return 0
@@ -137,6 +154,10 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> in
         if not in_range(points):
             out_of_range += 1
             continue
+        if is_filled:
+            width_pt, height_pt = np.ptp(points, axis=0)
+            share = min(width_pt / max(page_width, 1.0), 1.0) * min(height_pt / max(page_height, 1.0), 1.0)
+            found.painted += float(share)
         swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
         leaves = [swing for swing in swings if swing is not None]
         if leaves and not is_filled:

@@ -110,7 +110,7 @@ def _open(
         raise
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError, Image.DecompressionBombWarning,
             TypeError, ZeroDivisionError) as error:  # fmt: skip
-        raise InvalidFloorPlanError(f"the picture cannot be read: {error}; save it again as PNG") from error
+        raise InvalidFloorPlanError("the picture is damaged and cannot be read; save it again as PNG") from error
     return gray, warmth, _paper(dpi)
 
 

@@ -217,7 +217,9 @@ def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
         raise
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError,
             Image.DecompressionBombWarning) as error:  # fmt: skip
-        raise InvalidFloorPlanError(f"the picture of the ROS map cannot be read: {error}; save it again") from error
+        raise InvalidFloorPlanError(
+            "the picture of the ROS map is damaged and cannot be read; save it again"
+        ) from error
 
 
 def _frame_of(rooms: list[shapely.Polygon]) -> MapFrame:

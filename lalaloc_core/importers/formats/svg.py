@@ -53,6 +53,8 @@ _AUTOMATIC = re.compile(
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
 _BYTES_PER_ENTITY = 12
+# Style rules times elements.
+_MAX_STYLES = 2_000_000
 # Fills that are less opaque do not hide what is below them.
 _OPAQUE = 0.9
 # Elements without a shape, and elements that are drawn only where they are used.
@@ -186,6 +188,13 @@ def _check_uses(root: Element, budget: Budget) -> None:
         return total
 
     budget.spend(size(root))
+    rules = sum((element.text or "").count("{") for element in root.iter() if local_name(element) == "style")
+    # Every element is compared with the rules.
+    if rules * len(sizes) > _MAX_STYLES:
+        raise InvalidFloorPlanError(
+            f"the SVG has {rules} style rules for {len(sizes)} elements; the limit is {_MAX_STYLES // len(sizes)} "
+            "rules for as many; save it as plain SVG, with styles as attributes"
+        )
 
 
 def _size_on_paper(root: Element) -> float | None:
@@ -217,7 +226,7 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
     try:
         tree = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=96.0)
     except (ValueError, TypeError, AttributeError, IndexError, KeyError, ZeroDivisionError, OverflowError) as error:
-        raise InvalidFloorPlanError(f"the SVG cannot be read: {error}; save it as plain SVG") from error
+        raise InvalidFloorPlanError("the SVG has values that cannot be read; save it as plain SVG") from error
     drawing = Drawing()
     for element, context in _walk(tree, _Context()):
         budget.spend()

@@ -100,7 +100,7 @@ def sketch_picture(
         budget.trace.add("room", best.enclosed.rooms)
         budget.trace.add("no room", builder.no_room)
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
-    openings = _openings(best, ink, builder)
+    openings = _openings(best, ink, builder, budget)
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, drawn=best.enclosed.walls.envelope)
 
 
@@ -118,7 +118,7 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
-    enclosed = enclose(wall_polygons(walls, ink), [], (), _CONFIG, budget.check_time, rank)
+    enclosed = enclose(wall_polygons(walls, ink, budget.check_time), [], (), _CONFIG, budget.check_time, rank)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), contents, is_dark)
 
@@ -132,7 +132,7 @@ def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.P
     return shapely.Polygon(room.exterior, large)
 
 
-def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder) -> list[SketchedOpening]:
+def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budget) -> list[SketchedOpening]:
     """Return the openings: gaps by their content and the rooms beside them, and windows drawn into walls."""
     rooms = reading.enclosed.rooms
     outside = shapely.unary_union([room.buffer(0.05) for room in rooms])
@@ -140,11 +140,12 @@ def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder) -> list[Sketc
     gaps = [gap for gap in reading.enclosed.gaps if outside.intersects(gap.shape)]
     candidates = [(gap.start, gap.end, reading.contents[id(gap)]) for gap in gaps]
     if not reading.is_dark:
-        panes = windows_in_walls(reading.walls, ink)
+        panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
     found = []
     for start, end, content in candidates:
         width = math.dist(start, end)
+        budget.check_time()
         is_inner = _is_between_rooms(start, end, reading.walls.thickness_m, rooms)
         kind = _kind(content, width, is_inner=is_inner)
         found.append(SketchedOpening(kind, start, end))

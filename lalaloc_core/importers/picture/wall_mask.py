@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
@@ -25,6 +27,8 @@ _WIDE_PART = 0.15
 _CUT_CORNER_M, _SQUARE = 0.07, 0.8
 # Strokes of panes are paler than walls (of 255), thinner than walls (share), and long (m).
 _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
+# Separate walls of a picture.
+_MAX_PIECES = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,18 +131,29 @@ def _without_furniture(
     return keep[labels]
 
 
-def wall_polygons(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
-    """Return walls as straightened polygons in plan metres."""
+def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[shapely.Polygon]:
+    """Return walls as straightened polygons in plan metres.
+
+    Raises:
+        InvalidFloorPlanError: there are too many, or the time is over.
+    """
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return []
     straight = max(_STRAIGHT_PX * ink.metres_per_pixel, _STRAIGHT_M)
+    pieces = int((hierarchy.reshape(-1, 4)[:, 3] < 0).sum())
+    if pieces > _MAX_PIECES:
+        raise InvalidFloorPlanError(
+            f"the picture has {pieces} separate dark areas as thick as walls; the limit is {_MAX_PIECES}; check the "
+            "scale, and remove noise, hatches and patterns"
+        )
     holes: dict[int, list[np.ndarray]] = {}
     for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
         if parent >= 0:
             holes.setdefault(int(parent), []).append(contours[index])
     found: list[shapely.Polygon] = []
     for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+        check_time()
         if parent >= 0 or len(contours[index]) < 3:
             continue
         inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]

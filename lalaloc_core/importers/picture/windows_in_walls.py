@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import shapely
@@ -16,14 +18,15 @@ _FULL, _LONG = 0.8, 3.0
 _SLANTED_DEG = 8.0
 
 
-def windows_in_walls(walls: WallMask, ink: Ink) -> list[SketchedOpening]:
-    """Return the windows: groups of panes that lie side by side in a wall."""
+def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[SketchedOpening]:
+    """Return the windows: groups of panes that lie side by side in a wall. `check_time` raises an exception to stop."""
     if walls.cavities is None:
         return []
-    panes = _panes(walls, ink)
+    panes = _panes(walls, ink, check_time)
     found: list[SketchedOpening] = []
     used: set[int] = set()
     for i, (first, angle) in enumerate(panes):
+        check_time()
         if i in used:
             continue
         group = [first]
@@ -38,7 +41,7 @@ def windows_in_walls(walls: WallMask, ink: Ink) -> list[SketchedOpening]:
     return found
 
 
-def _panes(walls: WallMask, ink: Ink) -> list[tuple[np.ndarray, float]]:
+def _panes(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[tuple[np.ndarray, float]]:
     """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
     assert walls.cavities is not None
     # Cavities outside the walls are furniture.
@@ -51,6 +54,7 @@ def _panes(walls: WallMask, ink: Ink) -> list[tuple[np.ndarray, float]]:
     for label, (x0, y0, x1, y1) in enumerate(boxes):
         if names[label] == 0 or max(x1 - x0, y1 - y0) * ink.metres_per_pixel < _MIN_LENGTH_M:
             continue
+        check_time()
         part = (index[y0:y1, x0:x1] == label).astype(np.uint8)
         points = np.argwhere(part)[:, ::-1].astype(np.float32)
         (cx, cy), (width, height), angle = cv2.minAreaRect(points)
