@@ -12,7 +12,7 @@ from lalaloc_core.photograph.stated_camera import Intrinsics
 
 # Distance of the principal point from the middle, a share of the side, beyond which a calibration hardly fits.
 _FAR = 0.1
-# Relative difference of the scales across and down of an exact multiple, and the distance of the principal point from the
+# Relative difference of the scales across and down of an exact multiple, and distance of the principal point from the
 # middle of a phone's stored picture, a share of the side.
 _EXACT, _NEAR = 0.005, 0.05
 # Fields of view that differ by more, as a ratio of focal lengths, are contradictory.
