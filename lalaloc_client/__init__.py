@@ -42,7 +42,16 @@ from lalaloc_client.errors import (
     ProblemError,
     UnauthorisedError,
 )
-from lalaloc_client.frames import RosPose, camera_matrix, heading_of, ros_covariance, ros_pose, world_from_plan, yaw_of
+from lalaloc_client.frames import (
+    RosPose,
+    camera_matrix,
+    heading_of,
+    misfit_m,
+    ros_covariance,
+    ros_pose,
+    world_from_plan,
+    yaw_of,
+)
 from lalaloc_client.model import (
     Bounds,
     ConfusedRooms,
@@ -125,6 +134,7 @@ __all__ = [
     "ViewOptions",
     "camera_matrix",
     "heading_of",
+    "misfit_m",
     "ros_covariance",
     "ros_pose",
     "world_from_plan",

@@ -25,6 +25,9 @@ Convention = Literal["opengl", "unity"]
 # Variance of what a level camera on a flat floor does not measure: z, roll and pitch.
 _UNKNOWN = 1e-6
 _MIN_APART_M = 0.5
+# Places of photographs are right within decimetres: largest ratio of distances, and root mean square error (m, and as a
+# share of the places' extent).
+_MAX_SCALE, _MAX_MISFIT_M, _MAX_MISFIT = 1.3, 0.5, 0.25
 
 
 def yaw_of(heading_deg: float) -> float:
@@ -104,7 +107,8 @@ def world_from_plan(
         mirrored: whether the axes of the device's floor are left-handed seen from above, as (x, z) of ARKit are.
 
     Raises:
-        ValueError: fewer than two places, or all of them closer than 0.5 m.
+        ValueError: fewer than two places, all of them closer than 0.5 m, or places that do not fit: other units, other
+            distances, or axes of the other handedness.
     """
     if len(plan_m) != len(world_m) or len(plan_m) < 2:
         raise ValueError(f"{len(plan_m)} places in the plan and {len(world_m)} in the world; give at least two of both")
@@ -118,6 +122,7 @@ def world_from_plan(
     turn = sum((b - target) * (a - centre).conjugate() for a, b in zip(own, other, strict=True))
     if not abs(turn) > 0.0:
         raise ValueError("the places in the world are all the same; give places that are apart")
+    _check_fit([a - centre for a in own], [b - target for b in other])
     turn /= abs(turn)
     shift = target - turn * centre
     return (
@@ -125,3 +130,44 @@ def world_from_plan(
         (sign * turn.imag, sign * turn.real, sign * shift.imag),
         (0.0, 0.0, 1.0),
     )
+
+
+def misfit_m(
+    matrix: Matrix, plan_m: Sequence[tuple[float, float]], world_m: Sequence[tuple[float, float]]
+) -> list[float]:
+    """Return the distance of each place of `world_m` from that of `plan_m` by the matrix of `world_from_plan`."""
+    return [
+        math.hypot(*(row[0] * x + row[1] * y + row[2] - value for row, value in zip(matrix, place, strict=False)))
+        for (x, y), place in zip(plan_m, world_m, strict=True)
+    ]
+
+
+def _check_fit(own: Sequence[complex], other: Sequence[complex]) -> None:
+    """Refuse places, relative to their means, that no turn makes fit.
+
+    Raises:
+        ValueError: names the misfit and the remedy.
+    """
+    size_m, other_m = (math.sqrt(sum(abs(point) ** 2 for point in points)) for points in (own, other))
+    scale = other_m / size_m
+    if not 1.0 / _MAX_SCALE <= scale <= _MAX_SCALE:
+        raise ValueError(
+            f"distances in the world are {scale:.3g} times those in the plan; at most {_MAX_SCALE:g} times fit: give "
+            "both in metres, and the same places in the same order"
+        )
+
+    def rest_m(points: Sequence[complex]) -> float:
+        turned = abs(sum(b * a.conjugate() for a, b in zip(own, points, strict=True)))
+        return math.sqrt(max(size_m**2 + other_m**2 - 2.0 * turned, 0.0) / len(own))
+
+    as_given, as_mirrored = rest_m(other), rest_m([point.conjugate() for point in other])
+    if as_given > max(_MAX_MISFIT_M, 3.0 * as_mirrored):
+        raise ValueError(
+            f"the places fit with {as_given:.2f} m, and with {as_mirrored:.2f} m if one axis of the world is turned "
+            "over: give (x, -z) of ARKit and ARCore, or mirrored=True"
+        )
+    if as_given > max(_MAX_MISFIT_M, _MAX_MISFIT * size_m):
+        raise ValueError(
+            f"the places fit with {as_given:.2f} m; the limit is {max(_MAX_MISFIT_M, _MAX_MISFIT * size_m):.2f} m: "
+            "check that both lists have the same places in the same order"
+        )

@@ -50,6 +50,13 @@ def add_commands(commands: Any) -> None:
         help="poses of the robot: TUM lines, or CSV with time_s, x_m, y_m and yaw_deg, counter-clockwise from +x",
     )
     track.add_argument(
+        "--odometry-frame",
+        choices=("auto", "optical", "rep103"),
+        default="auto",
+        help="axes of TUM poses: rep103 (x forward, z up) or optical (z forward, y down), as of visual SLAM (default: "
+        "by the direction that stays upright)",
+    )
+    track.add_argument(
         "--mount",
         type=heading,
         default=0.0,
@@ -74,7 +81,11 @@ def _track(arguments: argparse.Namespace) -> None:
     plan = read_plan(arguments.plan, arguments).plan()
     stated = stated_camera(arguments)
     photographs = _photographs(arguments.folder)
-    trajectory = None if arguments.odometry is None else read_trajectory(_text(arguments.odometry))
+    trajectory = None
+    if arguments.odometry is not None:
+        trajectory = read_trajectory(_text(arguments.odometry), arguments.odometry_frame)
+        for warning in trajectory.warnings:
+            print(f"warning: {arguments.odometry}: {warning}", file=sys.stderr)
     found = _followed(arguments, plan, photographs, trajectory, stated)
     if arguments.trajectory is not None:
         poses = [(answer, answer.tracked.pose) for answer in found]

@@ -9,6 +9,7 @@ range are ignored with a warning.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from PIL import ExifTags, Image
@@ -27,6 +28,22 @@ _SENSORS_MM = {
     "iphone 6": (4.15, 4.89),
     "iphone 6 plus": (4.15, 4.89),
 }
+# Action cameras whose wide lens is a fisheye: maker and model, and the angle (degrees) across the longer side at 4:3:
+# as the maker states it (GoPro), else 0.8 of the diagonal that it states.
+_FISHEYES = tuple(
+    (re.compile(pattern, re.I), angle_deg)
+    for pattern, angle_deg in (
+        (r"gopro\b", 122.6),
+        (r"dji.*(action|\bac00\d)", 124.0),
+        (r"(arashi vision|insta360)\b", 126.0),
+        (r"(sjcam|akaso|eken|apeman|campark|dragon touch|thieye|victure)\b", 136.0),
+        (r"(xiaoyi|yi technology|yi)\b", 124.0),
+        (r"sony (hdr-a|fdr-x[13]0)", 136.0),
+        (r"garmin.*virb", 122.0),
+    )
+)
+# Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
+_MAX_FISHEYE_MM = 18.0
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
 _FOCAL_RANGE_MM = (0.5, 250.0)
@@ -48,12 +65,16 @@ class ExifLens:
         focal: focal length, pixels of the full picture; None if unknown.
         focal_sd: relative standard deviation of `focal`.
         strip: the picture is a strip of a phone's panorama mode.
+        fisheye: angle (radians) across the longer side, if the camera's wide lens is a fisheye; else None.
+        camera: maker and model, if `fisheye` is known.
         warnings: values that were ignored, and why.
     """
 
     focal: float | None = None
     focal_sd: float = 0.0
     strip: bool = False
+    fisheye: float | None = None
+    camera: str = ""
     warnings: tuple[str, ...] = ()
 
 
@@ -79,7 +100,22 @@ def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
         focal = zoom * lens / side_mm * long
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
-    return ExifLens(focal=focal, focal_sd=max(_SD if usual else _CROPPED_SD, doubt), warnings=tuple(warnings))
+    camera = _camera_of(exif)
+    is_wide = film is None or film <= _MAX_FISHEYE_MM
+    angle_deg = next((angle for pattern, angle in _FISHEYES if pattern.match(camera)), None) if is_wide else None
+    return ExifLens(
+        focal=focal,
+        focal_sd=max(_SD if usual else _CROPPED_SD, doubt),
+        fisheye=None if angle_deg is None else math.radians(angle_deg),
+        camera="" if angle_deg is None else camera,
+        warnings=tuple(warnings),
+    )
+
+
+def _camera_of(exif: Image.Exif) -> str:
+    """Return maker and model as they are printed."""
+    texts = (str(exif.get(tag, ""))[:40] for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+    return " ".join("".join(filter(str.isprintable, text)).strip() for text in texts).strip()
 
 
 def _film_side_mm(ratio: float) -> float:

@@ -224,6 +224,7 @@ def open_photograph(
             stated=stated,
             sphere=metadata,
             exif=exif,
+            orientation=file.orientation,
             looks_spherical=lambda: is_sphere(judged()),
             closes=lambda: is_closed(open_picture(content, max_size=(_LONG_SIDE, _LONG_SIDE), limits=limits)),
         )

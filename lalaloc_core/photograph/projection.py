@@ -14,6 +14,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.exif import ExifLens
+from lalaloc_core.photograph.intrinsics_fit import compare_focal_lengths, fit_intrinsics
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.stated_camera import (
     AUTO,
@@ -42,6 +43,8 @@ _UNCLOSED = ": GPano FullPanoWidthPixels is the width of the part, but the borde
 COARSEST = 128, 256
 # Relative standard deviation of a stated focal length.
 _GIVEN_SD = 0.01
+# That of the wide lenses of action cameras.
+_ACTION_SD = 0.05
 # Advice for photographs without a known field of view.
 _HELP = (
     "send hfov_deg, its horizontal field of view (a phone's main lens has about 67° in landscape and 53° in portrait "
@@ -84,6 +87,7 @@ def find_lens(
     exif: ExifLens,
     looks_spherical: Callable[[], bool],
     closes: Callable[[], bool] = lambda: True,
+    orientation: int = 1,
 ) -> Lens:
     """Return the projection of a picture: as stated, by GPano, by the picture itself, or by its EXIF focal length.
 
@@ -94,6 +98,7 @@ def find_lens(
         sphere: GPano metadata.
         exif: EXIF metadata.
         looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
+        orientation: Exif orientation of the stored picture.
         closes: `is_closed` of the picture; called only for a strip whose metadata state 360°.
 
     Raises:
@@ -102,13 +107,21 @@ def find_lens(
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
 
-    def known(camera: Camera, hfov_source: Source) -> Lens:
+    def known(camera: Camera, hfov_source: Source, warnings: tuple[str, ...] = ()) -> Lens:
+        if isinstance(camera, Perspective) and exif.fisheye is None:
+            warnings += compare_focal_lengths(camera.fx, exif.focal, width)
         return Lens(
-            projection=projection, projection_source=source, camera=camera, hfov_source=hfov_source, focal_sd=_GIVEN_SD
+            projection=projection,
+            projection_source=source,
+            camera=camera,
+            hfov_source=hfov_source,
+            focal_sd=_GIVEN_SD,
+            warnings=warnings,
         )
 
     if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
-        return known(camera_of_intrinsics(projection, width, height, stated.intrinsics), "given")
+        intrinsics, warnings = fit_intrinsics(stated.intrinsics, width, height, orientation)
+        return known(camera_of_intrinsics(projection, width, height, intrinsics), "given", warnings)
     is_full = projection == "equirectangular" and _is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
     if stated.hfov_deg is not None and not is_full:
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
@@ -121,6 +134,8 @@ def find_lens(
             f"nothing tells which angle the strip of {width} x {height} shows{_UNCLOSED if sphere.cylinder else ''}; "
             "send hfov_deg, its horizontal field of view (up to 360)"
         )
+    if projection == "fisheye" and exif.fisheye is not None:
+        return _action_camera(width, height, source, exif, exif.fisheye)
     if projection == "fisheye":
         raise InvalidPhotographError(
             "a fisheye photograph needs hfov_deg, its horizontal field of view, or intrinsics (OpenCV's fisheye model)"
@@ -185,6 +200,8 @@ def _projection(
     twice_as_wide = _is_twice_as_wide(width, height)
     if twice_as_wide and hfov == TWO_PI and looks_spherical():
         return "equirectangular", "estimated"
+    if exif.fisheye is not None and not exif.strip and not twice_as_wide:
+        return "fisheye", "exif"
     if stated.hfov_deg is not None:
         return ("cylindrical" if exif.strip or hfov > _WIDEST_LENS else "perspective"), "assumed"
     if exif.strip:
@@ -200,6 +217,22 @@ def _projection(
             "horizontal field of view (up to 360)"
         )
     return "perspective", "exif" if exif.focal is not None else "assumed"
+
+
+def _action_camera(width: int, height: int, source: Source, exif: ExifLens, angle: float) -> Lens:
+    """Return the lens of an action camera by its maker and model."""
+    text = (
+        f"{exif.camera} has a fisheye lens of about {math.degrees(angle):.0f}° across the longer side, which is "
+        "assumed; for a linear mode send projection=perspective and hfov_deg"
+    )
+    return Lens(
+        projection="fisheye",
+        projection_source=source,
+        camera=camera_of_hfov("fisheye", width, height, angle * width / max(width, height)),
+        hfov_source="assumed",
+        focal_sd=_ACTION_SD,
+        warnings=(*exif.warnings, text),
+    )
 
 
 def _perspective(width: int, height: int, source: Source, exif: ExifLens) -> Lens:

@@ -20,6 +20,7 @@ from lalaloc_client import (
     TrackedPose,
     camera_matrix,
     heading_of,
+    misfit_m,
     ros_pose,
     world_from_plan,
     yaw_of,
@@ -131,3 +132,22 @@ def test_places_too_close_to_align_are_refused() -> None:
         world_from_plan([(0.0, 0.0), (0.2, 0.0)], [(0.0, 0.0), (0.2, 0.0)])
     with pytest.raises(ValueError, match="at least two of both"):
         world_from_plan([(0.0, 0.0)], [(0.0, 0.0)])
+
+
+def test_places_that_do_not_fit_are_refused() -> None:
+    plan = [(0.0, 0.0), (3.0, 0.0), (3.0, 2.0)]
+    with pytest.raises(ValueError, match=r"are 3\.28 times those in the plan; at most 1\.3 times fit"):
+        world_from_plan(plan, [(0.0, 0.0), (9.84, 0.0), (9.84, 6.56)])
+    mirrored = [(x, -y) for x, y in plan]
+    with pytest.raises(ValueError, match=r"with 0\.00 m if one axis of the world is turned over: .* mirrored=True"):
+        world_from_plan(plan, mirrored)
+    assert misfit_m(world_from_plan(plan, mirrored, mirrored=True), plan, mirrored) == pytest.approx(
+        [0.0] * 3, abs=1e-9
+    )
+    with pytest.raises(ValueError, match=r"the places fit with \d\.\d\d m; the limit is 0\.\d\d m"):
+        world_from_plan(plan, [plan[1], plan[2], plan[0]])
+
+
+def test_misfit_is_that_of_each_place() -> None:
+    plan, world = [(0.0, 0.0), (4.0, 0.0)], [(1.0, 1.0), (1.0, 5.4)]
+    assert misfit_m(world_from_plan(plan, world), plan, world) == pytest.approx([0.2, 0.2])

@@ -45,13 +45,26 @@ def take(
     )
 
 
-def jpeg(pixels: np.ndarray, exif: dict[Any, Any] | None = None, orientation: int | None = None) -> bytes:
+def exif_of(tags: dict[Any, Any]) -> Image.Exif:
+    """Return Exif metadata with tags of the EXIF IFD as phones write them."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    return exif
+
+
+def jpeg(
+    pixels: np.ndarray,
+    exif: dict[Any, Any] | None = None,
+    orientation: int | None = None,
+    *,
+    maker: str | None = None,
+    model: str | None = None,
+) -> bytes:
     """Return a JPEG file with tags of the EXIF IFD as phones write them."""
-    image = Image.fromarray(pixels)
-    tags = Image.Exif()
-    if orientation is not None:
-        tags[0x0112] = orientation
-    tags.get_ifd(0x8769).update(exif or {})
+    image, tags = Image.fromarray(pixels), exif_of(exif or {})
+    for tag, value in ((0x0112, orientation), (0x010F, maker), (0x0110, model)):
+        if value is not None:
+            tags[tag] = value
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=92, exif=tags)
     return buffer.getvalue()

@@ -1,7 +1,8 @@
 """Odometry and trajectories in files: CSV, and the format of the TUM RGB-D benchmark.
 
 Both have one pose per line, in the frames of REP 103: x forward, y to the left, yaw counter-clockwise from +x.
-TUM: `time x y z qx qy qz qw`. CSV: a header with `time_s`, `x_m`, `y_m` and `yaw_deg`.
+TUM: `time x y z qx qy qz qw`. CSV: a header with `time_s`, `x_m`, `y_m` and `yaw_deg`. TUM files of visual SLAM have
+optical axes instead (z forward, y down), and the frame of the first camera or a level one as their world.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import csv
 import io
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +22,13 @@ from lalaloc_core.localise.tracking.walk_motion import Odometry
 
 _CSV = ("time_s", "x_m", "y_m", "yaw_deg")
 _TUM_VALUES = 8
+# Frames of TUM poses; "auto" chooses by gravity.
+Frame = Literal["auto", "optical", "rep103"]
+FRAMES: tuple[Frame, ...] = get_args(Frame)
+# Cosine of the largest tilt of a camera or robot that stays upright, and the advantage of a frame that is chosen.
+_UPRIGHT, _CLEARER = math.cos(math.radians(35.0)), 0.1
+# Share of the way on the floor that heights vary by, at most, and the shortest way (m) that tells.
+_LEVEL, _SHORTEST_M = 0.2, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +43,12 @@ class OdometryErrors:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses by time: seconds, positions (m), and yaws (radians, counter-clockwise from +x)."""
+    """Poses by time: seconds, positions (m), and yaws (radians, counter-clockwise from +x); warnings about the file."""
 
     time_s: Float[np.ndarray, "n"]
     position_m: Float[np.ndarray, "n 2"]
     yaw: Float[np.ndarray, "n"]
+    warnings: tuple[str, ...] = ()
 
     def at(self, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
         """Return the interpolated position and yaw at a time.
@@ -70,14 +80,15 @@ class Trajectory:
         return Odometry.of_stds(length_m * math.cos(ahead), length_m * math.sin(ahead), turn, stds)
 
 
-def read_trajectory(text: str) -> Trajectory:
-    """Read a CSV or TUM file.
+def read_trajectory(text: str, frame: Frame = "auto") -> Trajectory:
+    """Read a CSV or TUM file; `frame` is that of TUM poses.
 
     Raises:
-        InvalidMotionError: a line is invalid, or times do not rise.
+        InvalidMotionError: a line is invalid, times do not rise, or no frame keeps the poses upright.
     """
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    rows = _csv_rows(lines) if lines and "," in lines[0] else [_tum_row(line, n) for n, line in enumerate(lines, 1)]
+    is_csv = bool(lines) and "," in lines[0]
+    rows = _csv_rows(lines) if is_csv else [_tum_row(line, n) for n, line in enumerate(lines, 1)]
     if len(rows) < 2:
         raise InvalidMotionError(f"the odometry has {len(rows)} poses; it needs at least 2")
     values = np.array(rows, dtype=float)
@@ -86,7 +97,60 @@ def read_trajectory(text: str) -> Trajectory:
     if not (np.diff(values[:, 0]) > 0.0).all():
         row = int(np.argmin(np.diff(values[:, 0]))) + 2
         raise InvalidMotionError(f"pose {row} of the odometry is not later than the one before: sort it by time")
-    return Trajectory(values[:, 0], values[:, 1:3], values[:, 3])
+    return Trajectory(values[:, 0], values[:, 1:3], values[:, 3]) if is_csv else _placed(values, frame)
+
+
+def _placed(values: Float[np.ndarray, "n 8"], frame: Frame) -> Trajectory:
+    """Return the poses of a TUM file on the floor."""
+    position_m, axes = values[:, 1:4], _rotations(values[:, 4:])
+    ways = {
+        # Up of the body along up of the world, coordinates of the floor (x, y), and forward of the body.
+        "rep103": (axes[:, 2, 2], (0, 1), (1.0, 1.0), axes[:, :, 0]),
+        "optical": (axes[:, 1, 1], (2, 0), (1.0, -1.0), axes[:, :, 2]),
+        "optical in a level world": (-axes[:, 2, 1], (0, 1), (1.0, 1.0), axes[:, :, 2]),
+    }
+    upright = {name: float(np.min(way[0])) for name, way in ways.items() if frame in ("auto", name.split()[0])}
+    if frame == "auto":
+        upright = {name: share - _rise(position_m, ways[name][1]) for name, share in upright.items()}
+    # Where a frame is as likely as that of REP 103, such as on a straight way, it is not chosen.
+    name = max(upright, key=lambda name: upright[name] + (_CLEARER if name == "rep103" else 0.0))
+    if float(np.min(ways[name][0])) < _UPRIGHT:
+        tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(np.min(ways[name][0]))))))
+        raise InvalidMotionError(
+            f"the poses of the odometry lean by up to {tilt_deg:.0f}° in the frame '{name}'; the limit is 35°: check "
+            "the quaternions (qx qy qz qw) and --odometry-frame (rep103: x forward, z up; optical: z forward, y down)"
+        )
+    _, floor, signs, forward = ways[name]
+    ahead = forward[:, floor] * signs
+    text = "the odometry was taken for one of optical axes (z forward, y down); state --odometry-frame to be sure"
+    warnings = (text,) if frame == "auto" and name != "rep103" else ()
+    return Trajectory(values[:, 0], position_m[:, floor] * signs, np.arctan2(ahead[:, 1], ahead[:, 0]), warnings)
+
+
+def _rise(position_m: Float[np.ndarray, "n 3"], floor: tuple[int, int]) -> float:
+    """Return 1 if the poses rise more than people and robots do on the way between them, else 0."""
+    extent = np.ptp(position_m, axis=0)
+    length_m = float(np.hypot(*extent[list(floor)]))
+    rise_m = float(extent[3 - sum(floor)])
+    return float(rise_m > max(_LEVEL * length_m, _SHORTEST_M))
+
+
+def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Return rotations from the body to the world; columns are the axes of the body.
+
+    Raises:
+        InvalidMotionError: a quaternion has no length.
+    """
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    if not (length > 0.5).all():
+        raise InvalidMotionError("a pose of the odometry has no rotation: qx qy qz qw must have the length 1")
+    x, y, z, w = (quaternions / length).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def tum_line(time_s: float, position_m: Float[np.ndarray, "2"], z_m: float, heading: float) -> str:
@@ -113,8 +177,7 @@ def _tum_row(line: str, number: int) -> list[float]:
         raise InvalidMotionError(
             f"pose {number} of the odometry has {len(values)} values; TUM lines have {_TUM_VALUES}"
         )
-    time_s, x, y, _, qx, qy, qz, qw = values
-    return [time_s, x, y, math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))]
+    return values
 
 
 def _number(text: str | None, number: int) -> float:
