@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-ECQAF2VS.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,b}from"./chunk-P34NXUW2.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
