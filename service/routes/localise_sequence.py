@@ -17,11 +17,10 @@ from service.routes.dependencies import ApiCall, Call
 from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
 from service.routes.query_request import FILM, PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import SequenceAnswer, SequenceForm
+from service.settings.settings import FILM_PHOTOGRAPHS
 
 router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
-# A film's frames have the time of as many photographs.
-_FILM_PHOTOGRAPHS = 40
 _FILM_SCHEMA = {
     "type": "string",
     "format": "binary",
@@ -104,7 +103,7 @@ def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCal
         raise InvalidRequestError(faults)
     if len(film) > limits.max_film_bytes:
         raise UploadTooLargeError("max_film_bytes", limits.max_film_bytes, len(film))
-    context = context.for_photographs(_FILM_PHOTOGRAPHS).with_time(limits.film_deadline_s)
+    context = context.for_photographs(FILM_PHOTOGRAPHS).with_time(limits.film_deadline_s)
     return SequenceQuery(form, (), context, film)
 
 
