@@ -12,6 +12,7 @@ Begin with `asynchronous/client.py`; `make client` generates `blocking/` from it
 from lalaloc_client.answers import (
     BatchAnswer,
     Candidate,
+    FilmReading,
     GeoPoseAnswer,
     Localisation,
     Model,
@@ -86,6 +87,7 @@ __all__ = [
     "ConflictError",
     "ConfusedRooms",
     "ConnectionFailedError",
+    "FilmReading",
     "FloorPlan",
     "FloorPlanFailedError",
     "FloorPlanSummary",

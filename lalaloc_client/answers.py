@@ -328,7 +328,11 @@ class GeoPoseAnswer:
 
 @dataclass(frozen=True)
 class SequencePose:
-    """Pose of one photograph of a sequence, from all of them jointly; attributes as in `Localisation`."""
+    """Pose of one photograph of a sequence, from all of them jointly; attributes as in `Localisation`.
+
+    Attributes:
+        time_s: time of the frame in the film; None for photographs.
+    """
 
     position: Position
     heading_deg: float
@@ -349,6 +353,32 @@ class SequencePose:
     camera_height_m: float | None = None
     floorplan_id: str | None = None
     level: float | None = None
+    time_s: float | None = None
+
+
+@dataclass(frozen=True)
+class DroppedFrames:
+    """Frames of a film that were not kept for one reason."""
+
+    reason: str
+    frames: int
+
+
+@dataclass(frozen=True)
+class FilmReading:
+    """Reading of a film: frames that were decoded, and that became poses.
+
+    Attributes:
+        turned_deg: angle that the camera turned through.
+        warnings: faults of the film: the camera walks, shakes or stands still, or nothing can be followed.
+    """
+
+    frames_read: int
+    frames_kept: int
+    dropped: tuple[DroppedFrames, ...]
+    duration_s: float
+    turned_deg: float
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -358,9 +388,10 @@ class SequenceLocalisation:
     Attributes:
         poses: one pose per photograph.
         confidence: probability that all position errors are below 1 m.
-        warnings: motions that were not followed.
+        warnings: motions that were not followed, and photographs of a turn that do not overlap.
         stage: `retrieval` or `lpo`.
         camera_height_m: the best common camera height.
+        film: reading of the film; None for photographs.
     """
 
     floorplan_id: str
@@ -373,6 +404,7 @@ class SequenceLocalisation:
     timings_ms: Mapping[str, float]
     model: Model
     venue_id: str | None = None
+    film: FilmReading | None = None
 
 
 @dataclass(frozen=True)

@@ -232,6 +232,22 @@ def query_request(
     return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content, streamed=streamed)
 
 
+def film_request(
+    path: str, film: bytes | str | os.PathLike[str], values: Mapping[str, object], options: ViewOptions
+) -> Request:
+    """Return a query about a film.
+
+    Raises:
+        TypeError: an option is unknown.
+        ValueError: a number is not finite.
+    """
+    if unknown := options.keys() - (ViewOptions.__optional_keys__ | ViewOptions.__required_keys__):
+        raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see ViewOptions")
+    content = film if isinstance(film, bytes) else Path(film).read_bytes()
+    media, body = _form("film", [("film", content)], {**values, **options})
+    return Request("POST", path, headers={"Content-Type": media, "Accept": JSON}, content=body)
+
+
 def geopose_request(
     photograph: Photograph,
     params: Mapping[str, Any],

@@ -6,6 +6,7 @@ LaLaLocError
 │   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
 │   ├── MissingExtraError        a format needs a package that is not installed; names the extra
 │   ├── InvalidPhotographError     a picture is not a usable photograph, or a statement about it is invalid
+│   ├── InvalidFilmError         a film cannot be read, exceeds a limit, or shows nothing
 │   ├── InvalidFeaturesError     features of a photograph are damaged or out of range
 │   ├── ForeignFeaturesError     features of a photograph are another model's
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
@@ -82,6 +83,10 @@ class MissingExtraError(InvalidInputError):
 
 class InvalidPhotographError(InvalidInputError):
     """A picture is not a usable photograph, or a statement about it is invalid."""
+
+
+class InvalidFilmError(InvalidInputError):
+    """A film cannot be read, exceeds a limit, or shows nothing."""
 
 
 class InvalidFeaturesError(InvalidInputError):

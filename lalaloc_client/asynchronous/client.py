@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import aclosing
@@ -50,6 +51,7 @@ from lalaloc_client.requests import (
     Request,
     SequenceRefine,
     ViewOptions,
+    film_request,
     geopose_request,
     json_request,
     plan_request,
@@ -488,7 +490,7 @@ class AsyncClient(AsyncTransport):
             venue_id: id of a venue, to search all its plans; poses have `floorplan_id` and `level`.
             motion: `turn` for photographs from one spot, else `walk`, the default.
             relative_heading_deg: for `turn`, headings relative to each other, clockwise, None where unknown. Default:
-                searched.
+                from what the photographs show twice; turn by at most half the field of view between them.
             relative_heading_std_deg: their standard deviation. Default: 2.
             motions: for `walk`, measurements between consecutive photographs, any of {"distance_m": 2.4,
                 "distance_std_m": 0.1, "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2},
@@ -521,6 +523,43 @@ class AsyncClient(AsyncTransport):
         }
         content = await self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
         return parse(SequenceLocalisation, content)
+
+    async def localise_film(
+        self,
+        floorplan_id: str | None,
+        film: bytes | str | os.PathLike[str],
+        *,
+        venue_id: str | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        refine: SequenceRefine | None = None,
+        top_k: int | None = None,
+        **options: Unpack[ViewOptions],
+    ) -> SequenceLocalisation:
+        """Localise a film of one slow turn, once around on the spot.
+
+        Args:
+            floorplan_id: id of the plan; None with `venue_id`.
+            film: content or path of an MP4, MOV or WebM file. The frames that the service keeps become poses, with
+                `time_s`; `film` of the answer tells how it was read.
+            venue_id: id of a venue, to search all its plans.
+            camera_height_m: camera height, as in `QueryOptions`.
+            camera_height_std_m: its standard deviation, as in `QueryOptions`.
+            refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
+            top_k: number of candidates per frame. Default: set by the service.
+            **options: the camera, see `ViewOptions`.
+        """
+        values = {
+            "floorplan_id": floorplan_id,
+            "venue_id": venue_id,
+            "motion": "turn",
+            "camera_height_m": camera_height_m,
+            "camera_height_std_m": camera_height_std_m,
+            "refine": refine,
+            "top_k": top_k,
+        }
+        request = await run_blocking(film_request, "/localise/sequence", film, values, options)
+        return parse(SequenceLocalisation, await self.content(request))
 
     def track(
         self, floorplan_id: str | None = None, *, venue_id: str | None = None, **options: Unpack[SessionOptions]

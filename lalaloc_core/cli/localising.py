@@ -43,10 +43,16 @@ def add_commands(commands: Any) -> None:
     localise.add_argument(
         "photographs",
         type=Path,
-        nargs="+",
+        nargs="*",
         metavar="PHOTO",
         help="full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md), or "
         "their features from `lalaloc encode`",
+    )
+    localise.add_argument(
+        "--turn",
+        type=Path,
+        metavar="FILM",
+        help="film of one slow turn on the spot, or a folder of photographs of one, instead of PHOTO",
     )
     localise.add_argument(
         "--heading",
@@ -89,6 +95,8 @@ def _localise(arguments: argparse.Namespace) -> None:
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
         raise InvalidInputError("--heading-tolerance needs --heading, which is missing")
+    if bool(arguments.photographs) == (arguments.turn is not None):
+        raise InvalidInputError("photographs and --turn exclude each other; give one or more photographs, or --turn")
     if arguments.out is not None:
         check_picture_name(arguments.out)
     plan = read_plan(arguments.plan, arguments).plan()
@@ -96,7 +104,8 @@ def _localise(arguments: argparse.Namespace) -> None:
     check_file_options(arguments, plan)
     stated, several = stated_camera(arguments), len(arguments.photographs) > 1
     documents, rows, places = [], [], []
-    for number, answer in enumerate(_answers(arguments, plan, stated)):
+    answers = _answers(arguments, plan, stated) if arguments.turn is None else [_turn_answer(arguments, plan, stated)]
+    for number, answer in enumerate(answers):
         documents.append(answer.document)
         if answer.drawn is None:
             print(f"error: {answer.document['error']}", file=sys.stderr)
@@ -108,7 +117,7 @@ def _localise(arguments: argparse.Namespace) -> None:
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
             # Features have no photograph to show.
-            picture = "plan" if is_features(answer.content) else arguments.picture
+            picture = "plan" if not answer.content or is_features(answer.content) else arguments.picture
             shown = None if picture == "plan" else _pixels(answer.drawn, answer.content, stated)
             title = answer.photograph.name if several else None
             write_picture(draw_answer(answer.drawn, shown, picture, title=title), out)
@@ -187,6 +196,43 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
             "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
         }
         yield _Found(path, content, drawn, _document(path, drawn) | details)
+
+
+def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamera) -> _Found:
+    """Return the answer for a turn, with the angles of its photographs.
+
+    Raises:
+        InvalidInputError: the film or the photographs cannot be read, or options do not go with a turn.
+    """
+    from tqdm import tqdm
+
+    from lalaloc_core.cli.turning import read_turn, turn_document
+    from lalaloc_core.draw.answer import drawn_answer
+    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+    from lalaloc_core.localise.query import stated_height
+
+    if arguments.heading is not None:
+        raise InvalidInputError("--heading does not go with --turn, whose headings are searched; leave it out")
+    path, bundle = arguments.turn, Bundle.open(arguments.bundle)
+    model = LocalModel(bundle)
+    height = stated_height(plan, arguments.camera_height)
+    with tqdm(total=2, desc="read the turn", disable=None, leave=False) as progress:
+        turn = read_turn(path, model, stated)
+        progress.update()
+        progress.set_description("localise")
+        grid = model.grid(plan, plan.camera_height_m if model.encoder.predicts_profile else height.height_m)
+        found = model.localise_turn(plan, grid, turn.photographs, turn.linked, height)
+    first, confidence = found.pictures[0], found.confidence(bundle.manifest)
+    confidence_model = bundle.manifest.confidence_for(view=first.query.is_view)
+    drawn = drawn_answer(plan, grid, first, confidence_model, _SOURCES["searched"], photograph=turn.photographs[0])
+    details = {
+        "stage": found.stage,
+        "heading_source": "searched",
+        "confidence": confidence,
+        "warnings": turn.warnings,
+        "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
+    }
+    return _Found(path, b"", drawn, _document(path, drawn) | details | turn_document(turn, found))
 
 
 def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:

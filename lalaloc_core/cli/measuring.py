@@ -21,6 +21,7 @@ _GROUPS = (
     "accuracy",
     "views",
     "turns",
+    "films",
     "localisability",
     "uninformative",
     "evidence",

@@ -54,6 +54,10 @@ class QueryContext:
         """Return the context with the deadline of a query of several photographs."""
         return replace(self, deadline=self.begin + self.limit_s * work_factor(count))
 
+    def with_time(self, seconds: float) -> Self:
+        """Return the context with a later deadline."""
+        return replace(self, deadline=self.deadline + seconds)
+
     @property
     def spent_s(self) -> float:
         """Time (s) since the end of the upload."""

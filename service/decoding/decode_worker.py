@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 
 from lalaloc_core.draw.canvas import rasterise
-from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.film import Film, read_film
+from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.photograph import open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_turn
@@ -25,10 +27,11 @@ from service.workers.process import limit_memory, serve_jobs
 
 @dataclass(frozen=True, kw_only=True)
 class DecodeSizes:
-    """Sizes of decoded photographs: height and width (pixels) of full spheres, and the patches of others."""
+    """Sizes of decoded photographs: height and width (pixels) of full spheres, patches of others; limits of films."""
 
     sphere: tuple[int, int]
     patch: PatchSize
+    film: FilmLimits
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,14 @@ class DecodeJob:
     content: bytes | UploadedFile
     stated: StatedCamera
     overview: bool = False
+
+
+@dataclass(frozen=True)
+class FilmJob:
+    """Uploaded film of a turn; the worker gets it as bytes."""
+
+    content: bytes | UploadedFile
+    stated: StatedCamera
 
 
 @dataclass(frozen=True)
@@ -66,13 +77,14 @@ class RasteriseJob:
 
 @dataclass(frozen=True)
 class DecodeRefusal:
-    """Reason why a picture is not a usable photograph."""
+    """Reason why a picture is not a usable photograph, or a film not a usable one."""
 
     reason: str
+    is_film: bool = False
 
 
-Job = DecodeJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
+Job = DecodeJob | FilmJob | TurnJob | ShowJob | RasteriseJob
+Result = Photograph | Film | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -100,6 +112,8 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
             return angles_of_turn(job.views)
         assert isinstance(job.content, bytes)
         try:
+            if isinstance(job, FilmJob):
+                return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
             if isinstance(job, DecodeJob):
                 return open_photograph(
                     job.content,
@@ -110,8 +124,8 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
                     overview=job.overview,
                 )
             return _shown(job, job.content, limits)
-        except InvalidPhotographError as error:
-            return DecodeRefusal(str(error))
+        except (InvalidPhotographError, InvalidFilmError) as error:
+            return DecodeRefusal(str(error), isinstance(error, InvalidFilmError))
 
     return work
 

@@ -6,6 +6,7 @@ affected. No client keeps all workers busy.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from time import monotonic
 
@@ -13,9 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Manifest
-from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView
 from service import errors
 from service.capacity.fair_share import FairSemaphore
@@ -23,6 +25,7 @@ from service.decoding.decode_worker import (
     DecodeJob,
     DecodeRefusal,
     DecodeSizes,
+    FilmJob,
     Job,
     RasteriseJob,
     Result,
@@ -39,6 +42,8 @@ from service.uploaded_file import UploadedFile
 _HELP = "docs/how-to/take-photographs.md"
 # Photographs that can wait to be decoded.
 _QUEUE = 32
+# Films that can wait, and the CPU time (s) of finding the angles of a film's frames.
+_FILM_QUEUE, _FILM_MARGIN_S = 4, 40.0
 
 
 class Decoder:
@@ -46,24 +51,27 @@ class Decoder:
 
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
         self._settings = settings
-        self._pool: WorkerPool[Job, Result] = WorkerPool(
-            WorkerSpec(
-                "decode",
-                run_decoder,
-                (
-                    DecodeSizes(sphere=sphere_size(manifest), patch=patch_size(manifest)),
-                    settings.photographs.photograph_limits,
-                    settings.decode.memory_bytes,
-                ),
-                stall_s=settings.decode.stall_s,
-            ),
-            workers=settings.decode.workers,
-            queue_limit=_QUEUE,
-            keep_spare=True,
-            accounts=telemetry.cpu_accounts,
-            permits=permits,
-            on_restart=lambda _reason: telemetry.note_restart("decode"),
+        sizes = DecodeSizes(
+            sphere=sphere_size(manifest), patch=patch_size(manifest), film=settings.photographs.film_limits
         )
+
+        def pool(name: str, stall_s: float, workers: int, queue_limit: int) -> WorkerPool[Job, Result]:
+            arguments = sizes, settings.photographs.photograph_limits, settings.decode.memory_bytes
+            return WorkerPool(
+                WorkerSpec(name, run_decoder, arguments, stall_s=stall_s),
+                workers=workers,
+                queue_limit=queue_limit,
+                keep_spare=True,
+                accounts=telemetry.cpu_accounts,
+                permits=permits,
+                on_restart=lambda _reason: telemetry.note_restart(name),
+            )
+
+        self._pool = pool("decode", settings.decode.stall_s, settings.decode.workers, _QUEUE)
+        # Films take so long that photographs must not wait for them.
+        self._film_stall_s = settings.photographs.max_film_cpu_s + _FILM_MARGIN_S
+        self._films = pool("film", self._film_stall_s, settings.decode.film_workers, _FILM_QUEUE)
+        self._films_started, self._lock = False, threading.Lock()
         telemetry.gauge(
             "lalaloc_decode_queue_depth", "Photographs waiting for a decoding worker.", lambda: self._pool.waiting
         )
@@ -116,6 +124,22 @@ class Decoder:
         assert isinstance(result, Photograph)
         return result
 
+    async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:
+        """Read a film of a turn; the first one starts the workers.
+
+        Raises:
+            InvalidFilmError: see `read_film`; or the film stalled a worker, or crashed two.
+            InvalidPhotographError: a statement is invalid.
+            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
+        """
+        with self._lock:
+            if not self._films_started:
+                self._films.start()
+                self._films_started = True
+        result = await self._run_job(FilmJob(content, stated), deadline, client)
+        assert isinstance(result, Film)
+        return result
+
     async def angles(self, views: Sequence[TurnView], deadline: float, client: str = "") -> list[TurnAngles]:
         """Return the angles of photographs of one spot, by what they show twice.
 
@@ -159,16 +183,22 @@ class Decoder:
 
     async def _run_job(self, job: Job, deadline: float, client: str) -> Result:
         try:
-            result = await self._pool.run_job(job, max(deadline - monotonic(), 0.0), client)
+            pool = self._films if isinstance(job, FilmJob) else self._pool
+            result = await pool.run_job(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
             raise self._error(error, job) from error
         if isinstance(result, DecodeRefusal):
-            raise InvalidPhotographError(f"{result.reason}; see {_HELP}")
+            refused = InvalidFilmError if result.is_film else InvalidPhotographError
+            raise refused(f"{result.reason}; see {_HELP}")
         return result
 
     def close(self) -> None:
         """End all workers and wait for them."""
         self._pool.close()
+        with self._lock:
+            if self._films_started:
+                self._films.close()
+            self._films_started = True
 
     def _error(self, lost: JobLostError, job: Job) -> Exception:
         """Return the service's error for a lost job."""
@@ -177,6 +207,8 @@ class Decoder:
         if isinstance(job, RasteriseJob) and lost.reason == "stalled":
             # Drawings have a bounded size, so the machine is slow.
             return errors.DeadlineExceededError(self._settings.decode.stall_s)
+        if isinstance(job, FilmJob) and (fault := self._film_fault(lost)) is not None:
+            return InvalidFilmError(fault)
         match lost.reason:
             case "poisoned":
                 return InvalidPhotographError("the photograph crashed the decoder twice: save it anew or smaller")
@@ -195,3 +227,12 @@ class Decoder:
                 return errors.StoppingError()
             case "deadline" | "died":
                 return errors.DeadlineExceededError(self._settings.requests.request_deadline_s)
+
+    def _film_fault(self, lost: JobLostError) -> str | None:
+        """Return the fault of a film that a worker could not read; None if the film is not to blame."""
+        return {
+            "poisoned": "the film crashed the decoder twice: export it anew",
+            "stalled": f"reading the film took more than {self._film_stall_s:g} s of CPU time "
+            "(LALALOC_MAX_FILM_CPU_S): send a film with fewer pixels, or a shorter one",
+            "fault": "the film is damaged: export it anew",
+        }.get(lost.reason)

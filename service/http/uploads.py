@@ -43,7 +43,7 @@ _LARGE_FIELD = f"has more than {_MAX_FIELD_BYTES} bytes, the limit of a field"
 _UTF_8 = b"utf-8"
 
 # Settings that limit an upload.
-Settable = Literal["max_plan_bytes", "max_photograph_bytes", "max_sequence_bytes", "max_venue_bytes"]
+Settable = Literal["max_plan_bytes", "max_photograph_bytes", "max_sequence_bytes", "max_film_bytes", "max_venue_bytes"]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -81,14 +81,16 @@ class UploadLimits:
 
 
 class Repeats(NamedTuple):
-    """Smallest and largest number of files of one name, and the setting of the largest."""
+    """Smallest and largest number of files of one name, and the setting of the largest, if it can be set."""
 
     least: int
     most: int
-    setting: str
+    setting: str = ""
 
     def fault(self, count: str) -> str:
         """Return the message about a wrong number of files."""
+        if not self.setting:
+            return f"is given {count} times; send one"
         return f"is given {count} times, {self.least} to {self.most} are needed (LALALOC_{self.setting.upper()})"
 
 
@@ -246,7 +248,7 @@ def _sort(
 ) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
-    repeated = {**repeated, **{other: repeated[name] for other, name in substitutes.items() if name in repeated}}
+    repeated = {**{other: repeated[name] for other, name in substitutes.items() if name in repeated}, **repeated}
     needed, given = files | (repeated.keys() - substitutes.keys()), {name for name, _ in items}
     files, counts = needed | substitutes.keys(), Counter[str]()
     for part, value in items:
@@ -273,11 +275,9 @@ def _sort(
             faults.append((label, _NO_FILE))
     substituted = {name for other, name in substitutes.items() if other in given}
     faults.extend((name, "is missing") for name in sorted(needed - given - substituted))
-    faults.extend(
-        (other, f"is given beside {name}; send one of the two")
-        for other, name in substitutes.items()
-        if {other, name} <= given
-    )
+    for name in sorted(set(substitutes.values())):
+        kinds = [kind for kind in (name, *substitutes) if kind in given and substitutes.get(kind, name) == name]
+        faults.extend((kind, f"is given beside {kinds[0]}; send one of the two") for kind in kinds[1:])
     for name, repeats in repeated.items():
         if name in given and not repeats.least <= counts[name] <= repeats.most:
             faults.append((name, repeats.fault(str(counts[name]))))

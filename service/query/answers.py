@@ -12,11 +12,14 @@ from lalaloc_core.localise.query import KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
+from lalaloc_core.photograph.film import Film
 from service.query.geopose import geopose_at
 from service.query.ground import Ground, PlacedCandidate
 from service.query.spots import Spot, view_answer
 from service.schemas import (
     CandidateAnswer,
+    DroppedFrames,
+    FilmAnswer,
     LocaliseAnswer,
     ModelAnswer,
     Position,
@@ -28,6 +31,8 @@ from service.schemas import (
 
 # Smaller probabilities are rounded to 0 in the answer.
 _MIN_PROBABILITY = 5e-7
+# Fields of a pose that the answer to a query about its photograph alone has too.
+_POSE_FIELDS = SequencePoseAnswer.model_fields.keys() & LocaliseAnswer.model_fields.keys()
 
 
 def compose_answer(
@@ -157,10 +162,7 @@ def compose_sequence_answer(
     return SequenceAnswer(
         floorplan_id=first.floorplan_id,
         floorplan_revision=first.floorplan_revision,
-        poses=[
-            SequencePoseAnswer(**{name: getattr(answer, name) for name in SequencePoseAnswer.model_fields})
-            for answer in answers
-        ],
+        poses=[SequencePoseAnswer(**{name: getattr(answer, name) for name in _POSE_FIELDS}) for answer in answers],
         confidence=found.confidence(manifest, share),
         warnings=[
             *(_motion_warning(index, motions[index]) for index in found.motions_contradicted),
@@ -186,3 +188,20 @@ def _motion_warning(index: int, motion: Motion) -> str:
     if motion.direction is not None:
         measured.append(f"direction_deg {math.degrees(motion.direction):.4g}")
     return f"motions[{index}] ({', '.join(measured)}) contradicts the photographs and was ignored"
+
+
+def film_answer(film: Film) -> FilmAnswer:
+    """Return the answer's part about its film."""
+    return FilmAnswer(
+        frames_read=film.frames,
+        frames_kept=len(film.photographs),
+        dropped=[DroppedFrames(reason=reason, frames=frames) for reason, frames in film.dropped.items()],
+        duration_s=film.duration_s,
+        turned_deg=math.degrees(film.turned),
+        warnings=list(film.warnings),
+    )
+
+
+def timed_poses(poses: Sequence[SequencePoseAnswer], film: Film) -> list[SequencePoseAnswer]:
+    """Return the poses of a film's frames with their times."""
+    return [pose.model_copy(update={"time_s": time_s}) for pose, time_s in zip(poses, film.times_s, strict=True)]

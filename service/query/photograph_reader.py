@@ -9,6 +9,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.stated_pose import known_heading
 from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from service.capacity.query_context import QueryContext
@@ -17,6 +18,7 @@ from service.query.executor import Executor
 from service.query.queries import Content
 from service.query.spots import Spot
 from service.schemas import LocaliseForm, PhotographForm, StatedHeading
+from service.uploaded_file import UploadedFile
 
 
 class PhotographReader:
@@ -66,6 +68,15 @@ class PhotographReader:
                 if found.stated is not None:
                     photographs[index] = found.applied(await decode(contents[index], found.stated))
         return photographs, angles
+
+    async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
+        """Read a film of a turn.
+
+        Raises:
+            InvalidFilmError, DecoderNotReadyError, StoppingError: see `Decoder.film`.
+        """
+        with context.clock.stage("decode"):
+            return await self._decoder.film(content, stated, context.deadline, context.client)
 
     def known_heading(
         self, form: LocaliseForm | StatedHeading | PhotographForm, north: float | None, photograph: Photograph

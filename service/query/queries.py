@@ -55,13 +55,16 @@ class SequenceQuery:
 
     Attributes:
         form: the validated form fields.
-        contents: the uploaded picture files, or what was read of their features, in the order in which they were taken.
+        contents: the uploaded picture files, or what was read of their features, in the order in which they were taken;
+            none if there is a film.
         context: client, deadline and clock.
+        film: the uploaded film of a turn.
     """
 
     form: SequenceForm
     contents: Sequence[Content]
     context: QueryContext
+    film: bytes | UploadedFile | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation,
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
 from lalaloc_core.localise.venue.merged_plans import GAP_M
 from lalaloc_core.photograph import Photograph
-from service.query.answers import compose_answer, compose_sequence_answer
+from lalaloc_core.photograph.film import Film
+from service.query.answers import compose_answer, compose_sequence_answer, film_answer, timed_poses
 from service.query.ground import Ground
 from service.query.grounds import Site
 from service.query.queries import SequenceQuery
@@ -45,16 +46,17 @@ class SequenceSearch:
             InvalidPoseError: a height per photograph is stated, and the model compares latents of one height.
             LaLaLocError: see `Localiser.localise`.
         """
-        form, context, count = query.form, query.context, len(query.contents)
+        form, context = query.form, query.context
         if form.camera_heights_m is not None and not self._parts.encoder.predicts_profile:
             raise InvalidPoseError(
                 "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
                 "give camera_height_m"
             )
         # Measured motions must not lead from one plan of a venue to its neighbour.
-        gap_m = GAP_M + max(map(_reach_m, form.steps(count)))
+        gap_m = GAP_M + max(map(_reach_m, form.steps(max(len(query.contents), 2))))
         site = await self._parts.grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
-        photographs, linked = await self._decode(query)
+        photographs, linked, film = await self._decode(query)
+        count = len(photographs)
         known = [
             self._parts.reader.known_heading(form.heading_of(index), site.north, photograph)
             for index, photograph in enumerate(photographs)
@@ -87,17 +89,22 @@ class SequenceSearch:
             extras: dict[str, object] = {"warnings": warnings}
             if isinstance(where, VenueRecord):
                 extras["venue_id"] = where.id
+            if film is not None:
+                extras |= {"film": film_answer(film), "poses": timed_poses(answer.poses, film)}
             return answer.model_copy(update=extras)
 
         return await self._parts.executor.compute(context, compose)
 
-    async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], LinkedTurn | None]:
-        """Return the photographs; of a turn without stated angles also what their overlap tells."""
+    async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], LinkedTurn | None, Film | None]:
+        """Return the photographs, or the film's frames, and the angles of a turn that their overlap tells."""
         form, reader = query.form, self._parts.reader
+        if query.film is not None:
+            film = await reader.film(query.film, form.stated_camera, query.context)
+            return list(film.photographs), LinkedTurn.of(film.angles), film
         if form.motion == "walk" or form.relative_heading_deg is not None:
-            return await reader.decode(query.contents, form.stated_camera, query.context), None
+            return await reader.decode(query.contents, form.stated_camera, query.context), None, None
         photographs, angles = await reader.decode_turn(query.contents, form.stated_camera, query.context)
-        return photographs, None if angles is None else LinkedTurn.of(angles)
+        return photographs, None if angles is None else LinkedTurn.of(angles), None
 
     async def _search_sequence(
         self,

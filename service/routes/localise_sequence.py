@@ -6,20 +6,29 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from lalaloc_core.errors import InvalidMotionError
+from lalaloc_core.errors import InvalidFilmError, InvalidMotionError
 from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http.accept import preferred
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, Parts, Repeats
-from service.query import Content, SequenceQuery
+from service.http.uploads import GEOJSON, JSON, Parts, Repeats, Settable
+from service.query import Content, QueryContext, SequenceQuery
 from service.query.geopose import geojson_features
 from service.routes.dependencies import ApiCall, Call
 from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
-from service.routes.query_request import PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
+from service.routes.query_request import FILM, PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import SequenceAnswer, SequenceForm
+from service.settings.settings import FILM_PHOTOGRAPHS
 
 router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
+_FILM_SCHEMA = {
+    "type": "string",
+    "format": "binary",
+    "description": f"Instead of `{PHOTO}`, for `motion=turn`: a film of one slow turn, once around on the spot: MP4, "
+    "MOV or WebM with H.264, HEVC, VP8 or VP9. Limits: `max_film_bytes`, `max_film_s`, `max_film_pixels`, "
+    "`max_film_cpu_s`. "
+    "Sharp frames at equal angles become poses.",
+}
 _PHOTOS_SCHEMA: dict[str, Any] = {
     "type": "array",
     "items": {"type": "string", "format": "binary"},
@@ -33,29 +42,30 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
     "/localise/sequence",
     summary="Localise several photographs of one visit",
     response_model=SequenceAnswer,
-    openapi_extra=body_schema(SequenceForm, _PHOTOS_SCHEMA),
+    openapi_extra=body_schema(SequenceForm, _PHOTOS_SCHEMA, film=_FILM_SCHEMA),
     responses={
         200: {"content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}}}
     }
-    | problem_responses(InvalidMotionError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
+    | problem_responses(
+        InvalidMotionError, InvalidFilmError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS
+    ),
 )
 async def localise_sequence(call: Call) -> Response:
     """Localise several photographs of one visit together in a stored floor plan, or in the plans of a venue.
 
     Measured motions between them resolve places that look alike. Photographs that were taken while turning on one spot
-    (`motion=turn`) are together as certain as one with a wider field of view; send `relative_heading_deg` if it is
-    known. In a venue, every pose has its `floorplan_id` and `level`. With `Accept: application/geo+json` the answer is
-    a GeoJSON FeatureCollection, one Feature per photograph, for plans and venues with an `anchor`. The query waits for
-    a plan that is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls back to the best
-    path on the pose grid, with `"stage": "retrieval"`.
+    (`motion=turn`) are together as certain as one with a wider field of view; their angles follow from their overlap,
+    and a `film` of the turn can be sent instead of them. In a venue, every pose has its `floorplan_id` and `level`.
+    With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection, one Feature per photograph, for plans
+    and venues with an `anchor`. The query waits for a plan that is still preparing. If pose refinement (`lpo`) is not
+    done in time, the answer falls back to the best path on the pose grid, with `"stage": "retrieval"`.
     """
     media = preferred(call.request, (JSON, GEOJSON))
     idempotent = call.idempotent(media)
     most = call.settings.photographs.max_sequence_photographs
-    repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs")}
-    form, parts, context = await read_query(call, SequenceForm, "max_sequence_bytes", repeated=repeated)
-    photographs = _photographs(parts, form, call)
-    query = SequenceQuery(form, photographs, context.for_photographs(len(photographs)))
+    repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs"), FILM: Repeats(1, 1)}
+    form, parts, context = await read_query(call, SequenceForm, _largest(call), repeated=repeated, film=True)
+    query = _query(parts, form, context, call)
 
     async def respond(_token: str) -> Response:
         place = await call.place(form.floorplan_id, form.venue_id)
@@ -65,6 +75,36 @@ async def localise_sequence(call: Call) -> Response:
         return answer_as(found, media, geojson_features)
 
     return await idempotent.run_async(parts, respond, call.runtime.reads)
+
+
+def _largest(call: ApiCall) -> Settable:
+    """Return the setting that limits the body: that of films or that of photographs."""
+    limits = call.settings.photographs
+    return "max_film_bytes" if limits.max_film_bytes > limits.max_sequence_bytes else "max_sequence_bytes"
+
+
+def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCall) -> SequenceQuery:
+    """Return the query about the film or the photographs of a request.
+
+    Raises:
+        UploadTooLargeError: the film, or the photographs, are larger than allowed.
+        LaLaLocError: see `_photographs`.
+    """
+    limits = call.settings.photographs
+    films = parts.named(FILM)
+    if not films:
+        total = sum(map(len, parts.files.values()))
+        if total > limits.max_sequence_bytes:
+            raise UploadTooLargeError("max_sequence_bytes", limits.max_sequence_bytes, total)
+        photographs = _photographs(parts, form, call)
+        return SequenceQuery(form, photographs, context.for_photographs(len(photographs)))
+    (film,) = films
+    if faults := form.film_faults():
+        raise InvalidRequestError(faults)
+    if len(film) > limits.max_film_bytes:
+        raise UploadTooLargeError("max_film_bytes", limits.max_film_bytes, len(film))
+    context = context.for_photographs(FILM_PHOTOGRAPHS).with_time(limits.film_deadline_s)
+    return SequenceQuery(form, (), context, film)
 
 
 def _photographs(parts: Parts, form: SequenceForm, call: ApiCall) -> list[Content]:

@@ -35,7 +35,7 @@ from service.schemas import LocaliseAnswer, LocaliseForm, PhotographForm, Sequen
 from service.schemas.photographs import PhotographFields
 from service.storage.records import PlanRecord, VenueRecord
 
-PHOTO, FEATURES = "photo", "features"
+PHOTO, FEATURES, FILM = "photo", "features", "film"
 # Name of the part in versions up to 0.5.
 PANORAMA = "panorama"
 VARY = {"Vary": "Accept"}
@@ -43,12 +43,15 @@ Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
 Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 
 
-def body_schema(form: type[BaseModel], photo: Mapping[str, Any], *, idempotent: bool = True) -> dict[str, Any]:
+def body_schema(
+    form: type[BaseModel], photo: Mapping[str, Any], *, film: Mapping[str, Any] | None = None, idempotent: bool = True
+) -> dict[str, Any]:
     """Return the description of a query's body, and of its idempotency key.
 
     Args:
         form: fields of the body.
         photo: schema of its photographs.
+        film: schema of a film that can be sent instead.
         idempotent: tells whether the route takes an idempotency key.
     """
     schema = form.model_json_schema(ref_template="#/components/schemas/{model}")
@@ -62,7 +65,9 @@ def body_schema(form: type[BaseModel], photo: Mapping[str, Any], *, idempotent: 
         "description": f"Instead of `{PHOTO}`: its features, computed on the device with the image encoder of this "
         "service (`GET /model/{file}`; docs/reference/features.md), so that the photograph stays there.",
     }
-    # One of the three is needed. None is described as required, because of alternatives generated clients make a union
+    if film is not None:
+        schema["properties"][FILM] = dict(film)
+    # One of these is needed. None is described as required, because of alternatives generated clients make a union
     # of types.
     body = {"required": True, "content": {MULTIPART: {"schema": schema}}}
     return {"requestBody": body} | ({"parameters": [IDEMPOTENCY_KEY]} if idempotent else {})
@@ -75,6 +80,7 @@ async def read_query(
     *,
     files: Collection[str] = (),
     repeated: Mapping[str, Repeats] | None = None,
+    film: bool = False,
 ) -> tuple[Form, Parts, QueryContext]:
     """Read the form of a query and start the clock of its deadline.
 
@@ -84,6 +90,7 @@ async def read_query(
         limit: name of the setting that limits the body.
         files: see `read_parts`.
         repeated: see `read_parts`.
+        film: a film can be sent instead of photographs.
 
     Returns:
         the form, all parts, and the context of the query.
@@ -113,13 +120,13 @@ async def read_query(
                 check=partial(faults_of, form_type, context=bounds),
                 repeated=repeated or {},
                 aliases={PANORAMA: PHOTO},
-                substitutes={FEATURES: PHOTO},
+                substitutes={FEATURES: PHOTO} | ({FILM: PHOTO} if film else {}),
             )
         except errors.UploadTooLargeError as error:
             if settings.photographs.require_features:
                 raise errors.FeaturesRequiredError from error
             raise
-    if settings.photographs.require_features and parts.named(PHOTO):
+    if settings.photographs.require_features and (parts.named(PHOTO) or parts.named(FILM)):
         raise errors.FeaturesRequiredError
     context = QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)

@@ -37,7 +37,14 @@ from service.schemas.localise_answer import (
 )
 from service.schemas.localise_query import LocaliseForm
 from service.schemas.query_fields import EarthPoint
-from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
+from service.schemas.sequence import (
+    DroppedFrames,
+    FilmAnswer,
+    SequenceAnswer,
+    SequenceForm,
+    SequencePoseAnswer,
+    StatedHeading,
+)
 from service.schemas.sessions import (
     PathPoint,
     PhotographForm,

@@ -171,6 +171,13 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
             if given is not None and len(given) != count
         ]
 
+    def film_faults(self) -> list[tuple[str, str]]:
+        """Return (field, message) for fields that do not go with a film."""
+        faults = [] if self.motion == "turn" else [("motion", "is 'walk'; a film needs motion=turn")]
+        names = ("relative_heading_deg", "headings_deg")
+        given = [name for name in names if getattr(self, name) is not None]
+        return faults + [(name, "does not go with a film, whose frames are chosen by the service") for name in given]
+
     def steps(self, photographs: int) -> list[Motion]:
         """Return the motions between the photographs, unknown ones included."""
         if self.motion == "turn":
@@ -222,8 +229,29 @@ class SequencePoseAnswer(ResponseModel):
     latent_distance: Score
     geopose: GeoPose | None = None
     view: ViewAnswer | None = None
+    time_s: float | None = Field(default=None, description="Time of the frame in the film; null for photographs.")
     candidates: list[CandidateAnswer] = Field(
         description="Poses on the best paths, best path first; the first is the answer."
+    )
+
+
+class DroppedFrames(ResponseModel):
+    """Frames of a film that were not kept for one reason."""
+
+    reason: str
+    frames: int
+
+
+class FilmAnswer(ResponseModel):
+    """Reading of a film."""
+
+    frames_read: int = Field(description="Frames that were decoded.")
+    frames_kept: int = Field(description="Frames that became poses.")
+    dropped: list[DroppedFrames] = Field(description="Frames that were not kept, by reason.")
+    duration_s: float = Field(description="Time of the last frame.")
+    turned_deg: float = Field(description="Angle that the camera turned through, by optical flow.")
+    warnings: list[str] = Field(
+        description="Faults of the film: the camera walks, shakes or stands still, or nothing can be followed."
     )
 
 
@@ -243,6 +271,7 @@ class SequenceAnswer(ResponseModel):
         "a turn that do not overlap, plans of a venue that were not searched, and warnings about photographs, such as "
         "`photo[0]: …`."
     )
+    film: FilmAnswer | None = Field(default=None, description="Reading of the film; null for photographs.")
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
     camera_height_m: Metres = Field(description="Camera height of the first photograph that fits all photographs best.")
     timings_ms: TimingsAnswer

@@ -13,8 +13,11 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS as _PLAN
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.importers import DEFAULT_IMPORT_LIMITS as _IMPORT
 from lalaloc_core.importers import ImportLimits
+from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.spheres import PhotographLimits
 from service.settings.setting_types import Area, Count, HostNames, IssuerUrl, Metres, Origins, PortMapping, Seconds
+
+_FILM = FilmLimits()
 
 
 class SettingGroup(BaseModel):
@@ -94,7 +97,10 @@ class DecodeSettings(SettingGroup):
         description="CPU time limit for decoding one photograph; the process is then replaced and the query fails.",
     )
     memory_bytes: int = Field(
-        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one photograph; enforced on Linux."
+        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one photograph or film; enforced on Linux."
+    )
+    film_workers: int = Field(
+        default=1, ge=1, le=64, description="Processes that read films, one at a time each; started on first use."
     )
 
 
@@ -463,6 +469,15 @@ class PhotographSettings(SettingGroup):
     )
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a photograph.")
     max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")
+    max_film_bytes: Count = Field(default=_FILM.max_bytes, description="Size of a film's file.")
+    max_film_s: Seconds = Field(default=_FILM.max_s, description="Duration of a film.")
+    max_film_pixels: Count = Field(default=_FILM.max_pixels, description="Pixels of a film: width times height.")
+    max_film_cpu_s: Seconds = Field(
+        default=_FILM.max_cpu_s, description="CPU time limit for decoding a film; finding its angles has 40 s more."
+    )
+    film_deadline_s: Seconds = Field(
+        default=120.0, description="Timeout for reading a film, besides that of the query for its frames."
+    )
     max_top_k: int = Field(default=10, ge=1, le=100, description="Candidates per answer.")
     compass_tolerance_deg: float = Field(
         default=20.0,
@@ -480,6 +495,16 @@ class PhotographSettings(SettingGroup):
     def photograph_limits(self) -> PhotographLimits:
         """Limits of photographs, for the core."""
         return PhotographLimits(max_pixels=self.max_pixels, max_scans=self.max_scans)
+
+    @property
+    def film_limits(self) -> FilmLimits:
+        """Limits of films, for the core."""
+        return FilmLimits(
+            max_bytes=self.max_film_bytes,
+            max_s=self.max_film_s,
+            max_pixels=self.max_film_pixels,
+            max_cpu_s=self.max_film_cpu_s,
+        )
 
 
 def _items(text: str) -> frozenset[str]:

@@ -30,6 +30,9 @@ _DEFAULT_UPLOADS = 38
 # Photographs of a sequence within the time limits of one query.
 _PHOTOGRAPHS_PER_LIMIT = 10
 
+# A film's frames have the time of as many photographs.
+FILM_PHOTOGRAPHS = 40
+
 # Settings of earlier versions. A variable that sets one is ignored with a warning.
 _REMOVED = frozenset(
     {
@@ -158,8 +161,10 @@ class Settings(BaseModel):
 
     @property
     def sequence_deadline_s(self) -> float:
-        """Timeout for the longest sequence query after its upload."""
-        return self.requests.request_deadline_s * work_factor(self.photographs.max_sequence_photographs)
+        """Timeout for the longest sequence query, or query about a film, after its upload."""
+        photographs, limit_s = self.photographs, self.requests.request_deadline_s
+        film_s = limit_s * work_factor(FILM_PHOTOGRAPHS) + photographs.film_deadline_s
+        return max(limit_s * work_factor(photographs.max_sequence_photographs), film_s)
 
     @property
     def database_url(self) -> str:

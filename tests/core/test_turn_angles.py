@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ ONCE_AROUND = [24.0 * index for index in range(15)]
 ROOM_M, AXIS_M = np.array([5.5, 4.5, 2.5]), np.array([2.9, 2.1, 1.5])
 
 
-def photographs(headings_deg: Sequence[float], room: str = "living_room", **stated: float) -> list[Photograph]:
+def photographs(headings_deg: Sequence[float], room: str = "living_room", **stated: Any) -> list[Photograph]:
     pitches_deg = itertools.cycle([4.0, -6.0, 1.0])
     pictures = [
         jpeg(take(sphere(room), PORTRAIT, heading_deg=heading, pitch_deg=pitch))

@@ -13,7 +13,7 @@ type Text = Readonly<Record<string, string>>;
 type Form<Name extends keyof operations> = operations[Name] extends {
   requestBody?: { content: { "multipart/form-data": infer Body } };
 }
-  ? Partial<Omit<Body, "photo" | "features" | "panorama" | "file">>
+  ? Partial<Omit<Body, "photo" | "features" | "film" | "panorama" | "file">>
   : never;
 /** Fields of a form; lists and objects are sent as JSON, undefined and null are left out. */
 export type Fields<Name extends keyof operations> = Form<Name> | Text;
@@ -89,6 +89,12 @@ export class Client {
   original = async (id: string) => (await this.request(of("floorplans", id, "/original"))).blob();
   localise = (fields: Fields<"localise">, photo: Picture, options: CallOptions = {}) =>
     this.json<Schemas["LocaliseAnswer"]>("/localise", { ...options, ...query(fields, photo) });
+  /** Localise a film of one slow turn on the spot. */
+  localiseFilm = (fields: Fields<"localiseSequence">, film: Blob, options: CallOptions = {}) =>
+    this.json<Schemas["SequenceAnswer"]>("/localise/sequence", {
+      ...options,
+      ...form({ ...fields, motion: "turn" }, "film", film),
+    });
   /** Localise photographs of one visit, in the order in which they were taken; all of them as features, or none. */
   localiseSequence = (fields: Fields<"localiseSequence">, photos: Picture[], options: CallOptions = {}) =>
     this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...query(fields, ...photos) });

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -16,6 +17,7 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
@@ -27,7 +29,12 @@ from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, 
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, Refiner, StageClock, localise
+from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence
+from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
+from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
@@ -182,6 +189,49 @@ class LocalModel:
     def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
         """Search a plan."""
         return localise(plan, grid, self.encoder, query, refiner=self.refiner)
+
+    def open_turn(
+        self, contents: Sequence[bytes], stated: StatedCamera | None = None
+    ) -> tuple[list[Photograph], list[TurnAngles]]:
+        """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells.
+
+        Raises:
+            InvalidPhotographError: a photograph cannot be read, or is a sphere.
+        """
+        stated, manifest = stated or StatedCamera(), self.bundle.manifest
+        sizes = {"sphere_size": sphere_size(manifest), "patch_size": patch_size(manifest)}
+        photographs = [open_photograph(content, stated=stated, overview=True, **sizes) for content in contents]
+        if any(photograph.overview is None for photograph in photographs):
+            raise InvalidPhotographError("a full sphere is among the photographs; localise it by itself")
+        views = turn_views(photographs)
+        angles = angles_of_turn(views)
+        for index, turned in enumerate(turned_photographs(photographs, views, stated, angles)):
+            if turned.stated is not None:
+                photographs[index] = turned.applied(open_photograph(contents[index], stated=turned.stated, **sizes))
+        return photographs, angles
+
+    def localise_turn(
+        self,
+        plan: FloorPlan,
+        grid: PoseGrid,
+        photographs: Sequence[Photograph],
+        linked: LinkedTurn,
+        height: CameraHeight,
+    ) -> SequenceLocalisation:
+        """Search the place of photographs of one spot, and the angles that are not known."""
+
+        def as_one(turns: Sequence[float]) -> Localisation:
+            others = list(zip(photographs[1:], turns[1:], strict=True))
+            query = self.encoder.query(photographs[0], None, height, others=others)
+            config = LocaliseConfig(vdr_candidates=0)
+            return localise(plan, grid, self.encoder, query, refiner=self.refiner, config=config)
+
+        if linked.turns is not None:
+            return localised_turn(as_one(linked.turns), linked.turns)
+        queries = [self.encoder.query(photographs[index], None, height) for index in linked.order]
+        found = localise_sequence(plan, grid, self.encoder, queries, linked.motions, refiner=refine_sequence)
+        found = linked.in_order(found)
+        return judged_turn(found, as_one(found_turns(found)))
 
 
 def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:

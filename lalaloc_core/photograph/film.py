@@ -1,0 +1,351 @@
+"""Films of a turn on one spot: sharp frames at equal angles, with the angles between them.
+
+FFmpeg, in OpenCV, reads the film from memory with the demuxer that its first bytes call for, and no protocol: playlists
+and references to other files open nothing. Optical flow between samples tells how far the camera has turned, so that of
+each angle the sharpest frame is kept; overlap tells the angles between these (`turn_angles.py`).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from time import process_time
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.errors import InvalidFilmError
+from lalaloc_core.photograph.exif import ExifLens
+from lalaloc_core.photograph.film_limits import FilmLimits
+from lalaloc_core.photograph.film_motion import FlowTracker
+from lalaloc_core.photograph.patches import PatchSize
+from lalaloc_core.photograph.photo_sphere import PhotoSphere
+from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
+from lalaloc_core.photograph.projection import find_lens
+from lalaloc_core.photograph.stated_camera import StatedCamera
+from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
+from lalaloc_core.photograph.turned import turn_views, turned_photographs
+
+# Demuxers of FFmpeg by the kind of file; a kind is told by its first bytes.
+_DEMUXERS = {"MP4 or MOV": "mov", "WebM": "matroska"}
+_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+_EBML, _WEBM, _HEAD = b"\x1a\x45\xdf\xa3", b"webm", 64
+_CODECS = {b"h264": "H.264", b"avc1": "H.264", b"hevc": "HEVC", b"hvc1": "HEVC", b"hev1": "HEVC", b"VP90": "VP9"}
+_CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8"}
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+# Samples per second, and of a whole film.
+_RATE, _SAMPLES = 12.0, 240
+# Longer side (pixels) of kept frames.
+_LONG_SIDE = 960
+# Mean grey level of frames that are too dark.
+_DARK = 12.0
+# Standard deviation (radians) of turns by optical flow: constant, and as a share of the turn.
+_FLOW_SD, _FLOW_SHARE = math.radians(2.0), 0.04
+# Largest turn (radians, by optical flow, which can be wrong by a third) whose frames are kept.
+_MOST_TURN = 1.5 * TWO_PI
+# Turn (radians) that a film shows at least.
+_LEAST_TURN = math.radians(30.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Film:
+    """Frames of a turn that were kept of a film.
+
+    Attributes:
+        photographs: the frames as photographs, in the order of the film.
+        times_s: their times.
+        angles: their angles.
+        frames: number of frames that were read.
+        dropped: numbers of frames that were not kept, by reason.
+        duration_s: time of the last frame.
+        turned: angle (radians) that the camera turned through.
+        warnings: faults of the film.
+    """
+
+    photographs: tuple[Photograph, ...]
+    times_s: tuple[float, ...]
+    angles: tuple[TurnAngles, ...]
+    frames: int
+    dropped: Mapping[str, int]
+    duration_s: float
+    turned: float
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class _Sample:
+    """A frame that can be kept: its time, angle by optical flow, sharpness and picture."""
+
+    time_s: float
+    heading: float
+    sharpness: float
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(eq=False)
+class _Samples:
+    """Sharpest frames by angle, and what became of the others."""
+
+    full_size: tuple[int, int] = (0, 0)
+    best: dict[int, _Sample] = field(default_factory=dict)
+    dropped: Counter[str] = field(default_factory=Counter)
+    frames: int = 0
+    last_s: float = 0.0
+
+    def add(self, sample: _Sample, step: float) -> None:
+        """Keep a sample if it is the sharpest of its angle."""
+        place = round(sample.heading / step)
+        rival = self.best.get(place)
+        if rival is None and len(self.best) >= _MOST_TURN / step:
+            self.dropped["after more than a turn"] += 1
+            return
+        if rival is None or sample.sharpness > rival.sharpness:
+            self.best[place] = sample
+        if rival is not None:
+            self.dropped["less sharp than another of this angle"] += 1
+
+
+def read_film(
+    content: bytes,
+    *,
+    stated: StatedCamera | None = None,
+    patch_size: PatchSize | None = None,
+    limits: FilmLimits | None = None,
+) -> Film:
+    """Read a film of a turn on one spot.
+
+    Args:
+        content: the file: MP4, MOV or WebM with H.264, HEVC, VP8 or VP9.
+        stated: the caller's statements about the camera.
+        patch_size: size of the patches of its frames.
+        limits: limits of the film.
+
+    Raises:
+        InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
+        InvalidPhotographError: a statement is invalid.
+    """
+    stated, limits, size = stated or StatedCamera(), limits or FilmLimits(), patch_size or PatchSize()
+    stated.check()
+    if stated.projection == "auto":
+        stated = replace(stated, projection="perspective")
+    if len(content) > limits.max_bytes:
+        raise InvalidFilmError(
+            f"the film has {len(content)} bytes; the limit is {limits.max_bytes} (LALALOC_MAX_FILM_BYTES)"
+        )
+    tracker = FlowTracker(_field(stated))
+    samples = _sampled(content, tracker, limits)
+    kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
+    if not kept:
+        raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
+    photographs, angles = _turned([sample.picture for sample in kept], samples.full_size, stated, size)
+    tracker.calibrate(photographs[0].hfov.value, samples.full_size)
+    tracked = tracker.scale * np.array([sample.heading for sample in kept])
+    return Film(
+        photographs=tuple(photographs),
+        times_s=tuple(sample.time_s for sample in kept),
+        angles=tuple(_joined(angles, tracked)),
+        frames=samples.frames,
+        dropped=dict(samples.dropped),
+        duration_s=samples.last_s,
+        turned=tracker.turned,
+        warnings=tuple(_warnings(tracker)),
+    )
+
+
+def _turned(
+    pictures: Sequence[UInt8[np.ndarray, "h w 3"]], full_size: tuple[int, int], stated: StatedCamera, size: PatchSize
+) -> tuple[list[Photograph], list[TurnAngles]]:
+    """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
+
+    def photograph(picture: np.ndarray, statement: StatedCamera, *, overview: bool) -> Photograph:
+        nothing = ExifLens(), PhotoSphere()
+        lens = find_lens(
+            *full_size, stated=statement, sphere=nothing[1], exif=nothing[0], looks_spherical=lambda: False
+        )
+        return photograph_of_picture(picture, full_size, lens, statement, size, overview=overview)
+
+    photographs = [photograph(picture, stated, overview=True) for picture in pictures]
+    views = turn_views(photographs)
+    angles = angles_of_turn(views)
+    for index, found in enumerate(turned_photographs(photographs, views, stated, angles)):
+        if found.stated is not None:
+            again = photograph(pictures[index], found.stated, overview=False)
+            photographs[index] = found.applied(again)
+    return photographs, angles
+
+
+def _joined(angles: Sequence[TurnAngles], tracked: Float[np.ndarray, "n"]) -> list[TurnAngles]:
+    """Return the angles as one group, groups being joined by the turns that optical flow tells."""
+    joined = list(angles)
+    heading = np.array([angle.heading for angle in angles])
+    group = np.array([angle.group for angle in angles])
+    offset = {
+        number: float(np.angle(np.exp(1j * (tracked - heading)[group == number]).sum()))
+        for number in set(group.tolist())
+    }
+    for index, angle in enumerate(angles):
+        if angle.group:
+            turn = float(wrap_angle(angle.heading + offset[angle.group] - offset[0]))
+            apart = float(np.abs(tracked[index] - tracked[group == 0]).min())
+            heading_sd = math.hypot(angle.heading_sd, _FLOW_SD + _FLOW_SHARE * apart)
+            joined[index] = replace(angle, group=0, heading=turn, heading_sd=heading_sd)
+    return joined
+
+
+def _warnings(tracker: FlowTracker) -> list[str]:
+    warnings = []
+    if tracker.turned < _LEAST_TURN:
+        warnings.append(
+            f"the camera turns by {math.degrees(tracker.turned):.0f}° only: film one slow turn, once around on the spot"
+        )
+    if tracker.walks:
+        warnings.append(
+            "the camera walks: things grow or shift as they do not in a turn; stay on one spot, and turn about yourself"
+        )
+    if tracker.shakes:
+        warnings.append(
+            f"the camera shakes: it nods by {math.degrees(tracker.nod):.1f}° from one sample to the next; hold it with "
+            "both hands, and turn slowly"
+        )
+    if tracker.lost_share > 0.5:
+        warnings.append(
+            f"{100.0 * tracker.lost_share:.0f} % of the film shows nothing that can be followed, such as blank walls "
+            "or blur: its angles are less sure; turn slowly, in a lit room"
+        )
+    return warnings
+
+
+def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Samples:
+    """Decode a film, and return its sharpest frames by angle.
+
+    Raises:
+        InvalidFilmError: the film cannot be read, or exceeds a limit.
+    """
+    begin, samples = process_time(), _Samples()
+    with _opened(content, limits) as (capture, claimed_s):
+        interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
+        next_s = 0.0
+        while capture.grab():
+            samples.frames += 1
+            time_s = max(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), samples.last_s)
+            samples.last_s = time_s
+            if time_s > limits.max_s:
+                raise _too_long(time_s, limits)
+            if process_time() - begin > limits.max_cpu_s:
+                raise InvalidFilmError(
+                    f"decoding took more than {limits.max_cpu_s:g} s of CPU time for the first {time_s:.1f} s of the "
+                    "film, the limit (LALALOC_MAX_FILM_CPU_S): send a film with fewer pixels, or a shorter one"
+                )
+            if time_s + 1e-6 < next_s:
+                samples.dropped["between samples"] += 1
+                continue
+            next_s = time_s + interval_s
+            seen, frame = capture.retrieve()
+            if not seen or frame is None:
+                samples.dropped["damaged"] += 1
+                continue
+            _sample(frame, time_s, samples, tracker)
+    if not samples.frames:
+        raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
+    return samples
+
+
+def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
+    height, width = frame.shape[:2]
+    if samples.full_size == (0, 0):
+        samples.full_size = width, height
+    if samples.full_size != (width, height):
+        samples.dropped["of another size"] += 1
+        return
+    share = min(_LONG_SIDE / max(width, height), 1.0)
+    picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    if float(grey.mean()) < _DARK:
+        samples.dropped["dark"] += 1
+        return
+    heading = tracker.follow(grey)
+    sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
+    samples.add(_Sample(time_s, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step)
+
+
+@contextmanager
+def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCapture, float]]:
+    """Open a film in memory; yield it with the duration (s) that it claims."""
+    kind = film_kind(content)
+    if kind is None:
+        raise InvalidFilmError(
+            "the file is no MP4, MOV or WebM film by its first bytes; record or export the film in one of these formats"
+        )
+    before = os.environ.get(_OPTIONS)
+    # No protocol: everything is in memory. FFmpeg would otherwise choose among all of its demuxers by the content.
+    os.environ[_OPTIONS] = f"input_format;{_DEMUXERS[kind]}|protocol_whitelist;none|enable_drefs;0"
+    # It outlives the capture, which reads from it until it is released.
+    stream = io.BytesIO(content)
+    try:
+        capture = cv2.VideoCapture(stream, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])  # pyright: ignore
+    except cv2.error as error:
+        raise InvalidFilmError(f"the film is damaged: {error.err}") from error
+    finally:
+        if before is None:
+            del os.environ[_OPTIONS]
+        else:
+            os.environ[_OPTIONS] = before
+    try:
+        yield capture, _checked(capture, kind, limits)
+    finally:
+        capture.release()
+
+
+def film_kind(content: bytes) -> str | None:
+    """Return the kind of a film by its first bytes: "MP4 or MOV" or "WebM"; None for other files."""
+    if content[4:8] in _BOXES:
+        return "MP4 or MOV"
+    if content[:4] == _EBML and _WEBM in content[4:_HEAD]:
+        return "WebM"
+    return None
+
+
+def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
+    """Check a film's header; return the duration (s) that it claims.
+
+    Raises:
+        InvalidFilmError: no pictures, another codec, too many pixels, or too long.
+    """
+    if not capture.isOpened():
+        raise InvalidFilmError(f"the {kind} file has no film that can be read: it is damaged, or holds sound only")
+    code = struct.pack("<I", int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF)
+    if code not in _CODECS:
+        known = ", ".join(sorted(set(_CODECS.values())))
+        name = code.decode("ascii", "replace").strip("\0 ") or "unknown"
+        raise InvalidFilmError(f"the film's codec is '{name}'; it must be one of {known}: export it anew")
+    width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > limits.max_pixels:
+        raise InvalidFilmError(
+            f"the film has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
+            "(LALALOC_MAX_FILM_PIXELS): record in 4K or less"
+        )
+    rate, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    claimed_s = frames / rate if rate > 0.0 and frames > 0.0 and math.isfinite(rate) else 0.0
+    if claimed_s > limits.max_s + 1.0:
+        raise _too_long(claimed_s, limits)
+    return claimed_s
+
+
+def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
+    return InvalidFilmError(
+        f"the film is longer than {limits.max_s:g} s, the limit (LALALOC_MAX_FILM_S): it has {seconds:.0f} s at least; "
+        "cut it to one turn"
+    )
+
+
+def _field(stated: StatedCamera) -> float | None:
+    """Return the stated horizontal field of view (radians)."""
+    return None if stated.hfov_deg is None else math.radians(stated.hfov_deg)

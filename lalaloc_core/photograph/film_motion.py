@@ -1,0 +1,137 @@
+"""Motion of the camera of a film, about, by optical flow from sample to sample."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+# Longer side (pixels) of the pictures that are compared, corners of one, their quality and distance (pixels).
+_LONG_SIDE, _CORNERS, _QUALITY, _APART = 400, 200, 0.01, 6
+# Least number of corners that must be found again, and the largest error (pixels) of those that move together.
+_LEAST, _TOGETHER = 8, 3.0
+# Field of view of the shorter side of phones' films, and the step of kept frames as a share of the field.
+_USUAL_FIELD, _STEP_SHARE = math.radians(53.0), 0.25
+# Walking: change of size (natural logarithm) over the film, or of the share of corners that move together.
+_GROWN, _APART_SHARE = math.log(1.6), 0.45
+# Shaking: nod (radians) between samples.
+_NOD = math.radians(2.0)
+
+
+class FlowTracker:
+    """Angle that the camera of a film has turned through, about.
+
+    Attributes:
+        heading: angle (radians) since the first sample, clockwise.
+        step: angle (radians) between frames that are kept.
+        scale: factor that makes headings those of the true field of view; see `calibrate`.
+    """
+
+    def __init__(self, hfov: float | None = None) -> None:
+        """Begin with the horizontal field of view (radians); None for that of phones."""
+        self.heading, self.step = 0.0, _STEP_SHARE * (hfov or _USUAL_FIELD)
+        self.scale = 1.0
+        self._hfov = hfov
+        self._before: UInt8[np.ndarray, "h w"] | None = None
+        self._speed = 0.0
+        self._least = self._most = 0.0
+        self._nods: list[float] = []
+        self._shares: list[float] = []
+        self._grown = 0.0
+        self._steps = self._lost = 0
+
+    def follow(self, grey: UInt8[np.ndarray, "h w"]) -> float:
+        """Return the heading (radians) of the next sample."""
+        share = min(_LONG_SIDE / max(grey.shape), 1.0)
+        small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+        before, self._before = self._before, small
+        if before is None:
+            return self.heading
+        self._steps += 1
+        moved = _moved(before, small)
+        if moved is None:
+            # Blank or blurred: the turn goes on as before.
+            self._lost += 1
+        else:
+            # Angles, because pixels near the border are narrower.
+            angles = np.arctan(moved.places / self._focal(small))
+            across, down = np.median(angles[1] - angles[0], axis=0)
+            self._speed = -float(across)
+            self._nods.append(float(down))
+            self._shares.append(moved.share)
+            self._grown += moved.growth
+        self.heading += self._speed
+        self._least, self._most = min(self._least, self.heading), max(self._most, self.heading)
+        return self.heading
+
+    def _focal(self, grey: UInt8[np.ndarray, "h w"]) -> float:
+        height, width = grey.shape
+        if self._hfov is not None:
+            return _focal_of(self._hfov, width)
+        return _focal_of(_USUAL_FIELD, min(width, height))
+
+    def calibrate(self, hfov: float, size: tuple[int, int]) -> None:
+        """Set the scale by the true horizontal field of view (radians) of pictures of a size (width, height)."""
+        presumed = _focal_of(self._hfov, size[0]) if self._hfov else _focal_of(_USUAL_FIELD, min(size))
+        self.scale = presumed / _focal_of(hfov, size[0])
+
+    @property
+    def turned(self) -> float:
+        """Angle (radians) between the outermost headings."""
+        return self.scale * (self._most - self._least)
+
+    @property
+    def nod(self) -> float:
+        """Root mean square (radians) of the change of nods from sample to sample."""
+        return float(np.sqrt(np.mean(np.square(np.diff(self._nods))))) if len(self._nods) > 1 else 0.0
+
+    @property
+    def shakes(self) -> bool:
+        """True if the camera nods as no hand does that turns it slowly."""
+        return self.nod > _NOD
+
+    @property
+    def walks(self) -> bool:
+        """True if things grow, or shift against each other, as they do not in a turn."""
+        shifted = bool(self._shares) and float(np.median(self._shares)) < _APART_SHARE
+        return abs(self._grown) > _GROWN or shifted
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the samples that could not be followed."""
+        return self._lost / self._steps if self._steps else 0.0
+
+
+def _focal_of(hfov: float, width: int) -> float:
+    return 0.5 * width / math.tan(0.5 * min(hfov, 0.9 * math.pi))
+
+
+class _Moved(NamedTuple):
+    """Corners that move together: their places (pixels from the centre) before and after, log growth, share of all."""
+
+    places: Float[np.ndarray, "2 n 2"]
+    growth: float
+    share: float
+
+
+def _moved(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> _Moved | None:
+    """Return the motion of corners from one sample to the next; None if too few are found again."""
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _APART)
+    if corners is None or len(corners) < _LEAST:
+        return None
+    found, status, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
+    kept = status.ravel() == 1
+    if int(kept.sum()) < _LEAST:
+        return None
+    centre = np.array([0.5 * before.shape[1], 0.5 * before.shape[0]], np.float32)
+    one, other = corners[kept].reshape(-1, 2) - centre, found[kept].reshape(-1, 2) - centre
+    change, together = cv2.estimateAffinePartial2D(one, other, method=cv2.RANSAC, ransacReprojThreshold=_TOGETHER)
+    if change is None or int(together.sum()) < _LEAST:
+        return None
+    growth = math.hypot(change[0, 0], change[1, 0])
+    agreed = together.ravel() == 1
+    places = np.stack([one[agreed], other[agreed]]).astype(float)
+    return _Moved(places, math.log(max(growth, 1e-3)), float(agreed.mean()))

@@ -1,0 +1,67 @@
+"""`lalaloc localise --turn`: films and folders of photographs of one turn, with the shipped model."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lalaloc_core.cli import main
+from tests.core.filmed import encode, needs_ffmpeg, turn
+from tests.core.taken import EXAMPLES, jpeg
+
+PLAN = str(EXAMPLES / "flat.json")
+# Of the panorama that the pictures are cut from.
+TRUTH = next(pose for pose in json.loads((EXAMPLES / "poses.json").read_text()) if pose["file"] == "living_room.jpg")
+
+
+def answer_of(capsys: pytest.CaptureFixture[str], path: Path, *options: str) -> dict[str, Any]:
+    assert main(["localise", PLAN, "--turn", str(path), "--hfov", "53", "--json", *options]) == 0
+    (answer,) = json.loads(capsys.readouterr().out)
+    position = answer["position"]
+    assert math.hypot(position["x_m"] - TRUTH["x_m"], position["y_m"] - TRUTH["y_m"]) < 0.5
+    # The pictures look along the panorama's centre first, and turn by 60° in a second.
+    turned_deg = 60.0 * answer["poses"][0].get("time_s", 0.0)
+    assert answer["heading_deg"] == pytest.approx(TRUTH["heading_deg"] + turned_deg, abs=4.0)
+    return answer
+
+
+def test_folder_of_photographs_is_one_turn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for index, frame in enumerate(turn()[:48:4]):
+        (tmp_path / f"{index:02}.jpg").write_bytes(jpeg(frame))
+    answer = answer_of(capsys, tmp_path, "--out", str(tmp_path / "answer.svg"))
+    angles = [pose["view"]["relative_heading"]["value_deg"] % 360.0 for pose in answer["poses"]]
+    assert angles == pytest.approx([24.0 * index for index in range(12)], abs=1.0)
+    assert answer["poses"][0]["photograph"] == "00.jpg"
+    assert (tmp_path / "answer.svg").read_text().startswith("<svg")
+
+
+@needs_ffmpeg
+def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "turn.mp4"
+    encode(turn()[:46], path)
+    answer = answer_of(capsys, path)
+    assert answer["film"]["frames_read"] == 46
+    assert answer["film"]["frames_kept"] == len(answer["poses"])
+    assert answer["poses"][0]["time_s"] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "give one or more photographs, or --turn"),
+        (("photo.jpg", "--turn", "film.mp4"), "exclude each other"),
+        (("--turn", "{}", "--heading", "10"), "--heading does not go with --turn"),
+        (("--turn", "{}"), "has 0 photographs; a turn has 2 to 100"),
+        (("--turn", "{}/film.mp4"), "is no MP4, MOV or WebM film by its first bytes"),
+    ],
+)
+def test_unusable_turns_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"ffconcat version 1.0\n")
+    assert main(["localise", PLAN, *(argument.format(tmp_path) for argument in arguments)]) == 2
+    assert message in capsys.readouterr().err
