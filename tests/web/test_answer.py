@@ -48,6 +48,28 @@ def _assert_hottest_at(page: Page, x_m: float, y_m: float) -> None:
     assert middle == pytest.approx([x_m, y_m], abs=0.15)
 
 
+def _heat_reach_m(page: Page, x_m: float, y_m: float) -> float:
+    """Return the distance from a place to the farthest colour of the heat map that is half opaque."""
+    return page.evaluate(
+        """async ([x, y]) => { let farthest = 0;
+        for (const image of document.querySelectorAll('#plan .heat image')) {
+            const shown = new Image(); shown.src = image.getAttribute('href'); await shown.decode();
+            const canvas = document.createElement('canvas');
+            const [width, height] = [canvas.width, canvas.height] = [shown.width, shown.height];
+            const context = canvas.getContext('2d'); context.drawImage(shown, 0, 0);
+            const pixels = context.getImageData(0, 0, width, height).data;
+            const box = ['x', 'y', 'width', 'height'].map((name) => Number(image.getAttribute(name)));
+            for (let i = 0; i < width * height; i++) {
+                if (pixels[4 * i + 3] < 128) continue;
+                const [column, row] = [i % width, Math.floor(i / width)];
+                const at = [box[0] + (column + 0.5) / width * box[2], -box[1] - (row + 0.5) / height * box[3]];
+                farthest = Math.max(farthest, Math.hypot(at[0] - x, at[1] - y));
+            } }
+        return farthest; }""",
+        [x_m, y_m],
+    )
+
+
 def _assert_accessible(page: Page) -> None:
     violations = Axe().run(page).response["violations"]
     serious = [violation for violation in violations if violation["impact"] in ("serious", "critical")]
@@ -62,6 +84,10 @@ def test_first_visit_leads_to_an_answer_with_one_click(desktop: Visit) -> None:
     desktop.find()
     expect(page.locator("#answer .room")).not_to_be_empty()
     _assert_hottest_at(page, *_marker(page))
+    # An answer within 10 cm does not look like one within a metre.
+    words = page.locator("#answer .where").inner_text()
+    within_cm = int(re.findall(r"± (\d+) cm", words)[0])
+    assert _heat_reach_m(page, *_marker(page)) < 0.03 * within_cm + 0.1
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     # The canvas over the photograph has yellow lines.
     yellow = page.evaluate(
@@ -218,7 +244,7 @@ def test_phone_needs_no_horizontal_scrolling(phone: Visit) -> None:
     page = phone.open_example()
     phone.find()
     assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
-    for selector in ("#plan", "#stage", "#find", "#answer"):
+    for selector in ("#plan", "#stage", "#find", "#answer", "#edit-plan", "#draw-plan"):
         box = page.locator(selector).bounding_box()
         assert box is not None
         assert box["x"] >= 0

@@ -112,10 +112,9 @@ def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:
 
 def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
-    for _ in range(4):
-        page.locator("#photo-strip .remove").first.click()
-    expect(page.locator("#together")).to_be_hidden()
     page.locator("#photo-file").set_input_files(_phone_photographs(tmp_path, [0.0, 60.0, 120.0]))
+    # Photographs of the example give way to the user's own.
+    expect(page.locator("#photo-strip li")).to_have_count(3)
     together = page.get_by_role("group", name="These photographs are")
     together.get_by_label("Taken from one spot, turning").check()
     expect(page.get_by_role("button", name="Find all")).to_be_hidden()

@@ -15,10 +15,10 @@ _TITLES: dict[Photograph, str] = {
     "three_phone": "three of one spot",
 }
 _REMEDIES = {
-    "heading": "state the heading",
-    "three_photographs": "take three photographs of one spot, a third of a turn apart",
-    "sphere": "take a sphere",
-    "room_hint": "name the room",
+    "heading": "Set the heading of a phone photograph",
+    "three_photographs": "Take three phone photographs from one spot, a third of a turn apart, as one query",
+    "sphere": "Take a 360° photograph instead of a phone photograph",
+    "room_hint": "Choose the room of a phone photograph as a hint",
     "doors": "draw doors and windows",
 }
 # Smallest gain that is advised.
@@ -81,7 +81,8 @@ def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
     for gain, name in sorted(gains, reverse=True):
         if gain >= _WORTH:
-            lines.append(f"To find more phone photographs, {_REMEDIES[name]}: +{100 * gain:.0f} points")
+            before, after = found.plan[HARDEST], found.plan[HARDEST] + gain
+            lines.append(f"{_REMEDIES[name]}: {_percent(after)} are found instead of {_percent(before)}")
     doors = found.gains["doors"]
     if doors is None:
         lines.append(f"The plan shows no openings: {_REMEDIES['doors']}")
