@@ -86,7 +86,7 @@ def test_first_visit_leads_to_an_answer_with_one_click(desktop: Visit) -> None:
     _assert_hottest_at(page, *_marker(page))
     # An answer within 10 cm does not look like one within a metre.
     words = page.locator("#answer .where").inner_text()
-    within_cm = int(re.findall(r"± (\d+) cm", words)[0])
+    within_cm = int(re.findall(r"±\s(\d+)\scm", words)[0])
     assert _heat_reach_m(page, *_marker(page)) < 0.03 * within_cm + 0.1
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     # The canvas over the photograph has yellow lines.

@@ -34,6 +34,13 @@ export class LocalisabilityLayer {
   );
   private readonly known = h("input", { type: "checkbox", id: "localisability-heading" });
   private readonly share = h("p", { class: "share", role: "status" });
+  private readonly state = h("span", {});
+  private readonly progress = h(
+    "p",
+    { class: "hint progress", id: "localisability-progress", hidden: true },
+    h("progress", { "aria-label": "Prediction" }),
+    this.state,
+  );
   private readonly advice = h("ul");
   private plan: Plan | null = null;
   private found: Localisability | null = null;
@@ -51,6 +58,7 @@ export class LocalisabilityLayer {
         h("label", { class: "inline" }, this.known, " heading known"),
       ),
       this.share,
+      this.progress,
       h("span", { class: "ramp", "aria-hidden": "true" }),
       h("ul", { class: "ticks" }, ...["0 %", "50 %", "100 %"].map((tick) => h("li", {}, tick))),
       this.advice,
@@ -87,17 +95,43 @@ export class LocalisabilityLayer {
     let { plan } = this;
     try {
       plan = await this.store();
-      const found = this.found ?? (await api.localisability(plan.id));
-      // The user may have chosen another plan in the meantime.
-      if (this.plan?.revision !== found.revision) return;
-      this.found = found;
       this.panel.hidden = false;
       this.open.setAttribute("aria-pressed", "true");
       this.draw();
+      // A rough map comes first, in a fifth of the time.
+      for (const coarse of [true, false]) {
+        if (this.found !== null && !this.found.coarse) break;
+        const found = await this.timed(coarse, api.localisability(plan.id, coarse));
+        // The user may have chosen another plan in the meantime, or closed the map.
+        if (this.plan?.revision !== found.revision) return;
+        this.found = found;
+        this.draw();
+        if (this.panel.hidden) return;
+      }
     } catch (error) {
-      if (this.plan?.revision === plan?.revision) showError(byId("plan-error"), error);
+      if (this.plan?.revision !== plan?.revision) return;
+      if (this.found === null) this.close();
+      showError(byId("plan-error"), error);
     } finally {
       this.open.removeAttribute("aria-busy");
+    }
+  }
+
+  /** Show the step of a prediction and its seconds until it is there. */
+  private async timed<T>(coarse: boolean, predicting: Promise<T>): Promise<T> {
+    const begin = Date.now();
+    const tell = (): void => {
+      const step = coarse ? "Step 1 of 2: a rough map" : "Step 2 of 2: more places; the map above is rough";
+      this.state.textContent = ` ${step}, ${Math.round((Date.now() - begin) / 1000)} s`;
+    };
+    tell();
+    this.progress.hidden = false;
+    const ticking = setInterval(tell, 1000);
+    try {
+      return await predicting;
+    } finally {
+      clearInterval(ticking);
+      this.progress.hidden = true;
     }
   }
 
@@ -108,6 +142,8 @@ export class LocalisabilityLayer {
     byId("plan-panel").classList.toggle("predicted", isShown);
     if (!isShown) {
       show(this.element);
+      show(this.share);
+      show(this.advice);
       return;
     }
     const heading = this.known.checked ? "known" : "unknown",

@@ -26,8 +26,11 @@ _WORTH = 0.02
 _PAIRS = 3
 
 
-def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
-    """Return plain data: probabilities by condition for the plan, its rooms and places, confusions and remedies."""
+def report_of(plan: FloorPlan, found: Localisability, *, coarse: bool = False) -> dict[str, Any]:
+    """Return plain data: probabilities by condition for the plan, its rooms and places, confusions and remedies.
+
+    A coarse prediction has too few draws for advice.
+    """
     rooms = [
         {"id": room.id, "name": room.name, "probability": row}
         for room, row in zip(plan.rooms, _rows(found.rooms), strict=True)
@@ -46,6 +49,7 @@ def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
     ]
     gains = {name: None if gain is None else round(gain, 3) for name, gain in found.gains.items()}
     return {
+        "coarse": coarse,
         "spacing_m": round(found.spacing_m, 3),
         "probability": {name: round(found.plan[name], 3) for name in CONDITIONS},
         "rooms": rooms,
@@ -53,7 +57,7 @@ def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
         "confused": confused,
         "measured_on": HARDEST,
         "gains": gains,
-        "advice": _advice_of(plan, found),
+        "advice": [] if coarse else _advice_of(plan, found),
     }
 
 
