@@ -44,6 +44,8 @@ export class LocalisabilityLayer {
   private readonly advice = h("ul");
   private plan: Plan | null = null;
   private found: Localisability | null = null;
+  /** Prediction under way. */
+  private running: symbol | null = null;
 
   /** `store` returns the plan that is shown, stored if it is an example. */
   constructor(private readonly store: () => Promise<Plan>) {
@@ -71,6 +73,7 @@ export class LocalisabilityLayer {
   setPlan(plan: Plan | null): void {
     if (plan?.revision !== this.plan?.revision) {
       this.close();
+      this.stop();
       this.found = null;
     }
     this.plan = plan;
@@ -89,49 +92,67 @@ export class LocalisabilityLayer {
       this.close();
       return;
     }
+    if (this.running !== null) this.unfold();
     if (this.open.hasAttribute("aria-busy")) return;
     clearError(byId("plan-error"));
     this.open.setAttribute("aria-busy", "true");
-    let { plan } = this;
+    let { plan } = this,
+      own: symbol | null = null;
     try {
       plan = await this.store();
-      this.panel.hidden = false;
-      this.open.setAttribute("aria-pressed", "true");
-      this.draw();
-      // A rough map comes first, in a fifth of the time.
-      for (const coarse of [true, false]) {
-        if (this.found !== null && !this.found.coarse) break;
-        const found = await this.timed(coarse, api.localisability(plan.id, coarse));
-        // The user may have chosen another plan in the meantime, or closed the map.
-        if (this.plan?.revision !== found.revision) return;
-        this.found = found;
-        this.draw();
-        if (this.panel.hidden) return;
-      }
+      own = this.running = Symbol();
+      this.open.setAttribute("aria-busy", "true");
+      this.unfold();
+      await this.predict(plan, own);
     } catch (error) {
       if (this.plan?.revision !== plan?.revision) return;
       if (this.found === null) this.close();
       showError(byId("plan-error"), error);
     } finally {
-      this.open.removeAttribute("aria-busy");
+      if (this.running === own) this.stop();
+    }
+  }
+
+  private unfold(): void {
+    this.panel.hidden = false;
+    this.open.setAttribute("aria-pressed", "true");
+    this.draw();
+  }
+
+  /** Forget the prediction under way, which may be of another plan. */
+  private stop(): void {
+    this.running = null;
+    this.progress.hidden = true;
+    this.open.removeAttribute("aria-busy");
+  }
+
+  /** Predict roughly at first, in a fifth of the time, then fully; stop for another plan and if the user closes the map. */
+  private async predict(plan: Plan, own: symbol): Promise<void> {
+    for (const coarse of [true, false]) {
+      if (this.found !== null && (coarse || !this.found.coarse)) continue;
+      const found = await this.timed(coarse, own, api.localisability(plan.id, coarse));
+      if (this.running !== own || this.plan?.revision !== found.revision) return;
+      this.found = found;
+      this.draw();
+      if (this.panel.hidden) return;
     }
   }
 
   /** Show the step of a prediction and its seconds until it is there. */
-  private async timed<T>(coarse: boolean, predicting: Promise<T>): Promise<T> {
+  private async timed<T>(coarse: boolean, own: symbol, predicting: Promise<T>): Promise<T> {
     const begin = Date.now();
     const tell = (): void => {
-      const step = coarse ? "Step 1 of 2: a rough map" : "Step 2 of 2: more places; the map above is rough";
-      this.state.textContent = ` ${step}, ${Math.round((Date.now() - begin) / 1000)} s`;
+      if (this.running !== own) return;
+      const step = coarse ? "Step 1 of 2: a rough map" : "Step 2 of 2: more places; the map is rough as yet";
+      this.state.textContent = `${step}, ${Math.round((Date.now() - begin) / 1000)} s`;
+      this.progress.hidden = false;
     };
     tell();
-    this.progress.hidden = false;
     const ticking = setInterval(tell, 1000);
     try {
       return await predicting;
     } finally {
       clearInterval(ticking);
-      this.progress.hidden = true;
     }
   }
 
@@ -153,7 +174,7 @@ export class LocalisabilityLayer {
       this.share,
       "In all of the plan: ",
       h("strong", {}, percent(found.probability[condition])),
-      ` within ${within} m. Predicted from the plan, without any photograph.`,
+      ` within ${within} m. Predicted ${found.coarse ? "roughly " : ""}from the plan, without any photograph.`,
     );
     show(this.advice, ...found.advice.map((sentence) => h("li", {}, `${sentence}.`)));
     const cell = cellSize(plan.plan);
