@@ -20,6 +20,7 @@ import { Venues } from "./venues";
 // For tests.
 export { layoutLines, layoutView } from "./layout";
 export { toEarth, toPlan } from "./earth";
+export { heatMap } from "./heat";
 export { placesOf, remainder } from "./places";
 
 class Page {
