@@ -69,8 +69,10 @@ def test_heat_map_is_as_wide_as_the_answer(desktop: Visit) -> None:
             const context = canvas.getContext('2d'); context.drawImage(shown, 0, 0);
             const pixels = context.getImageData(0, 0, width, height).data;
             for (let i = 0; i < width * height; i++)
-                if (pixels[4 * i + 3] > 20) farthest = Math.max(farthest, Math.hypot(
-                    (i % width + 0.5) / width * 5 - position.x_m, 5 - (Math.floor(i / width) + 0.5) / height * 5 - position.y_m));
+                if (pixels[4 * i + 3] > 20) {
+                    const x = (i % width + 0.5) / width * 5, y = 5 - (Math.floor(i / width) + 0.5) / height * 5;
+                    farthest = Math.max(farthest, Math.hypot(x - position.x_m, y - position.y_m));
+                }
             return farthest; };
         return [await reach(null), await reach([[0.0016, 0], [0, 0.0016]]), await reach([[0.16, 0], [0, 0.0016]])]; }"""
     )
