@@ -295,6 +295,7 @@ class Localisability:
         gains: increase of the probability of phone photographs with unknown heading by remedy: `heading`,
             `three_photographs`, `sphere`, `room_hint`, and `doors`, which is that of the openings of the plan.
         advice: sentences about confused rooms and what helps most.
+        coarse: the prediction is rough, without advice.
     """
 
     floorplan_id: str
@@ -306,6 +307,7 @@ class Localisability:
     confused: tuple[ConfusedRooms, ...]
     gains: Mapping[str, float | None]
     advice: tuple[str, ...]
+    coarse: bool = False
 
 
 @dataclass(frozen=True)

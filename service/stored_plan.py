@@ -21,10 +21,12 @@ if TYPE_CHECKING:
 # Files made from a plan: description (a part of the answer to GET), walls, rooms as SVG without and with the areas that
 # became no room, mesh, exports; which photographs are found, and the map of that for each kind of them.
 RenditionKind = (
-    Literal["description", "layout", "drawing", "preview", "mesh", "localisability"] | ExportFormat | Condition
+    Literal["description", "layout", "drawing", "preview", "mesh", "localisability", "coarse localisability"]
+    | ExportFormat
+    | Condition
 )
 # Files that depend on the model.
-PREDICTIONS: frozenset[RenditionKind] = frozenset({"localisability", *CONDITIONS})
+PREDICTIONS: frozenset[RenditionKind] = frozenset({"localisability", "coarse localisability", *CONDITIONS})
 # Made by worker processes even of small plans: the cells of maps are many, and predictions search the plan.
 SLOW: frozenset[RenditionKind] = frozenset({"ros", *PREDICTIONS})
 # Characters or bytes of a document beyond which worker processes parse it.

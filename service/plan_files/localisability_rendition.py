@@ -14,7 +14,7 @@ from service.schemas.localisability import LocalisabilityAnswer
 from service.stored_plan import RenditionJob
 
 
-def plan_localisability(plan: FloorPlan, job: RenditionJob) -> bytes:
+def plan_localisability(plan: FloorPlan, job: RenditionJob, *, coarse: bool = False) -> bytes:
     """Return the `LocalisabilityAnswer` of a plan as JSON.
 
     Raises:
@@ -25,7 +25,7 @@ def plan_localisability(plan: FloorPlan, job: RenditionJob) -> bytes:
         floorplan_id=job.stored.id,
         revision=job.stored.revision_id,
         model=ModelAnswer.of(job.bundle),
-        **report_of(plan, localisability(plan, job.bundle.manifest)),
+        **report_of(plan, localisability(plan, job.bundle.manifest, coarse=coarse), coarse=coarse),
     )
     return answer.model_dump_json().encode()
 

@@ -46,11 +46,11 @@ def no_room_of(report: str | None) -> list[list[list[float]]]:
 
 def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
     match job.kind:
-        case "localisability":
+        case "localisability" | "coarse localisability":
             # Imported late: the search needs libraries that other files do not.
             from service.plan_files.localisability_rendition import plan_localisability
 
-            return plan_localisability(plan, job)
+            return plan_localisability(plan, job, coarse=job.kind != "localisability")
         case "layout":
             return plan_layout(plan, job.stored.id, job.stored.revision_id)
         case "drawing":

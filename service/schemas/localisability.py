@@ -69,6 +69,9 @@ class LocalisabilityAnswer(ResponseModel):
     floorplan_id: str
     revision: str
     model: ModelAnswer
+    coarse: bool = Field(
+        default=False, description="The prediction is rough: few places, one draw at each, no `advice`."
+    )
     spacing_m: Metres = Field(
         description="Distance of the poses that are compared: 0.5 m, more in large plans. A photograph counts as found "
         "if its answer is right within 1 m, or within this distance if it is longer."

@@ -93,6 +93,7 @@ def test_localisability_is_read_and_drawn(service: Any) -> None:
     assert (found.floorplan_id, found.revision, found.spacing_m) == (plan.id, plan.revision, 0.5)
     assert [room.id for room in found.rooms] == [room.id for room in plan.rooms]
     assert 0.0 <= found.places[0].probability["phone_unknown_heading"] <= 1.0
+    assert (service.localisability(plan.id, coarse=True).coarse, found.coarse) == (True, False)
     drawing = service.localisability_map(plan.id, "three_phone", "known")
     assert "three phone photographs of one spot are found" in drawing
 

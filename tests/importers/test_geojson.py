@@ -57,6 +57,20 @@ def test_level_option_selects_a_level():
         import_plan(_collection(KITCHEN, HALL), ImportOptions(level="7"))
 
 
+def test_levels_are_in_the_order_of_their_numbers_without_roofs():
+    levels = [
+        _feature([[0, 0], [4, 0], [4, 3]], indoor="room", name=f"room on {name}", level=name)
+        for name in ("Floor 10", "Floor 2", "Dach", "Roof terrace")
+    ]
+    plans = import_plans(_collection(*levels))
+    assert [plan.level.name for plan in plans] == ["Floor 2", "Floor 10", "Roof terrace"]  # type: ignore[union-attr]
+    assert "level 'Dach' was left out: it is a roof (set level to read it)" in plans[0].report.warnings
+    (roof,) = import_plans(_collection(*levels), ImportOptions(level="Dach"))
+    assert len(roof.document["rooms"]) == 1
+    # A file with nothing but roofs is read.
+    assert len(import_plans(_collection(levels[2]))) == 1
+
+
 def test_invalid_level_is_named():
     huge = _feature([[0, 0], [9e3, 0], [9e3, 9e3]], indoor="room", name="Halle", level="1")
     content = _collection(KITCHEN, huge)

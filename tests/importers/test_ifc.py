@@ -161,9 +161,10 @@ def duplex() -> tuple[ImportedPlan, ...]:
 
 
 def test_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
-    assert [plan.level.name for plan in duplex] == ["Level 1", "Level 2", "Roof"]  # type: ignore[union-attr]
-    assert [plan.level.number for plan in duplex] == [0.0, 1.0, 2.0]  # type: ignore[union-attr]
-    assert [len(plan.document["rooms"]) for plan in duplex] == [10, 10, 1]
+    assert [plan.level.name for plan in duplex] == ["Level 1", "Level 2"]  # type: ignore[union-attr]
+    assert [plan.level.number for plan in duplex] == [0.0, 1.0]  # type: ignore[union-attr]
+    assert [len(plan.document["rooms"]) for plan in duplex] == [10, 10]
+    assert "level 'Roof' was left out: it is a roof (set level to read it)" in duplex[0].report.warnings
     ground, first = duplex[0], duplex[1]
     assert (len(lines(ground.document, "door")), len(lines(ground.document, "window"))) == (6, 4)
     assert len(lines(first.document, "door")) == 8

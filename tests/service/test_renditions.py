@@ -247,10 +247,14 @@ def test_localisability_is_predicted_once_per_revision_and_model(
         assert {place["room"] for place in answer["places"]} == {room["id"] for room in answer["rooms"]}
         assert set(answer["gains"]) == {"heading", "three_photographs", "sphere", "room_hint", "doors"}
         assert answer["advice"] != []
+        rough = client.get(url, params={"coarse": True})
+        assert (rough.json()["coarse"], rough.json()["advice"], answer["coarse"]) == (True, [], False)
+        assert rough.headers["etag"] != first.headers["etag"]
         again = client.get(url, headers={"If-None-Match": first.headers["etag"]})
         assert (again.status_code, client.get(url).content) == (304, first.content)
         assert_problem(client.get(f"{url}.svg?photograph=drone"), 422, "invalid-request")
-    assert begun == ["localisability", "phone_unknown_heading", "sphere_known_heading"]
+    kinds = ["localisability", "phone_unknown_heading", "sphere_known_heading", "coarse localisability"]
+    assert begun == kinds
     with start_app(tmp_path) as client:
         # Another model, without measured errors.
         refused = client.get(url, headers={"If-None-Match": first.headers["etag"]})

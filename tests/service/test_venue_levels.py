@@ -126,7 +126,7 @@ def test_sample_model_becomes_a_venue(client: httpx.Client) -> None:
     assert DUPLEX is not None
     venue = send(client, DUPLEX.read_bytes(), "Duplex.ifc").json()
     names = [entry["name"] for entry in plans_of(client, venue["id"])]
-    assert names == ["Duplex – Level 1", "Duplex – Level 2", "Duplex – Roof"]
+    assert names == ["Duplex – Level 1", "Duplex – Level 2"]
 
 
 def test_levels_keep_their_plan_as_a_file(client: httpx.Client) -> None:

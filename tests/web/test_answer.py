@@ -55,6 +55,33 @@ def _assert_accessible(page: Page) -> None:
     assert messages == [], "\n".join(messages)
 
 
+def test_heat_map_is_as_wide_as_the_answer(desktop: Visit) -> None:
+    """The pose grid of 0.5 m blurs the map by 0.2 m; an answer is more accurate."""
+    reaches = desktop.open().evaluate(
+        """async () => { const { heatMap } = await import('/web/app.js');
+        const plan = { rooms: [{ polygon: [[0, 0], [5, 0], [5, 5], [0, 5]] }] }, position = { x_m: 2.6, y_m: 2.4 };
+        const posterior = { x_m: [2.5, 3, 2.5], y_m: [2.5, 2.5, 3], probability: [0.9, 0.08, 0.02], step_m: 0.5 };
+        const reach = async (covariance_m2) => { let farthest = 0;
+            const image = heatMap(posterior, plan, { position, covariance_m2 }).querySelector('image');
+            const shown = new Image(); shown.src = image.getAttribute('href'); await shown.decode();
+            const canvas = document.createElement('canvas');
+            const [width, height] = [canvas.width, canvas.height] = [shown.width, shown.height];
+            const context = canvas.getContext('2d'); context.drawImage(shown, 0, 0);
+            const pixels = context.getImageData(0, 0, width, height).data;
+            for (let i = 0; i < width * height; i++)
+                if (pixels[4 * i + 3] > 20) {
+                    const x = (i % width + 0.5) / width * 5, y = 5 - (Math.floor(i / width) + 0.5) / height * 5;
+                    farthest = Math.max(farthest, Math.hypot(x - position.x_m, y - position.y_m));
+                }
+            return farthest; };
+        return [await reach(null), await reach([[0.0016, 0], [0, 0.0016]]), await reach([[0.16, 0], [0, 0.0016]])]; }"""
+    )
+    grid, round_, long = reaches
+    assert grid > 0.9
+    assert round_ < 0.25
+    assert 1.4 < long < 2.2
+
+
 def test_first_visit_leads_to_an_answer_with_one_click(desktop: Visit) -> None:
     page = desktop.open_example()
     expect(page.locator("#plan .room")).to_have_count(7)
@@ -218,7 +245,7 @@ def test_phone_needs_no_horizontal_scrolling(phone: Visit) -> None:
     page = phone.open_example()
     phone.find()
     assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
-    for selector in ("#plan", "#stage", "#find", "#answer"):
+    for selector in ("#plan", "#stage", "#find", "#answer", "#edit-plan", "#draw-plan"):
         box = page.locator(selector).bounding_box()
         assert box is not None
         assert box["x"] >= 0

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 from PIL import ExifTags, Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import jpeg, sphere, take
@@ -75,9 +75,18 @@ def _colours(page: Page, place: str) -> list[list[int]]:
 def test_layer_shows_where_photographs_will_be_found(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     opener = page.get_by_role("button", name="Will it work here?")
+    held = list[Route]()
+    page.route("**/localisability", lambda route: held.append(route))
     opener.click()
     panel = page.get_by_role("region", name="Will it work here?")
-    expect(panel).to_be_visible(timeout=100_000)
+    expect(panel.locator("#localisability-progress")).to_contain_text("Step 1 of 2")
+    # A rough map is shown while the full prediction is under way.
+    expect(panel.locator("#localisability-progress")).to_contain_text("Step 2 of 2", timeout=100_000)
+    assert len(_colours(page, "#plan .localisability")) == 7
+    expect(panel.locator("li", has_text="are found instead of")).to_have_count(0)
+    (route,) = held
+    route.continue_()
+    expect(panel.locator("#localisability-progress")).to_be_hidden(timeout=100_000)
     expect(opener).to_have_attribute("aria-pressed", "true")
     expect(panel).to_contain_text("heading")
     expect(panel.locator(".share")).to_contain_text("within 1 m")
@@ -112,10 +121,9 @@ def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:
 
 def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
-    for _ in range(4):
-        page.locator("#photo-strip .remove").first.click()
-    expect(page.locator("#together")).to_be_hidden()
     page.locator("#photo-file").set_input_files(_phone_photographs(tmp_path, [0.0, 60.0, 120.0]))
+    # Photographs of the example give way to the user's own.
+    expect(page.locator("#photo-strip li")).to_have_count(3)
     together = page.get_by_role("group", name="These photographs are")
     together.get_by_label("Taken from one spot, turning").check()
     expect(page.get_by_role("button", name="Find all")).to_be_hidden()

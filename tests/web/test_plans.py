@@ -348,24 +348,28 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
             expect(page.locator("#plan-error")).to_contain_text("no answer is kept")
 
 
-def test_link_holds_an_answer_that_the_service_does_not_keep(desktop: Visit, phone: Visit) -> None:
-    page = desktop.open_example()
-    desktop.find()
-    where = page.locator("#answer .where").inner_text()
-    page.locator("#copy-link").click()
-    expect(page.locator("#copied")).to_contain_text("#answer-data=")
-    link = page.locator("#copied").inner_text()
-    assert len(link) < 8000
-    other = phone.page
-    asked: list[str] = []
-    other.on("request", lambda request: asked.append(request.url))
-    other.goto(link)
-    expect(other.locator("#answer .where")).to_have_text(where)
-    expect(other.locator("#answer-body")).to_contain_text("did not compute it again")
-    assert not [url for url in asked if "/localise" in url]
-    other.goto("about:blank")
-    other.goto(link[:-40])
-    expect(other.locator("#plan-error")).to_contain_text("damaged or incomplete")
+def test_link_holds_an_answer_that_the_service_does_not_keep(
+    browser: Browser, start_app: StartApp, tmp_path: Path
+) -> None:
+    with start_app(tmp_path) as client:
+        for visited in visit(browser, client):
+            page = visited.open_example()
+            visited.find()
+            where = page.locator("#answer .where").inner_text()
+            page.locator("#copy-link").click()
+            expect(page.locator("#copied")).to_contain_text("#answer-data=")
+            link = page.locator("#copied").inner_text()
+            assert len(link) < 8000
+            page.goto("about:blank")
+            asked: list[str] = []
+            page.on("request", lambda request, asked=asked: asked.append(request.url))
+            page.goto(link)
+            expect(page.locator("#answer .where")).to_have_text(where)
+            expect(page.locator("#answer-body")).to_contain_text("did not compute it again")
+            assert not [url for url in asked if "/localise" in url]
+            page.goto("about:blank")
+            page.goto(link[:-40])
+            expect(page.locator("#plan-error")).to_contain_text("damaged or incomplete")
 
 
 def test_photographed_rooms_are_an_example(desktop: Visit) -> None:

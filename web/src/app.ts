@@ -20,6 +20,7 @@ import { Venues } from "./venues";
 // For tests.
 export { layoutLines, layoutView } from "./layout";
 export { toEarth, toPlan } from "./earth";
+export { heatMap } from "./heat";
 export { placesOf, remainder } from "./places";
 
 class Page {
@@ -87,7 +88,7 @@ class Page {
       if (known === undefined) this.onExample(example);
       else await this.plans.choose(known.id);
       const files = await exampleFiles(FLAT);
-      if (!this.hasStarted && answers.photos.list.length === 0) answers.photos.add(files);
+      if (!this.hasStarted && answers.photos.list.length === 0) answers.photos.add(files, true);
     } else await this.plans.choose(stored[0]!.id);
   }
 
@@ -129,7 +130,7 @@ class Page {
     const { photos } = this.answers;
     if (plan !== null) this.onExample(plan);
     const shown = photos.list.find(({ file }) => file.name === files[0]?.name);
-    if (shown === undefined) photos.add(files);
+    if (shown === undefined) photos.add(files, true);
     else photos.choose(shown);
   }
 

@@ -1,9 +1,12 @@
-/** Heat maps of rooms, and the posterior as one, as in lalaloc_core/draw/heat.py: each place is blurred within its room. */
+/**
+ * Heat maps of rooms, and the posterior as one, as in lalaloc_core/draw/heat.py: each place is blurred within its room. The
+ * place of the answer is as wide as its covariance, which is finer than the pose grid.
+ */
 
 import { s } from "./dom";
 import { inside } from "./layout";
 import { type Box, boxOf, path } from "./plan_drawing";
-import type { PlanDocument, Point, Posterior, RoomDocument } from "./types";
+import type { Answer, PlanDocument, Point, Posterior, RoomDocument } from "./types";
 
 // Places less probable than the best one by this factor are not coloured.
 const MIN_RATIO = 1e-5;
@@ -13,6 +16,8 @@ const CELLS = 300,
 // Standard deviation of the blur in steps of the pose grid, and radius of the kernel in standard deviations.
 const DEVIATION = 0.4,
   RADIUS = 5;
+// Poses of the grid within this distance (m) of an answer count as the place of the answer.
+const SAME_PLACE_M = 1;
 // Shade from which colours cover the plan, and opacity from there on.
 const OPAQUE_SHADE = 0.3,
   MAX_OPACITY = 0.92;
@@ -29,9 +34,9 @@ export interface Cells {
 type Field = Cells & { values: Float64Array };
 
 /** Draw a picture for each room with any probability, clipped to its floor. */
-export function heatMap(posterior: Posterior, plan: PlanDocument): SVGGElement {
+export function heatMap(posterior: Posterior, plan: PlanDocument, answer: Refined): SVGGElement {
   const cell = cellSize(plan);
-  const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell)).filter((field) => field !== null);
+  const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell, answer)).filter((field) => field !== null);
   const best = fields.reduce((most, { values }) => values.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
   for (const { values } of fields)
     values.forEach((value, index) => {
@@ -39,6 +44,9 @@ export function heatMap(posterior: Posterior, plan: PlanDocument): SVGGElement {
     });
   return roomPictures("posterior", fields, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
 }
+
+/** Place of an answer with its uncertainty. */
+type Refined = Pick<Answer, "position" | "covariance_m2">;
 
 /** Return the size of the cells of a plan's maps. */
 export function cellSize(plan: PlanDocument): number {
@@ -96,7 +104,10 @@ export function shadeOf(density: number, best: number): number {
   return Math.max(0, 1 - Math.log(Math.max(density / best, MIN_RATIO)) / Math.log(MIN_RATIO));
 }
 
-function fieldOf(posterior: Posterior, room: RoomDocument, cell: number): Field | null {
+function fieldOf(posterior: Posterior, room: RoomDocument, cell: number, answer: Refined): Field | null {
+  const { x_m, y_m } = answer.position,
+    isOfAnswer = answer.covariance_m2 !== null && isIn(room, x_m, y_m);
+  let own = 0;
   const cells = cellsOf(room, cell),
     { columns, rows, box } = cells;
   const left = box.x,
@@ -104,14 +115,37 @@ function fieldOf(posterior: Posterior, room: RoomDocument, cell: number): Field 
   let spread: Float64Array | null = null;
   posterior.x_m.forEach((x, index) => {
     const y = posterior.y_m[index]!;
-    if (x < left || x > left + box.width || y < high - box.height || y > high || !inside(room.polygon, x, y)) return;
-    if ((room.holes ?? []).some((hole) => inside(hole, x, y))) return;
+    if (x < left || x > left + box.width || y < high - box.height || y > high || !isIn(room, x, y)) return;
     spread ??= new Float64Array(columns * rows);
-    splat(spread, columns, rows, [(x - left) / cell - 0.5, (high - y) / cell - 0.5], posterior.probability[index]!);
+    if (isOfAnswer && Math.hypot(x - x_m, y - y_m) < SAME_PLACE_M) own += posterior.probability[index]!;
+    else
+      splat(spread, columns, rows, [(x - left) / cell - 0.5, (high - y) / cell - 0.5], posterior.probability[index]!);
   });
   if (spread === null) return null;
   const kernel = kernelOf((DEVIATION * posterior.step_m) / cell);
-  return { ...cells, values: blurred(blurred(spread, columns, rows, 1, kernel), columns, rows, columns, kernel) };
+  const values = blurred(blurred(spread, columns, rows, 1, kernel), columns, rows, columns, kernel);
+  // As strong at its middle as one pose of this probability, so that places compare by their probabilities.
+  if (own > 0) addNormal(values, cells, answer, own * kernel[0]! ** 2);
+  return { ...cells, values };
+}
+
+const isIn = (room: RoomDocument, x: number, y: number): boolean =>
+  inside(room.polygon, x, y) && !(room.holes ?? []).some((hole) => inside(hole, x, y));
+
+/** Add a normal distribution about the place of an answer, with its covariance but no narrower than a cell. */
+function addNormal(values: Float64Array, cells: Cells, { position, covariance_m2 }: Refined, peak: number): void {
+  const { box, columns, rows } = cells,
+    cell = box.width / columns;
+  const [[xx, xy], [, yy]] = covariance_m2 as [[number, number], [number, number]];
+  const a = xx + (0.5 * cell) ** 2,
+    b = yy + (0.5 * cell) ** 2,
+    determinant = a * b - xy ** 2;
+  values.forEach((value, index) => {
+    const dx = box.x + ((index % columns) + 0.5) * cell - position.x_m;
+    const dy = -box.y - (Math.floor(index / columns) + 0.5) * (box.height / rows) - position.y_m;
+    const square = (b * dx * dx - 2 * xy * dx * dy + a * dy * dy) / determinant;
+    values[index] = value + peak * Math.exp(-0.5 * square);
+  });
 }
 
 /** Distribute a value over the four cells around a place. */

@@ -34,9 +34,18 @@ export class LocalisabilityLayer {
   );
   private readonly known = h("input", { type: "checkbox", id: "localisability-heading" });
   private readonly share = h("p", { class: "share", role: "status" });
+  private readonly state = h("span", {});
+  private readonly progress = h(
+    "p",
+    { class: "hint progress", id: "localisability-progress", hidden: true },
+    h("progress", { "aria-label": "Prediction" }),
+    this.state,
+  );
   private readonly advice = h("ul");
   private plan: Plan | null = null;
   private found: Localisability | null = null;
+  /** Prediction under way. */
+  private running: symbol | null = null;
 
   /** `store` returns the plan that is shown, stored if it is an example. */
   constructor(private readonly store: () => Promise<Plan>) {
@@ -51,6 +60,7 @@ export class LocalisabilityLayer {
         h("label", { class: "inline" }, this.known, " heading known"),
       ),
       this.share,
+      this.progress,
       h("span", { class: "ramp", "aria-hidden": "true" }),
       h("ul", { class: "ticks" }, ...["0 %", "50 %", "100 %"].map((tick) => h("li", {}, tick))),
       this.advice,
@@ -63,6 +73,7 @@ export class LocalisabilityLayer {
   setPlan(plan: Plan | null): void {
     if (plan?.revision !== this.plan?.revision) {
       this.close();
+      this.stop();
       this.found = null;
     }
     this.plan = plan;
@@ -81,23 +92,67 @@ export class LocalisabilityLayer {
       this.close();
       return;
     }
+    if (this.running !== null) this.unfold();
     if (this.open.hasAttribute("aria-busy")) return;
     clearError(byId("plan-error"));
     this.open.setAttribute("aria-busy", "true");
-    let { plan } = this;
+    let { plan } = this,
+      own: symbol | null = null;
     try {
       plan = await this.store();
-      const found = this.found ?? (await api.localisability(plan.id));
-      // The user may have chosen another plan in the meantime.
-      if (this.plan?.revision !== found.revision) return;
-      this.found = found;
-      this.panel.hidden = false;
-      this.open.setAttribute("aria-pressed", "true");
-      this.draw();
+      own = this.running = Symbol();
+      this.open.setAttribute("aria-busy", "true");
+      this.unfold();
+      await this.predict(plan, own);
     } catch (error) {
-      if (this.plan?.revision === plan?.revision) showError(byId("plan-error"), error);
+      if (this.plan?.revision !== plan?.revision) return;
+      if (this.found === null) this.close();
+      showError(byId("plan-error"), error);
     } finally {
-      this.open.removeAttribute("aria-busy");
+      if (this.running === own) this.stop();
+    }
+  }
+
+  private unfold(): void {
+    this.panel.hidden = false;
+    this.open.setAttribute("aria-pressed", "true");
+    this.draw();
+  }
+
+  /** Forget the prediction under way, which may be of another plan. */
+  private stop(): void {
+    this.running = null;
+    this.progress.hidden = true;
+    this.open.removeAttribute("aria-busy");
+  }
+
+  /** Predict roughly at first, in a fifth of the time, then fully; stop for another plan and if the user closes the map. */
+  private async predict(plan: Plan, own: symbol): Promise<void> {
+    for (const coarse of [true, false]) {
+      if (this.found !== null && (coarse || !this.found.coarse)) continue;
+      const found = await this.timed(coarse, own, api.localisability(plan.id, coarse));
+      if (this.running !== own || this.plan?.revision !== found.revision) return;
+      this.found = found;
+      this.draw();
+      if (this.panel.hidden) return;
+    }
+  }
+
+  /** Show the step of a prediction and its seconds until it is there. */
+  private async timed<T>(coarse: boolean, own: symbol, predicting: Promise<T>): Promise<T> {
+    const begin = Date.now();
+    const tell = (): void => {
+      if (this.running !== own) return;
+      const step = coarse ? "Step 1 of 2: a rough map" : "Step 2 of 2: more places; the map is rough as yet";
+      this.state.textContent = `${step}, ${Math.round((Date.now() - begin) / 1000)} s`;
+      this.progress.hidden = false;
+    };
+    tell();
+    const ticking = setInterval(tell, 1000);
+    try {
+      return await predicting;
+    } finally {
+      clearInterval(ticking);
     }
   }
 
@@ -108,6 +163,8 @@ export class LocalisabilityLayer {
     byId("plan-panel").classList.toggle("predicted", isShown);
     if (!isShown) {
       show(this.element);
+      show(this.share);
+      show(this.advice);
       return;
     }
     const heading = this.known.checked ? "known" : "unknown",
@@ -117,7 +174,7 @@ export class LocalisabilityLayer {
       this.share,
       "In all of the plan: ",
       h("strong", {}, percent(found.probability[condition])),
-      ` within ${within} m. Predicted from the plan, without any photograph.`,
+      ` within ${within} m. Predicted ${found.coarse ? "roughly " : ""}from the plan, without any photograph.`,
     );
     show(this.advice, ...found.advice.map((sentence) => h("li", {}, `${sentence}.`)));
     const cell = cellSize(plan.plan);

@@ -8,6 +8,8 @@ import type { Answer, Hints, Together } from "./types";
 
 export interface Photo {
   file: File;
+  /** The photograph came with an example, not from the user. */
+  isExample: boolean;
   url: string;
   /** Filled fields of the form, by their names in the request. */
   settings: Record<string, string>;
@@ -90,14 +92,15 @@ export class Photos {
     return motion === "turn" || motion === "walk" ? { motion, photos: this.all } : null;
   }
 
-  /** Add pictures and choose the first of them. */
-  add(files: File[]): void {
+  /** Add pictures and choose the first of them; those of examples give way to the user's own. */
+  add(files: File[], isExample = false): void {
     const rejected = files.filter((file) => !isPicture(file));
     clearErrors();
     const added = files
       .filter(isPicture)
       .map((file): Photo => ({
         file,
+        isExample,
         url: URL.createObjectURL(file),
         settings: { ...this.shared },
         hints: NO_HINTS,
@@ -105,11 +108,19 @@ export class Photos {
         asked: { fields: {}, files: [file], onDevice: false },
       }));
     if (added.length > 0) this.forgetGroup();
+    if (added.length > 0 && !isExample) this.discardExamples();
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
     if (rejected.length === 0) return;
     const names = rejected.map((file) => `“${file.name}”`).join(", ");
     showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
+  }
+
+  private discardExamples(): void {
+    for (const photo of this.all.filter(({ isExample }) => isExample)) {
+      this.all.splice(this.all.indexOf(photo), 1);
+      URL.revokeObjectURL(photo.url);
+    }
   }
 
   /** Choose a photograph, or none. */

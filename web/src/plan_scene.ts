@@ -84,7 +84,7 @@ export class PlanScene {
     const isHere = answer !== null && answer.floorplan_id === plan?.id;
     const posterior = isHere ? answer.posterior : null;
     byId("heat-legend").hidden = posterior === null;
-    show(this.heat, posterior && drawn && heatMap(posterior, drawn));
+    show(this.heat, posterior && drawn && heatMap(posterior, drawn, answer!));
     const hasFocus = this.marker.element.contains(document.activeElement);
     show(this.overlay);
     if (answer === null || plan === null || answer.candidates[selected]?.floorplan_id !== plan.id) return false;

@@ -13,8 +13,13 @@ export interface VenueActions {
   showPlan: (planId: string) => void;
 }
 
-/** Return name and level of a plan of a venue. */
-export const planLabel = ({ name, level }: { name: string; level: number }): string => `${name}, level ${level}`;
+// Words for levels in names of plans, such as those that an import made of a file's levels.
+const NAMES_LEVEL =
+  /(?<!\p{L})(level|floor|stor(e?y|ies)|basement|attic|ground|(erd|ober|unter|dach|keller)?gescho(ss|ß)|ebene|stock|étage|sous-sol|rez-de-chaussée|piano|piso|planta|andar|verdieping|våning|etasje|etage|piętro|parter|[eoudk]g)(?!\p{L})|階/iu;
+
+/** Return name and level of a plan of a venue; a name that tells its level tells it once. */
+export const planLabel = ({ name, level }: { name: string; level: number }): string =>
+  NAMES_LEVEL.test(name) ? name : `${name}, level ${level}`;
 
 export class Venues {
   private readonly list = byId("venue-list");

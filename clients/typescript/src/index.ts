@@ -74,8 +74,12 @@ export class Client {
     planOf(await this.request(of("floorplans", id, revisionQuery(revision))));
   layout = (id: string, revision?: string) =>
     this.json<Schemas["LayoutAnswer"]>(of("floorplans", id, `/layout${revisionQuery(revision)}`));
-  /** Predict which photographs of a plan will be found. */
-  localisability = (id: string) => this.json<Schemas["LocalisabilityAnswer"]>(of("floorplans", id, "/localisability"));
+  /** Predict which photographs of a plan will be found; roughly, in a fifth of the time, if `coarse`. */
+  localisability = (id: string, coarse = false, options: CallOptions = {}) =>
+    this.json<Schemas["LocalisabilityAnswer"]>(
+      of("floorplans", id, `/localisability${coarse ? "?coarse=true" : ""}`),
+      options,
+    );
   createPlan = async (plan: Schemas["FloorPlanDocument"]) =>
     planOf(await this.request("/floorplans", json("POST", plan)));
   /** Upload a plan as a file; `fields` are import options. */

@@ -35,7 +35,7 @@ from lalaloc_core.importers.common.sketch import (
     T,
     choose_levels,
 )
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.common.vocabulary import is_roof, room_type_from_name
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
@@ -192,6 +192,14 @@ def assemble_levels(
     if not plans:
         raise next(iter(empty.values()))
     left_out = tuple(f"level '{name}' was left out: {reason}" for name, reason in list(empty.items())[:_MAX_NAMED])
+    roofs = [plan for plan in plans if plan.level is not None and is_roof(plan.level.name)]
+    if len(chosen) > 1 and 0 < len(roofs) < len(plans):
+        plans = [plan for plan in plans if plan not in roofs]
+        left_out += tuple(
+            f"level '{plan.level.name}' was left out: it is a roof (set level to read it)"
+            for plan in roofs[:_MAX_NAMED]
+            if plan.level is not None
+        )
     return tuple(
         replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *left_out))) for plan in plans
     )

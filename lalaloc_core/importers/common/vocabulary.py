@@ -173,6 +173,16 @@ _JAPANESE_ROLES: tuple[tuple[str, Role], ...] = (
 )
 # Letters that have no base letter with an accent.
 _LETTERS = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "Æ": "AE", "ł": "l", "Ł": "L", "đ": "d", "œ": "oe"})
+# Words for roofs, and those that stand beside them in names of levels.
+_ROOFS, _OF_LEVELS = (
+    frozenset(words.split())
+    for words in (
+        "roof roofs roofing dach dacher toit toiture toits tetto copertura cubierta tejado cobertura telhado dak tak "
+        "yttertak tag",
+        "level floor storey story plan ebene stockwerk niveau etage livello piano nivel planta piso andar verdieping "
+        "niva etasje poziom pietro le la il el o het",
+    )
+)
 
 
 def split_words(text: str) -> list[str]:
@@ -180,6 +190,12 @@ def split_words(text: str) -> list[str]:
     spaced = re.sub(r"(?<=[a-zß-öø-ÿł])(?=[A-ZÀ-ÞŁ])", " ", text)
     folded = unicodedata.normalize("NFKD", spaced.translate(_LETTERS)).encode("ascii", "ignore").decode().casefold()
     return re.findall(r"[a-z]+", folded)
+
+
+def is_roof(level: str) -> bool:
+    """Return whether a level is a roof by its name: "Roof", "Roof level", "04 - Dach", but no "Roof terrace"."""
+    words = [word for word in split_words(level) if word not in _OF_LEVELS]
+    return bool(words) and all(word in _ROOFS for word in words)
 
 
 def role_from_name(text: str) -> Role | None:

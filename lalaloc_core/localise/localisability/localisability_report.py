@@ -15,10 +15,10 @@ _TITLES: dict[Photograph, str] = {
     "three_phone": "three of one spot",
 }
 _REMEDIES = {
-    "heading": "state the heading",
-    "three_photographs": "take three photographs of one spot, a third of a turn apart",
-    "sphere": "take a sphere",
-    "room_hint": "name the room",
+    "heading": "Set the heading of a phone photograph",
+    "three_photographs": "Take three phone photographs from one spot, a third of a turn apart, as one query",
+    "sphere": "Take a 360° photograph instead of a phone photograph",
+    "room_hint": "Choose the room of a phone photograph as a hint",
     "doors": "draw doors and windows",
 }
 # Smallest gain that is advised.
@@ -26,8 +26,11 @@ _WORTH = 0.02
 _PAIRS = 3
 
 
-def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
-    """Return plain data: probabilities by condition for the plan, its rooms and places, confusions and remedies."""
+def report_of(plan: FloorPlan, found: Localisability, *, coarse: bool = False) -> dict[str, Any]:
+    """Return plain data: probabilities by condition for the plan, its rooms and places, confusions and remedies.
+
+    A coarse prediction has too few draws for advice.
+    """
     rooms = [
         {"id": room.id, "name": room.name, "probability": row}
         for room, row in zip(plan.rooms, _rows(found.rooms), strict=True)
@@ -46,6 +49,7 @@ def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
     ]
     gains = {name: None if gain is None else round(gain, 3) for name, gain in found.gains.items()}
     return {
+        "coarse": coarse,
         "spacing_m": round(found.spacing_m, 3),
         "probability": {name: round(found.plan[name], 3) for name in CONDITIONS},
         "rooms": rooms,
@@ -53,7 +57,7 @@ def report_of(plan: FloorPlan, found: Localisability) -> dict[str, Any]:
         "confused": confused,
         "measured_on": HARDEST,
         "gains": gains,
-        "advice": _advice_of(plan, found),
+        "advice": [] if coarse else _advice_of(plan, found),
     }
 
 
@@ -81,7 +85,8 @@ def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
     for gain, name in sorted(gains, reverse=True):
         if gain >= _WORTH:
-            lines.append(f"To find more phone photographs, {_REMEDIES[name]}: +{100 * gain:.0f} points")
+            before, after = found.plan[HARDEST], found.plan[HARDEST] + gain
+            lines.append(f"{_REMEDIES[name]}: {_percent(after)} are found instead of {_percent(before)}")
     doors = found.gains["doors"]
     if doors is None:
         lines.append(f"The plan shows no openings: {_REMEDIES['doors']}")
