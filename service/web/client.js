@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-YLBQ3YSA.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,b}from"./chunk-PZ3BUION.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
