@@ -197,7 +197,11 @@ async def read_parts(
                 form = await parser.parse()
     except MultiPartException as error:
         if repeated and error.message.startswith(_TOO_MANY_FILES):
-            faults = [(name, repeats.fault(f"more than {repeats.most}")) for name, repeats in repeated.items()]
+            faults = [
+                (name, repeats.fault(f"more than {repeats.most}"))
+                for name, repeats in repeated.items()
+                if repeats.most > 1
+            ]
             raise errors.InvalidRequestError(faults) from error
         if error.message.startswith(_TOO_LARGE_PART):
             name = parser._current_part.field_name[:50]

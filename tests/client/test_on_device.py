@@ -11,7 +11,8 @@ import httpx
 import pytest
 
 from lalaloc_client import ConflictError, InvalidError, OnDeviceError, UnauthorisedError
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.bundle import MANIFEST_NAME, default_bundle
+from lalaloc_core.localise.encode.features import DEVICE_FILES
 from tests.client.conftest import FailingServer, MakeClient, Planned
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp, upload
@@ -52,7 +53,7 @@ def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) ->
     answer = service.localise(home, KITCHEN, on_device=True, refine="none")
     assert answer.room == "kitchen"
     (folder,) = cache.iterdir()
-    assert {path.name for path in folder.iterdir()} == {"image_encoder.onnx", "view_encoder.onnx"}
+    assert {path.name for path in folder.iterdir()} == set(DEVICE_FILES) - {MANIFEST_NAME}
     found = service.localise_sequence(home, [KITCHEN, PHONE.read_bytes()], on_device=True, hfov_deg=None, refine="none")
     assert len(found.poses) == 2
     with pytest.raises(OnDeviceError, match="hfov_deg is 900"):
@@ -69,7 +70,7 @@ def test_damaged_cache_is_loaded_again(service: Any, home: str, cache: Path) -> 
     (getattr(service, "_client", service))._device.forget()
     service.localise(home, PHONE, on_device=True, refine="none")
     assert (folder / "view_encoder.onnx").read_bytes() == whole
-    assert {path.name for path in folder.iterdir()} == {"image_encoder.onnx", "view_encoder.onnx"}
+    assert {path.name for path in folder.iterdir()} == set(DEVICE_FILES) - {MANIFEST_NAME}
 
 
 def test_features_are_sent_as_such(service: Any, home: str, tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_altered_model_is_refused(
 def test_service_with_another_model_gets_its_features(
     make_client: MakeClient, failing: FailingServer, app: httpx.Client, cache: Path
 ) -> None:
-    files = {name: app.get(f"/model/{name}").content for name in ("image_encoder.onnx", "view_encoder.onnx")}
+    files = {name: app.get(f"/model/{name}").content for name in DEVICE_FILES if name != MANIFEST_NAME}
     manifest = Planned(200, app.get("/model/manifest.json").content)
     foreign = {"type": "urn:lalaloc:problem:foreign-features", "status": 409, "detail": "another model"}
     answers = [Planned(409, foreign), manifest, Planned(409, foreign)]
@@ -113,4 +114,4 @@ def test_service_with_another_model_gets_its_features(
         client.localise("0" * 32, PHONE, on_device=True)
     # The files are cached by digest, so the manifest alone was read again.
     assert [request.path for request in failing.requests].count("/model/manifest.json") == 2
-    assert len(failing.requests) == 6
+    assert len(failing.requests) == 7

@@ -23,6 +23,7 @@ from lalaloc_core.bundle import (
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
     MANIFEST_NAME,
+    OBJECTS_ONNX,
     VIEW_ONNX,
     VIEW_WEIGHTS,
     Bundle,
@@ -75,7 +76,7 @@ class TestExport:
         assert (manifest.name, manifest.version, manifest.architecture) == ("tiny", "test", "ring")
         assert (manifest.image_height, manifest.image_width, manifest.profile_columns) == (32, 64, 32)
         assert (manifest.latent_size, manifest.ring_sectors) == (128, 16)
-        assert set(manifest.files) == set(BUNDLE_FILES) - {VIEW_ONNX, VIEW_WEIGHTS}
+        assert set(manifest.files) == set(BUNDLE_FILES) - {VIEW_ONNX, VIEW_WEIGHTS, OBJECTS_ONNX}
         for name, entry in manifest.files.items():
             assert len(opened_bundle.read(name)) == entry.bytes
         assert manifest.training["parity_max_abs_difference"] < PARITY_TOLERANCE == 1e-4

@@ -346,7 +346,7 @@ class TestMatchingWeights:
             PredictedCandidate(
                 pose=dataclasses.replace(TRUTH, x_m=0.2 if k == right else 3.0 + k),
                 terms=dict(zip(("walls", "openings", "ceiling", "room_type"), map(float, row), strict=True))
-                | {"height": 0.0},
+                | {"objects": 0.0, "height": 0.0},
                 probability=0.1,
             )
             for k, row in enumerate(terms)

@@ -244,9 +244,8 @@ def test_contradicted_heading_is_searched_with_a_warning(
     warned = 0
     for shot, home in list(zip(shots, homes, strict=True))[:6]:
         answer = ask(shipped, home, shot.picture, (shot.heading_deg + 120.0) % 360.0)
-        if answer["warnings"]:
+        if any("contradicts" in warning for warning in answer["warnings"]):
             warned += 1
-            assert "contradicts" in answer["warnings"][0]
             assert answer["heading_source"] == "searched"
         else:
             assert answer["confidence"] < 0.5

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.localise.encode.features import MAX_BYTES, FeatureEncoder, read_features
+from lalaloc_core.localise.encode.features import DEVICE_FILES, MAX_BYTES, FeatureEncoder, read_features
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import Photograph, open_photograph
@@ -219,7 +219,7 @@ def test_camera_is_stated_when_features_are_computed(client: httpx.Client, home:
 
 
 def test_device_needs_the_served_files_only(client: httpx.Client, device: Device, tmp_path: Path) -> None:
-    for name in ("manifest.json", "image_encoder.onnx", "view_encoder.onnx"):
+    for name in DEVICE_FILES:
         served = client.get(f"/model/{name}")
         assert served.status_code == 200, served.text
         (tmp_path / name).write_bytes(served.content)

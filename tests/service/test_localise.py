@@ -204,7 +204,7 @@ BAD_PICTURES = {
     "empty": (b"", "empty"),
     "no picture": (b"\x89PNG but not really", "not a readable"),
     "GIF": (b"GIF89a", "is a GIF picture"),
-    "truncated": (encode_picture(512, 256, "JPEG")[:3000], "damaged"),
+    "truncated": (encode_picture(512, 256, "JPEG")[:3000], "rows are missing, because the file ends too early"),
     "bomb": (_png_header(20_000, 10_000), "pixels"),
     "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
     "strip": (encode_picture(800, 256, "PNG"), "800 x 256 is a strip; send projection=cylindrical and hfov_deg"),

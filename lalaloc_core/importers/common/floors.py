@@ -43,7 +43,7 @@ class Floor:
     higher_m2: float
 
 
-def find_floor(faces: Iterable[Float[np.ndarray, "n 3"]], check_time: Callable[[], None]) -> Floor | None:
+def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: Callable[[], None]) -> Floor | None:
     """Return the floor among the faces of a solid, or of a surface, in metres; None if all faces are steep.
 
     The floor begins with the lowest face and grows over faces that touch it, up to a step of 60 cm each. `check_time`

@@ -114,7 +114,7 @@ def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions)
     Raises:
         InvalidFloorPlanError: no storey has that name or number.
     """
-    ordered = sorted(levels.values(), key=lambda item: (_height(item[0]), _natural(item[0].name)))
+    ordered = sorted(levels.values(), key=lambda item: (_height(item[0]), _numbers(item[0].name)))
     if options.level is None:
         return ordered
     found = [item for item in ordered if item[0].matches(options.level)]
@@ -124,9 +124,9 @@ def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions)
     return found
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which "Level 2" is before "Level 10"."""
-    return [(int(part), "") if part.isdecimal() else (0, part.casefold()) for part in re.split(r"(\d{1,9})", name)]
+def _numbers(name: str) -> list[int]:
+    """Return a key by which "Level 2" is before "Level 10"; names without a number stay in the order of the file."""
+    return [int(number) for number in re.findall(r"\d{1,9}", name)]
 
 
 def _height(level: Level) -> float:

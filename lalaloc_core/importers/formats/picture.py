@@ -108,8 +108,11 @@ def _open(
                 warmth = None if upright.mode in grey_modes else _warmth(flat)
     except InvalidFloorPlanError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError, Image.DecompressionBombWarning,
-            TypeError, ZeroDivisionError) as error:  # fmt: skip
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InvalidFloorPlanError(
+            f"the picture has too many pixels; the limit is {limit} in total (max_plan_pixels); reduce its resolution"
+        ) from error
+    except (OSError, ValueError, SyntaxError, EOFError, TypeError, ZeroDivisionError) as error:
         raise InvalidFloorPlanError("the picture is damaged and cannot be read; save it again as PNG") from error
     return gray, warmth, _paper(dpi)
 
