@@ -13,6 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.vocabulary import mentions_roof
 
 OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]
@@ -114,7 +115,7 @@ def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions)
     Raises:
         InvalidFloorPlanError: no storey has that name or number.
     """
-    ordered = sorted(levels.values(), key=lambda item: (_height(item[0]), _numbers(item[0].name)))
+    ordered = sorted(levels.values(), key=lambda item: (_height(item[0]), _order(item[0].name)))
     if options.level is None:
         return ordered
     found = [item for item in ordered if item[0].matches(options.level)]
@@ -124,9 +125,9 @@ def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions)
     return found
 
 
-def _numbers(name: str) -> list[int]:
-    """Return a key by which "Level 2" is before "Level 10"; names without a number stay in the order of the file."""
-    return [int(number) for number in re.findall(r"\d{1,9}", name)]
+def _order(name: str) -> tuple[bool, list[int]]:
+    """Return a key by which "Level 2" is before "Level 10", and a roof last; others stay in the order of the file."""
+    return mentions_roof(name), [int(number) for number in re.findall(r"\d{1,9}", name)]
 
 
 def _height(level: Level) -> float:

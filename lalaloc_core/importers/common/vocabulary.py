@@ -198,6 +198,11 @@ def is_roof(level: str) -> bool:
     return bool(words) and all(word in _ROOFS for word in words)
 
 
+def mentions_roof(level: str) -> bool:
+    """Return whether a level is at a roof by its name, such as "Roof terrace"."""
+    return any(word in _ROOFS for word in split_words(level))
+
+
 def role_from_name(text: str) -> Role | None:
     """Return the role of a layer, block or class from its name, None if the name gives none."""
     found = {role for word in split_words(text) if (role := _role_of_word(word)) is not None}
