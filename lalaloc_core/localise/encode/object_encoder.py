@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.bundle import OBJECTS_ONNX, Bundle, ObjectsManifest
-from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.localise.encode.exported_network import as_array, open_session
 from lalaloc_core.localise.query import PredictedRoomType, SeenObject, SeenObjects
 from lalaloc_core.photograph import Photograph
 
 OBJECT_OUTPUTS = ("object_probability", "object_azimuth")
-# Least probability of objects that are named.
-_LEAST = 0.1
+# Least probability of objects that are named, and a probability whose log is finite.
+_LEAST, _NEVER = 0.1, 1e-9
 
 
 class ObjectEncoder:
@@ -60,10 +59,9 @@ def seen_objects(
     """
     probability = np.stack([share for share, _ in views])
     score = probability.mean(axis=0) @ np.array(manifest.shares) + manifest.floor
-    types = len(ROOM_TYPES)
-    # Objects tell nothing about rooms without a type.
-    score[0] = score[1:].mean()
-    room_type = PredictedRoomType(np.log(score / score.sum()), np.full(types, 1.0 / types))
+    # Objects are never those of the unknown type.
+    score[0] = _NEVER
+    room_type = PredictedRoomType(np.log(score / score.sum()), np.full(len(score), 1.0 / (len(score) - 1)))
     best = probability.argmax(axis=0)
     named = [number for number in np.argsort(-probability.max(axis=0)) if probability[best[number], number] >= _LEAST]
     objects = tuple(
