@@ -22,7 +22,7 @@ _ALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 _MARKER = re.compile(rb"\xff([^\x00\xff])")
 # Segments hold up to 64 KiB, so these are more than any metadata need. Cameras write one segment of Exif, or a few.
 _MAX_SEGMENTS, _MAX_EXIF_SEGMENTS = 2_000, 16
-# PhotographEncoder write pixels in chunks of 8 KiB and more.
+# Encoders of PNG write pixels in chunks of 8 KiB and more.
 _MAX_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 # Length before and checksum after each chunk.
