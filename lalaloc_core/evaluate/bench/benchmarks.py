@@ -17,6 +17,7 @@ from lalaloc_core.evaluate.bench.accuracy import (
     bench_views,
 )
 from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
+from lalaloc_core.evaluate.bench.bounds import bench_bounds
 from lalaloc_core.evaluate.bench.films import bench_films
 from lalaloc_core.evaluate.bench.localisability_accuracy import bench_localisability
 from lalaloc_core.evaluate.bench.service_latency import bench_service
@@ -38,6 +39,7 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "views": lambda: bench_views(bundle, homes, textures),
         "turns": lambda: bench_turns(bundle, homes, textures),
         "films": lambda: bench_films(bundle, homes, textures),
+        "bounds": lambda: bench_bounds(bundle, homes, textures),
         "localisability": lambda: bench_localisability(bundle, homes, textures),
         "uninformative": lambda: bench_uninformative(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),

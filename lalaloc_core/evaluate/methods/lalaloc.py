@@ -15,7 +15,7 @@ import torch
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.bundle import Bundle, MatchingWeights
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
@@ -24,7 +24,7 @@ from lalaloc_core.learn.data.views import ViewPhotograph
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-from lalaloc_core.localise.match import MatchingConfig, PoseGrid
+from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost, PoseGrid, layouts_at
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
 from lalaloc_core.localise.refine import LpoConfig
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
@@ -272,6 +272,23 @@ def found_pose(query: Query, candidate: Candidate) -> Pose:
     """Return a candidate as a pose of the panorama."""
     heading = photograph_heading(query, candidate)
     return Pose.at(candidate.position_m, candidate.room_index, heading, candidate.cost)
+
+
+def cost_of_pose(query: Query, plan: FloorPlan, pose: Pose, weights: MatchingWeights) -> float:
+    """Return the matching cost of a pose of the photograph."""
+    assert query.profile is not None
+    config = MatchingConfig()
+    layouts = layouts_of_pose(query, plan, pose)
+    cost, _ = MatchingCost(plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
+    return float(cost[0, 0])
+
+
+def layouts_of_pose(query: Query, plan: FloorPlan, pose: Pose) -> Layouts:
+    """Return the layout at a pose in the frame of the query's first hypothesis."""
+    assert query.profile is not None
+    poses = PoseSet(pose.position_m[None], np.array([pose.room_index]))
+    heading = np.array([math.radians(pose.heading_deg) - query.roll[0]])
+    return layouts_at(plan, poses, heading, query.profile.log_m.shape[1])
 
 
 def grid_index(grid: PoseGrid, candidate: Candidate) -> int:

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import TWO_PI, column_azimuths
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
@@ -41,9 +40,7 @@ from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInf
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
 from lalaloc_core.localise.query import Query
-from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 
 SUMMARY_FILE = "worst.json"
@@ -224,8 +221,8 @@ class _QueryAnalyser:
             floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
             strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
-            fit["true_cost"] = _cost(query, scene, prediction.truth, weights)
-            fit["found_cost"] = None if found is None else _cost(query, scene, found, weights)
+            fit["true_cost"] = cost_of_pose(query, scene.plan, prediction.truth, weights)
+            fit["found_cost"] = None if found is None else cost_of_pose(query, scene.plan, found, weights)
             fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)
         errors_m = position_errors_m([prediction])
         first_m = position_errors_m([prediction], next(iter(prediction.stages), None))
@@ -250,17 +247,6 @@ class _QueryAnalyser:
 def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width: float) -> Stroke:
     lines = layout_lines(scene.plan, pose, camera_height_m, PICTURE_HEIGHT, PICTURE_WIDTH)
     return Stroke(lines, colour, width, width + 1.0)
-
-
-def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> float:
-    """Return the matching cost of a pose."""
-    assert query.profile is not None
-    config = MatchingConfig()
-    poses = PoseSet(pose.position_m[None], np.array([pose.room_index]))
-    heading = np.array([pose.heading - query.roll[0]])
-    layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
-    cost, _ = MatchingCost(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
-    return float(cost[0, 0])
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:

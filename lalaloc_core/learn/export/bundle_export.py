@@ -244,15 +244,23 @@ class _RingOutputs(nn.Module):
 
 
 class _ViewOutputs(nn.Module):
-    """Encoder of views with its features as a plain tuple."""
+    """Encoder of views with its features as a plain tuple: averages over the picture and its mirror image."""
 
     def __init__(self, encoder: ViewNetwork) -> None:
         super().__init__()
         self.encoder = encoder
 
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
-        features = self.encoder(image, camera_height_m)
-        return (*vars(features.walls).values(), features.seen, *vars(features.structure).values())
+        both = self.encoder(torch.cat([image, image.flip(2)]), torch.cat([camera_height_m, camera_height_m]))
+        openings, *others = vars(both.structure).values()
+        by_column = (*(_halves(value) for value in (*vars(both.walls).values(), both.seen, openings)),)
+        averaged = (*(0.5 * (own + mirrored.flip(1)) for own, mirrored in by_column),)
+        return (*averaged, *(0.5 * (own + mirrored) for own, mirrored in map(_halves, others)))
+
+
+def _halves(values: Tensor) -> tuple[Tensor, Tensor]:
+    own, mirrored = values.unflatten(0, (2, -1)).unbind()
+    return own, mirrored
 
 
 def _export(
