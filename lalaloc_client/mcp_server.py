@@ -1,0 +1,245 @@
+"""Server of the Model Context Protocol: tools with which assistants import plans and localise photographs.
+
+The tools call a LaLaLoc service, with the caller's key and within its limits. Over stdio the server runs on the
+caller's machine and reads files by their paths. Over streamable HTTP it reads none: files come as data URLs, and the
+caller's `Authorization` header goes to the service.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import logging
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+from mcp.server.mcpserver import Context, Image, MCPServer
+from mcp.server.mcpserver.exceptions import ToolError
+from pydantic import Field
+
+from lalaloc_client.asynchronous.client import AsyncClient
+from lalaloc_client.errors import ClientError, ConnectionFailedError, ProblemError
+from lalaloc_client.requests import QueryOptions, ViewOptions, film_request, http_options
+
+_INSTRUCTIONS = (
+    "Finds where in a floor plan photographs were taken. Import the plan first, then localise photographs by its id. "
+    "Coordinates are metres in the plan's frame, headings degrees clockwise from its +y. Believe an answer as far as "
+    "its confidence says, tell the user its warnings, and if it is not sure, ask what to do next."
+)
+_DATA, _BASE64, _BEARER = "data:", ";base64,", "Bearer "
+# Base64 of the service's largest files, in a request to this server.
+_MAX_BODY_BYTES = 2**28
+_MAX_PHOTOGRAPHS, _MAX_LISTED = 64, 100
+# Films are read and plans with many rooms prepared within this.
+_TIMEOUT_S = 120.0
+
+File = Annotated[str, Field(description="Path of a file on this machine, or a data URL (data:...;base64,...).")]
+PlanId = Annotated[str | None, Field(description="Id of the floor plan; give this or venue_id.")]
+VenueId = Annotated[str | None, Field(description="Id of a venue of several plans, instead of floorplan_id.")]
+FieldOfView = Annotated[
+    float | None, Field(description="Horizontal field of view in degrees. Default: from the file, or estimated.")
+]
+CameraHeight = Annotated[float | None, Field(description="Camera height above the floor in metres.")]
+
+
+def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool) -> MCPServer[Any]:
+    """Return a server whose tools call the service at an address.
+
+    Args:
+        base_url: address of the service.
+        api_key: key of a caller that sends none, as over stdio; None for none.
+        reads_paths: tools read files of this machine, as is right only if the caller owns it.
+
+    Raises:
+        ValueError: the address or the key is invalid.
+    """
+    http_options(base_url, api_key, _TIMEOUT_S)
+    tools = _Tools(base_url, api_key, reads_paths=reads_paths)
+    server: MCPServer[Any] = MCPServer("lalaloc", instructions=_INSTRUCTIONS)
+    for tool in (tools.import_plan, tools.list_plans, tools.localise_photograph, tools.localise_turn, tools.next_step):
+        server.add_tool(tool)
+    return server
+
+
+def serve(base_url: str, api_key: str | None = None, *, address: tuple[str, int] | None = None) -> None:
+    """Serve on stdio, or over streamable HTTP at an address (host, port), path `/mcp`, until interrupted.
+
+    Raises:
+        ValueError: the address of the service or the key is invalid.
+    """
+    # One line for each request is too much beside the protocol.
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    if address is None:
+        make_server(base_url, api_key, reads_paths=True).run("stdio")
+    else:
+        # Callers must bring keys of their own.
+        server, (host, port) = make_server(base_url, reads_paths=False), address
+        server.run("streamable-http", host=host, port=port, stateless_http=True, max_request_body_size=_MAX_BODY_BYTES)
+
+
+class _Tools:
+    """The tools; their docstrings and fields are what assistants read."""
+
+    def __init__(self, base_url: str, api_key: str | None, *, reads_paths: bool) -> None:
+        self._base_url, self._api_key, self._reads_paths = base_url, api_key, reads_paths
+
+    async def import_plan(
+        self,
+        plan: File,
+        context: Context[Any, Any],
+        options: Annotated[
+            dict[str, str | float | bool] | None,
+            Field(
+                description='Facts that the file does not state, such as {"metres_per_pixel": 0.01}, '
+                '{"level": "1"}, {"page": 2} or {"unit": "cm"}.'
+            ),
+        ] = None,
+    ) -> str:
+        """Store a floor plan (DXF, IFC, SVG, PDF, PNG, JPEG, GeoJSON, native JSON, ...).
+
+        Returns its id and rooms, and a report of what was read, assumed and left out.
+        """
+        document = self._file(plan)
+        async with self._service(context) as service:
+            stored = await service.upload_floorplan(document, options=options)
+            ready = await service.wait_until_ready(stored.id)
+            rooms = [{"id": room.id, "name": room.name, "type": room.type} for room in ready.rooms]
+            facts = {"id": ready.id, "name": ready.name, "status": ready.status, "area_m2": ready.area_m2}
+            return _text({**facts, "rooms": rooms, "warnings": ready.warnings, "report": ready.import_report})
+
+    async def list_plans(
+        self,
+        context: Context[Any, Any],
+        name: Annotated[str | None, Field(description="Part of the plans' names. Default: all plans.")] = None,
+    ) -> str:
+        """List the first hundred stored floor plans with their ids."""
+        async with self._service(context) as service:
+            plans: list[dict[str, Any]] = []
+            async for plan in service.floorplans(name, page_size=_MAX_LISTED):
+                plans.append({"id": plan.id, "name": plan.name, "status": plan.status})
+                if len(plans) == _MAX_LISTED:
+                    break
+            return _text(plans)
+
+    async def localise_photograph(
+        self,
+        photograph: File,
+        context: Context[Any, Any],
+        floorplan_id: PlanId = None,
+        venue_id: VenueId = None,
+        heading_deg: Annotated[
+            float | None, Field(description="Heading of its centre, clockwise from the plan's +y, if known.")
+        ] = None,
+        hfov_deg: FieldOfView = None,
+        camera_height_m: CameraHeight = None,
+        picture: Annotated[bool, Field(description="Also return the answer as a picture (plans only).")] = True,
+    ) -> list[str | Image]:
+        """Find where in a floor plan a photograph was taken: a phone's photograph or a 360° sphere.
+
+        Returns position, heading, room, confidence, warnings and further candidates, and the answer drawn.
+        """
+        content = self._file(photograph)
+        options = QueryOptions(heading_deg=heading_deg, hfov_deg=hfov_deg, camera_height_m=camera_height_m)
+        async with self._service(context) as service:
+            found = await service.localise_query("/localise", [content], _place(floorplan_id, venue_id), options)
+            answer: list[str | Image] = [found.decode()]
+            if picture and floorplan_id is not None:
+                answer.append(Image(data=await service.picture(floorplan_id, content, **options), format="png"))
+            return answer
+
+    async def localise_turn(
+        self,
+        context: Context[Any, Any],
+        photographs: Annotated[
+            list[File] | None,
+            Field(description="Photographs of one spot in the order of the turn, overlapping by half."),
+        ] = None,
+        film: Annotated[File | None, Field(description="A film of one slow turn instead (MP4, MOV, WebM).")] = None,
+        floorplan_id: PlanId = None,
+        venue_id: VenueId = None,
+        hfov_deg: FieldOfView = None,
+        camera_height_m: CameraHeight = None,
+    ) -> str:
+        """Find where someone stood who turned around once: far surer than a single photograph."""
+        if (photographs is None) == (film is None):
+            raise ToolError("give either photographs or film")
+        contents = [self._file(photograph) for photograph in photographs or []]
+        if film is None and not 2 <= len(contents) <= _MAX_PHOTOGRAPHS:
+            raise ToolError(f"{len(contents)} photographs are given; a turn has 2 to {_MAX_PHOTOGRAPHS}")
+        path, options = "/localise/sequence", ViewOptions(hfov_deg=hfov_deg)
+        values = {**_place(floorplan_id, venue_id), "motion": "turn", "camera_height_m": camera_height_m}
+        async with self._service(context) as service:
+            if film is None:
+                found = await service.localise_query(path, contents, values, options)
+            else:
+                found = await service.query(film_request, path, self._file(film), values, options)
+            return found.decode()
+
+    async def next_step(
+        self,
+        photograph: File,
+        context: Context[Any, Any],
+        floorplan_id: PlanId = None,
+        venue_id: VenueId = None,
+        hfov_deg: FieldOfView = None,
+    ) -> str:
+        """Say what to do next to make an unsure answer sure, such as a turn, a step through a door, or a heading."""
+        content = self._file(photograph)
+        async with self._service(context) as service:
+            options = QueryOptions(hfov_deg=hfov_deg)
+            found = await service.localise_query("/localise", [content], _place(floorplan_id, venue_id), options)
+            answer = json.loads(found)
+            view = answer.get("view") or {}
+            said = {name: view[name] for name in ("advice", "next_step") if view.get(name) is not None}
+            return _text({"confidence": answer.get("confidence"), **said, "warnings": answer.get("warnings", [])})
+
+    @asynccontextmanager
+    async def _service(self, context: Context[Any, Any]) -> AsyncIterator[AsyncClient]:
+        """Yield a client with the caller's key; errors of the service become errors of the tool, with the remedy."""
+        sent = "" if context.headers is None else context.headers.get("authorization", "")
+        key = sent.removeprefix(_BEARER) if sent.startswith(_BEARER) else self._api_key
+        try:
+            async with AsyncClient(self._base_url, api_key=key, timeout_s=_TIMEOUT_S) as service:
+                yield service
+        except ProblemError as error:
+            faults = "".join(f"; {name} {message}" for name, message in error.faults)
+            raise ToolError(f"{error.detail}{faults}") from error
+        except ConnectionFailedError as error:
+            raise ToolError(f"{error}; does the service at {self._base_url} run?") from error
+        except (ClientError, OSError, ValueError) as error:
+            raise ToolError(str(error)) from error
+
+    def _file(self, text: str) -> bytes | Path:
+        """Return the content of a data URL, or the path of a file.
+
+        Raises:
+            ToolError: neither, or paths are not read.
+        """
+        if text.startswith(_DATA):
+            _, separator, encoded = text.partition(_BASE64)
+            if not separator:
+                raise ToolError("the data URL is not in base64; write data:image/jpeg;base64,...")
+            try:
+                return base64.b64decode(encoded, validate=True)
+            except binascii.Error as error:
+                raise ToolError("the data URL is damaged: it is not valid base64") from error
+        if not self._reads_paths:
+            raise ToolError("this server reads no files of its machine; send the file as a data URL")
+        path = Path(os.path.expanduser(text))
+        if not path.is_file():
+            raise ToolError(f"there is no file '{text}'; give the full path")
+        return path
+
+
+def _place(floorplan_id: str | None, venue_id: str | None) -> dict[str, str | None]:
+    if (floorplan_id is None) == (venue_id is None):
+        raise ToolError("give either floorplan_id or venue_id; list_plans names the stored plans")
+    return {"floorplan_id": floorplan_id, "venue_id": venue_id}
+
+
+def _text(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
