@@ -22,6 +22,7 @@ _GROUPS = (
     "views",
     "turns",
     "films",
+    "steps",
     "localisability",
     "uninformative",
     "evidence",
