@@ -116,7 +116,7 @@ export function stepArrow(answer: Answer, box: Box): SVGGElement | null {
   const tip = [-0.15, 0.15].map((side) => `M${at(turn, far)}L${at(turn + side, far - 1.6 * unit)}`).join("");
   return s(
     "g",
-    { class: "step", transform: `translate(${x_m} ${-y_m}) rotate(${answer.heading_deg})` },
+    { class: "next-step", transform: `translate(${x_m} ${-y_m}) rotate(${answer.heading_deg})` },
     s("title", {}, `Next step: ${step.text}`),
     step.kind === "turn" && s("path", { d: arc }),
     s("path", { d: `M${at(turn, step.kind === "turn" ? 5 * unit : 1.5 * unit)}L${at(turn, far)}${tip}` }),
