@@ -221,7 +221,7 @@ def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedC
     model = LocalModel(bundle)
     height = stated_height(plan, arguments.camera_height)
     with tqdm(total=2, desc="read the turn", disable=None, leave=False) as progress:
-        turn = read_turn(path, model, stated)
+        turn = read_turn(path, bundle.manifest, stated)
         progress.update()
         progress.set_description("localise")
         grid = model.grid(plan, plan.camera_height_m if model.encoder.predicts_profile else height.height_m)
