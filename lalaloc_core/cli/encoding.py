@@ -45,8 +45,8 @@ def add_commands(commands: Any) -> None:
         type=Path,
         metavar="FILE",
         help="file of the features of a single photograph (default: beside each photograph, with the suffix "
-        ".features); of --turn: folder of the features and of turn.json, the fields to send with them (default: FILM with the "
-        "suffix .features)",
+        ".features); of --turn: folder of the features and of turn.json, the fields to send with them (default: FILM "
+        "with the suffix .features)",
     )
     add_camera_options(encode)
     encode.set_defaults(run=_encode)
