@@ -159,6 +159,30 @@ class SeenObject:
 
 
 @dataclass(frozen=True)
+class NextStep:
+    """Step after an answer that is not sure, and what it is expected to tell.
+
+    Attributes:
+        kind: `turn` (another photograph from the same spot), `door` (one from behind a door), `heading` (state it) or
+            `rooms` (choose one of them as a hint).
+        text: the step in words.
+        turn_deg: of `turn` and `door`: direction relative to the photograph's centre, clockwise.
+        distance_m: of `door`: distance to it.
+        rooms: of `rooms`: ids of the probable rooms, the most probable first.
+        expected_bits: expected increase of `View.information_bits`.
+        expected_confidence: expected confidence after the step.
+    """
+
+    kind: str
+    text: str
+    turn_deg: float | None
+    distance_m: float | None
+    rooms: tuple[str, ...] | None
+    expected_bits: float
+    expected_confidence: float
+
+
+@dataclass(frozen=True)
 class View(ReadView):
     """Assumptions about a photograph, and how much it could tell. See `ReadView` as well.
 
@@ -170,6 +194,8 @@ class View(ReadView):
             models without objects.
         objects: recognised objects that tell the type of room, the most probable first; None as `room_types`.
         relative_heading: heading minus that of the first photograph of a turn; None where it was searched.
+        next_step: the single step with the highest expected confidence; None where the answer is sure, where no step
+            helps, and for services without this field.
     """
 
     information_bits: float
@@ -178,6 +204,7 @@ class View(ReadView):
     room_types: Mapping[str, float] | None = None
     objects: tuple[SeenObject, ...] | None = None
     relative_heading: AssumedAngle | None = None
+    next_step: NextStep | None = None
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
+import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera
@@ -14,21 +17,36 @@ from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import atomic_write
 
+if TYPE_CHECKING:
+    from lalaloc_core.bundle import Manifest
+    from lalaloc_core.localise.encode.features import FeatureEncoder
+    from lalaloc_core.photograph import StatedCamera
+
 _HEIGHT_M = 1.5
+# Least standard deviation of the angles of a turn that is stated.
+_LEAST_STD_DEG = 0.5
 
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     encode = commands.add_parser("encode", help="compute the features of photographs, to send instead of them")
     encode.add_argument(
-        "photographs", type=Path, nargs="+", metavar="PHOTO", help="photographs, as for `lalaloc localise`"
+        "photographs", type=Path, nargs="*", metavar="PHOTO", help="photographs, as for `lalaloc localise`"
+    )
+    encode.add_argument(
+        "--turn",
+        type=Path,
+        metavar="FILM",
+        help="film of one slow turn on the spot, or a folder of photographs of one, instead of PHOTO",
     )
     encode.add_argument(
         "-o",
         "--out",
         type=Path,
         metavar="FILE",
-        help="file of the features of a single photograph (default: beside each photograph, with the suffix .features)",
+        help="file of the features of a single photograph (default: beside each photograph, with the suffix "
+        ".features); of --turn: folder of the features and of turn.json, the fields to send with them (default: FILM "
+        "with the suffix .features)",
     )
     add_camera_options(encode)
     encode.set_defaults(run=_encode)
@@ -54,10 +72,15 @@ def _encode(arguments: argparse.Namespace) -> None:
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
     from lalaloc_core.photograph import open_photograph
 
+    if bool(arguments.photographs) == (arguments.turn is not None):
+        raise InvalidInputError("photographs and --turn exclude each other; give one or more photographs, or --turn")
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
+    if arguments.turn is not None:
+        _encode_turn(arguments, bundle.manifest, encoder, stated)
+        return
     for path in arguments.photographs:
         content = content_of(path)
         with named(path):
@@ -65,12 +88,42 @@ def _encode(arguments: argparse.Namespace) -> None:
                 content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
             )
             features = encoder.features(view)
-        out = arguments.out or path.with_suffix(".features")
-        try:
-            atomic_write(out, features)
-        except OSError as error:
-            raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
-        print(f"{out}: {len(features)} bytes")
+        _write(arguments.out or path.with_suffix(".features"), features)
+
+
+def _encode_turn(
+    arguments: argparse.Namespace, manifest: Manifest, encoder: FeatureEncoder, stated: StatedCamera
+) -> None:
+    """Write the features of a turn, and the angles between them, which features cannot tell."""
+    from lalaloc_core.cli.turning import read_turn
+
+    turn = read_turn(arguments.turn, manifest, stated)
+    for warning in turn.warnings:
+        print(f"warning: {arguments.turn}: {warning}", file=sys.stderr)
+    out = arguments.out or arguments.turn.with_suffix(".features")
+    try:
+        out.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"'{out}' cannot be made: {error.strerror}") from error
+    for index, photograph in enumerate(turn.photographs):
+        _write(out / f"{index:02}.features", encoder.features(photograph))
+    angles = turn.linked.angles
+    std_deg = max(math.degrees(angle.heading_sd) for angle in angles if not angle.group)
+    fields = {
+        "motion": "turn",
+        # Angles to photographs of other groups are unknown.
+        "relative_heading_deg": [None if angle.group else round(math.degrees(angle.heading), 2) for angle in angles],
+        "relative_heading_std_deg": round(max(std_deg, _LEAST_STD_DEG), 2),
+    }
+    _write(out / "turn.json", json.dumps(fields, indent=1).encode())
+
+
+def _write(out: Path, content: bytes) -> None:
+    try:
+        atomic_write(out, content)
+    except OSError as error:
+        raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
+    print(f"{out}: {len(content)} bytes")
 
 
 def _features(arguments: argparse.Namespace) -> None:

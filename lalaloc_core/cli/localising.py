@@ -145,6 +145,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
     from lalaloc_core.evaluate.methods.lalaloc import LocalModel
     from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
     from lalaloc_core.localise.encode.features import is_features, read_features
+    from lalaloc_core.localise.localisability.step_report import step_after
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.photograph import StatedCamera
 
@@ -180,6 +181,9 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         confidence = found.confidence(confidence_model)
         sure = found.posterior.position if confidence is None else confidence.position
         advice = advice_for([view.azimuths], sure)
+        step = step_after(
+            plan, bundle.manifest, found, confidence, arcs=[view.azimuths], field=view.hfov.value, step_m=grid.step_m
+        )
         source = "searched" if found.heading_contradicted else known.source
         warnings = ["the photograph contradicts the heading, which was estimated instead"]
         warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
@@ -190,9 +194,9 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
             "heading_source": source,
             "heading_confidence": None if confidence is None else confidence.heading,
             "probability_elsewhere": None if confidence is None else confidence.elsewhere,
-            "warnings": warnings if advice is None else [*warnings, advice],
+            "warnings": [*warnings, *([] if advice is None else [advice]), *([] if step is None else [step["text"]])],
             "view": view_document(view)
-            | {"information_bits": information_bits(plan, grid.poses, found.posterior.pose)},
+            | {"information_bits": information_bits(plan, grid.poses, found.posterior.pose), "next_step": step},
             "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
         }
         yield _Found(path, content, drawn, _document(path, drawn) | details)
@@ -217,7 +221,7 @@ def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedC
     model = LocalModel(bundle)
     height = stated_height(plan, arguments.camera_height)
     with tqdm(total=2, desc="read the turn", disable=None, leave=False) as progress:
-        turn = read_turn(path, model, stated)
+        turn = read_turn(path, bundle.manifest, stated)
         progress.update()
         progress.set_description("localise")
         grid = model.grid(plan, plan.camera_height_m if model.encoder.predicts_profile else height.height_m)

@@ -23,6 +23,7 @@ _GROUPS = (
     "turns",
     "films",
     "bounds",
+    "steps",
     "localisability",
     "uninformative",
     "evidence",

@@ -6,20 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from lalaloc_core.bundle import Manifest
 from lalaloc_core.cli.cameras import content_of, named, view_document
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.errors import InvalidFilmError, InvalidInputError
 from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
-
-if TYPE_CHECKING:
-    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+from lalaloc_core.photograph.turned import open_turn
 
 _PICTURES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif"})
 _MAX_PHOTOGRAPHS = 100
@@ -44,7 +43,7 @@ class Turn:
     warnings: list[str]
 
 
-def read_turn(path: Path, model: LocalModel, stated: StatedCamera) -> Turn:
+def read_turn(path: Path, manifest: Manifest, stated: StatedCamera) -> Turn:
     """Read a film, or the photographs of a folder in the order of their names.
 
     Raises:
@@ -52,7 +51,7 @@ def read_turn(path: Path, model: LocalModel, stated: StatedCamera) -> Turn:
     """
     if not path.is_dir():
         try:
-            film = read_film(content_of(path), stated=stated, patch_size=patch_size(model.bundle.manifest))
+            film = read_film(content_of(path), stated=stated, patch_size=patch_size(manifest))
         except InvalidFilmError as error:
             raise InvalidFilmError(f"'{path}': {error}") from error
         linked = LinkedTurn.of(film.angles)
@@ -61,7 +60,12 @@ def read_turn(path: Path, model: LocalModel, stated: StatedCamera) -> Turn:
     if not 2 <= len(files) <= _MAX_PHOTOGRAPHS:
         raise InvalidInputError(f"'{path}' has {len(files)} photographs; a turn has 2 to {_MAX_PHOTOGRAPHS}")
     with named(path):
-        photographs, angles = model.open_turn([content_of(file) for file in files], stated)
+        photographs, angles = open_turn(
+            [content_of(file) for file in files],
+            stated,
+            sphere_size=sphere_size(manifest),
+            patch_size=patch_size(manifest),
+        )
     linked = LinkedTurn.of(angles)
     warnings = linked.warnings(min(photograph.hfov.value for photograph in photographs))
     return Turn(photographs, [file.name for file in files], linked, None, [*warnings, *_common_warnings(photographs)])

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective
 from lalaloc_core.photograph.levelling import MAX_ESTIMATED_SD
-from lalaloc_core.photograph.photograph import Assumed, Photograph
+from lalaloc_core.photograph.patches import PatchSize
+from lalaloc_core.photograph.photograph import Assumed, Photograph, open_photograph
 from lalaloc_core.photograph.stated_camera import HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG, StatedCamera
-from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView
+from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_turn
 
 # Largest relative standard deviation of the focal length by several photographs' lines: their errors are alike.
 _LINES_FOCAL_SD = 0.03
@@ -44,6 +47,26 @@ class Turned:
                 "turn; send hfov_deg or the camera's original files",
             )
         return replace(photograph, hfov=self.hfov, pitch=self.pitch, roll=self.roll, warnings=warnings)
+
+
+def open_turn(
+    contents: Sequence[bytes], stated: StatedCamera, *, sphere_size: tuple[int, int], patch_size: PatchSize | None
+) -> tuple[list[Photograph], list[TurnAngles]]:
+    """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells.
+
+    Raises:
+        InvalidPhotographError: a photograph cannot be read, or is a sphere.
+    """
+    read = partial(open_photograph, sphere_size=sphere_size, patch_size=patch_size)
+    photographs = [read(content, stated=stated, overview=True) for content in contents]
+    if any(photograph.overview is None for photograph in photographs):
+        raise InvalidPhotographError("a full sphere is among the photographs; localise it by itself")
+    views = turn_views(photographs)
+    angles = angles_of_turn(views)
+    for index, turned in enumerate(turned_photographs(photographs, views, stated, angles)):
+        if turned.stated is not None:
+            photographs[index] = turned.applied(read(contents[index], stated=turned.stated))
+    return photographs, angles
 
 
 def turn_views(photographs: Sequence[Photograph]) -> list[TurnView]:

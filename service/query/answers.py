@@ -44,6 +44,7 @@ def compose_answer(
     timings_ms: dict[str, float],
     bundle: Bundle,
     warnings: Sequence[str] = (),
+    with_step: bool = True,
 ) -> LocaliseAnswer:
     """Compose the answer to a query about one photograph.
 
@@ -55,6 +56,7 @@ def compose_answer(
         timings_ms: durations (ms) by stage.
         bundle: the model.
         warnings: warnings besides those about the heading and the photograph.
+        with_step: compute the next step of an answer that is not sure.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view)
     final, uncertainty = found.best[found.stage], None
@@ -94,7 +96,7 @@ def compose_answer(
         camera_height_m=found.camera_height_m,
         candidates=candidates,
         geopose=best.geopose,
-        view=view_answer(spot, ground, found, confidence),
+        view=view_answer(spot, ground, found, confidence, bundle.manifest if with_step else None),
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=ModelAnswer.of(bundle),
     )

@@ -79,8 +79,17 @@ class SequenceSearch:
         def compose() -> SequenceAnswer:
             spots = _spots(photographs, found, one_spot=form.motion == "turn")
             answers = [
-                compose_answer(picture, ground, spot, heading, timings_ms=timings_ms, bundle=self._parts.bundle)
-                for heading, picture, spot in zip(known, found.pictures, spots, strict=True)
+                compose_answer(
+                    picture,
+                    ground,
+                    spot,
+                    heading,
+                    timings_ms=timings_ms,
+                    bundle=self._parts.bundle,
+                    # Angles of a turn count from its first photograph; a walk goes on from its last.
+                    with_step=index == (0 if form.motion == "turn" else count - 1),
+                )
+                for index, (heading, picture, spot) in enumerate(zip(known, found.pictures, spots, strict=True))
             ]
             answers = _with_relative_headings(answers, form, linked)
             share = min(ground.share(picture) for picture in found.pictures)

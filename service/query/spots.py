@@ -6,14 +6,24 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lalaloc_core.bundle import Manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.belief import Confidence, advice_for, information_bits, union_of_arcs
+from lalaloc_core.localise.localisability.step_report import step_after
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.photograph import Assumed, Photograph
 from lalaloc_core.photograph.cameras import Around, Fisheye
 from lalaloc_core.photograph.stated_camera import intrinsics_of
 from service.query.ground import Ground
-from service.schemas.photographs import AssumedAngle, CameraAnswer, ReadView, SeenArc, SeenObjectAnswer, ViewAnswer
+from service.schemas.photographs import (
+    AssumedAngle,
+    CameraAnswer,
+    NextStepAnswer,
+    ReadView,
+    SeenArc,
+    SeenObjectAnswer,
+    ViewAnswer,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +45,31 @@ class Spot:
         return union_of_arcs([(seen.azimuths[0] + turn, seen.azimuths[1] + turn) for seen, turn in turned])
 
 
-def view_answer(spot: Spot, ground: Ground, found: Localisation, confidence: Confidence | None) -> ViewAnswer:
-    """Return the answer's part about its photograph."""
+def view_answer(
+    spot: Spot, ground: Ground, found: Localisation, confidence: Confidence | None, manifest: Manifest | None
+) -> ViewAnswer:
+    """Return the answer's part about its photograph; the next step follows from the model's `manifest`, if any."""
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
-    seen = found.query.objects
+    seen, step = found.query.objects, None
+    if manifest is not None:
+        step = step_after(
+            ground.plan,
+            manifest,
+            found,
+            confidence,
+            arcs=spot.arcs,
+            field=spot.photograph.hfov.value,
+            step_m=ground.grid.step_m,
+            # Plans of a venue have rooms of the same names.
+            rooms_known=ground.hints.rooms is not None or ground.merged is not None,
+        )
     return ViewAnswer(
         **vars(read_view(spot)),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
         advice=advice_for(spot.arcs, sure),
+        next_step=None if step is None else NextStepAnswer(**step),
         room_types=None if seen is None else seen.room_type.shares(),
         objects=None
         if seen is None

@@ -24,6 +24,8 @@ _HEADERS = {
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
         "connect-src 'self' blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
+    # “Look around” uses the camera and, for directions, the sensors of a phone.
+    "Permissions-Policy": "camera=(self), microphone=(), accelerometer=(self), gyroscope=(self), magnetometer=(self)",
     # Browsers revalidate each time, because another version can answer next.
     "Cache-Control": "no-cache",
 }

@@ -144,6 +144,25 @@ class SeenObjectAnswer(ResponseModel):
     azimuth_deg: SignedDegrees = Field(description="Direction relative to the photograph's centre, clockwise.")
 
 
+class NextStepAnswer(ResponseModel):
+    """Step after an answer that is not sure, and what it is expected to tell."""
+
+    kind: Literal["turn", "door", "heading", "rooms"] = Field(
+        description="`turn`: take another photograph from the same spot; `door`: take one from behind a door; "
+        "`heading`: state the heading, within 10°; `rooms`: choose one of `rooms` as a hint."
+    )
+    text: str = Field(description="The step in words.")
+    turn_deg: SignedDegrees | None = Field(
+        description="Of `turn` and `door`: direction relative to the photograph's centre, clockwise; else null."
+    )
+    distance_m: Score | None = Field(description="Of `door`: distance to the door; else null.")
+    rooms: list[str] | None = Field(
+        description="Of `rooms`: `id` of each probable room, the most probable first; else null."
+    )
+    expected_bits: Score = Field(description="Expected increase of `information_bits`.")
+    expected_confidence: Share = Field(description="Expected `confidence` after the step.")
+
+
 class ViewAnswer(ReadView):
     """Assumptions about the photograph, the azimuths it shows, and how much it could tell."""
 
@@ -160,6 +179,13 @@ class ViewAnswer(ReadView):
     advice: str | None = Field(
         description="How to photograph the place for a sure answer, such as `turn around`; null where it is sure, or "
         "where more of the surroundings would not help."
+    )
+    next_step: NextStepAnswer | None = Field(
+        default=None,
+        description="The single step with the highest expected confidence, by the posterior and the model's measured "
+        "errors. Null where the confidence is null, or 0.5 or more, where no step raises it by 0.02, where the "
+        "photograph is probably of no place of the plan, and for all but the first photograph of a turn and the last "
+        "of a walk.",
     )
     room_types: dict[str, Share] | None = Field(
         description="Probability of each type of room, the most probable first, by recognised objects; types "

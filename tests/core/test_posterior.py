@@ -48,7 +48,7 @@ from lalaloc_core.render.sampling import PoseSet
 from tests.core.questions import perfect_query
 from tests.strategies import plan_of, present, rectangle, seeds
 
-NOWHERE = Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1))
+NOWHERE = Support(np.zeros(1, int), np.zeros((1, 2)), np.zeros(1), np.ones(1))
 PLAIN = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
 
 

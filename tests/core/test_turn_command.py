@@ -49,6 +49,22 @@ def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert answer["poses"][0]["time_s"] < 0.2
 
 
+def test_features_of_a_turn_are_sent_with_its_angles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "turn").mkdir()
+    for index, frame in enumerate(turn()[:12:4]):
+        (tmp_path / "turn" / f"{index}.jpg").write_bytes(jpeg(frame))
+    assert main(["encode", "--turn", str(tmp_path / "turn"), "--hfov", "53", "-o", str(tmp_path / "out")]) == 0
+    assert "turn.json" in capsys.readouterr().out
+    fields = json.loads((tmp_path / "out" / "turn.json").read_text())
+    assert fields["relative_heading_deg"] == pytest.approx([0.0, 24.0, 48.0], abs=1.0)
+    assert 0.5 <= fields["relative_heading_std_deg"] < 5.0
+    written = sorted(file.name for file in (tmp_path / "out").glob("*.features"))
+    assert written == ["00.features", "01.features", "02.features"]
+    assert main(["localise", PLAN, str(tmp_path / "out" / "00.features"), "--json"]) == 0
+    assert main(["encode"]) == 2
+    assert "give one or more photographs, or --turn" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

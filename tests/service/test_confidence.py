@@ -6,6 +6,7 @@ The homes are rendered from the validation split, outside the range that the cal
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,8 @@ from PIL import Image
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.painted import painted_room
 from tests.service.conftest import StartApp, localise, upload, wait_for
 
@@ -288,3 +291,19 @@ def test_plain_corridor_is_uncertain_along_only(shipped: httpx.Client, given: bo
     assert along > 25.0 * across
     assert answer["covariance_m2"][0][0] == pytest.approx(along, rel=0.05)
     assert min(abs(answer["position"]["y_m"] - y_m) for y_m in (0.8, 1.0)) < 0.15
+
+
+def test_unsure_answer_has_a_next_step_and_a_sure_one_none(shipped: httpx.Client) -> None:
+    flat = upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
+    wall = jpeg(take(sphere("living_room"), Perspective.of_hfov(480, 640, np.radians(53.0)), heading_deg=70.0))
+    unsure = ask(shipped, flat, wall, None, hfov_deg=53.0)
+    assert unsure["confidence"] < 0.5 < 1.0 - unsure["probability_elsewhere"]
+    step = unsure["view"]["next_step"]
+    assert unsure["confidence"] + 0.02 <= step["expected_confidence"] <= 1.0
+    assert step["expected_bits"] > 0.0
+    assert (step["turn_deg"] is None) == (step["kind"] in ("heading", "rooms"))
+    assert "; the expected confidence is then " in step["text"]
+    assert ask(shipped, flat, wall, None, hfov_deg=53.0)["view"]["next_step"] == step
+    sure = ask(shipped, flat, (EXAMPLES / "kitchen.jpg").read_bytes(), None)
+    assert sure["confidence"] >= 0.5
+    assert sure["view"]["next_step"] is None

@@ -115,7 +115,9 @@ def test_contradicted_hints_are_warned_about() -> None:
     plan = FloorPlan.from_dict(PLAN)
     query = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
     answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)
-    posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0, Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1)))
+    posterior = Posterior(
+        np.ones(1), 1.0, (1.0,), 1.0, Support(np.zeros(1, int), np.zeros((1, 2)), np.zeros(1), np.ones(1))
+    )
     hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
     found = Localisation(
         query=query, candidates=[answer], posterior=posterior, stage="lpo", signals={}, hints_missed=("near", "rooms")

@@ -318,7 +318,7 @@ def test_flat_picture_without_webgl(desktop: Visit) -> None:
     )
     page = desktop.open_example()
     expect(page.locator(".stage")).to_have_attribute("data-shape", "whole")
-    expect(page.get_by_role("button", name="Look around")).to_be_disabled()
+    expect(page.get_by_role("button", name="From inside")).to_be_disabled()
     desktop.find()
     # The viewer reports the missing WebGL.
     desktop.errors.clear()

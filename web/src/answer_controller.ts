@@ -2,19 +2,21 @@
 
 import { showAll } from "./all_answers";
 import { markSelected, showAnswer } from "./answer_panel";
-import { captionWords } from "./answer_words";
+import { captionWords, confidenceWords, stepWords } from "./answer_words";
 import { api } from "./api";
 import { device } from "./device/device";
 import { byId, scrollTo } from "./dom";
 import { hideGuide } from "./guide";
 import { HintForm } from "./hints";
 import { layoutLines, roomAt } from "./layout";
+import type { LiveAnswer } from "./look/live_lines";
+import type { FoundPlace } from "./look/look_around";
 import { clearError, clearErrors, showError } from "./notices";
 import { PanoramaView } from "./panorama_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
 import type { PlanScene } from "./plan_scene";
-import { askSingle, askTogether, type Place } from "./query";
+import { askFilm, askSingle, askTogether, type Place } from "./query";
 import type { Answer, ChosenVenue, Layout, Plan, Pose } from "./types";
 
 const DEFAULT_CAMERA_HEIGHT_M = 1.5;
@@ -211,8 +213,46 @@ export class AnswerController {
           : `Layout as seen from ${room.name}, ${place}.`;
   }
 
-  /** Localise the chosen photograph, or its group. */
+  /** Localise the chosen photograph, or its group, and show errors. */
   private async localise(): Promise<void> {
+    try {
+      await this.search();
+    } catch (error) {
+      showError(this.error, error, this.fields);
+    }
+  }
+
+  /** Localise the frames of a guided turn; null if it was stopped. */
+  async findTurn(frames: File[], directions: number[] | null, signal: AbortSignal): Promise<FoundPlace | null> {
+    this.photos.takeTurn(frames, directions);
+    signal.addEventListener("abort", () => this.cancelQuery());
+    await this.search();
+    const { answer } = this;
+    if (answer === null || signal.aborted) return null;
+    const words = `${answer.room}. ${confidenceWords(answer.confidence)}. ${stepWords(answer) ?? ""}`;
+    return { words, live: () => this.liveAnswer(answer) };
+  }
+
+  /** Localise a film of a turn; return false if it was stopped. */
+  async findFilm(film: File, signal: AbortSignal): Promise<boolean> {
+    const answer = await askFilm(await this.actions.place(signal), film, signal);
+    if (signal.aborted) return false;
+    if (answer.floorplan_id !== this.scene.plan?.id) await this.actions.showPlan(answer.floorplan_id);
+    this.photos.choose(null);
+    this.show(answer);
+    scrollTo(byId("answer"));
+    return true;
+  }
+
+  /** Return an answer for the live picture; null before its plan's walls are loaded. */
+  private liveAnswer({ view, position: { x_m, y_m }, heading_deg, camera_height_m }: Answer): LiveAnswer | null {
+    const room = this.layout === null ? null : roomAt(this.layout.rooms, x_m, y_m);
+    if (room === null || view == null) return null;
+    return { view, heading: heading_deg, lines: layoutLines(x_m, y_m, room, camera_height_m) };
+  }
+
+  /** Localise the chosen photograph, or its group. Rejects with the error, unless it was stopped. */
+  private async search(): Promise<void> {
     const photo = this.photos.current;
     if (photo === null) return;
     this.cancelQuery();
@@ -241,7 +281,7 @@ export class AnswerController {
       hideGuide();
       scrollTo(byId("answer"));
     } catch (error) {
-      if (!signal.aborted) showError(this.error, error, this.fields);
+      if (!signal.aborted) throw error;
     } finally {
       if (!signal.aborted) this.cancelQuery();
     }

@@ -1,7 +1,7 @@
 /** Answer on the plan, besides the heat map: covariance ellipse and other candidates. */
 
 import { s } from "./dom";
-import { degrees } from "./layout";
+import { degrees, radians } from "./layout";
 import type { Photo } from "./photos";
 import { placesOf } from "./places";
 import { type Box, unitOf } from "./plan_drawing";
@@ -99,5 +99,26 @@ export function companions(
           ),
         );
       }),
+  );
+}
+
+/** Draw the direction of the next step from the answer: a turn as an arc with an arrow, a door as an arrow to it. */
+export function stepArrow(answer: Answer, box: Box): SVGGElement | null {
+  const step = answer.view?.next_step;
+  if (step == null || step.turn_deg === null) return null;
+  const { x_m, y_m } = answer.position,
+    unit = unitOf(box);
+  const turn = radians(step.turn_deg),
+    far = step.distance_m ?? 9 * unit;
+  const at = (azimuth: number, length: number): string =>
+    `${(length * Math.sin(azimuth)).toFixed(3)} ${(-length * Math.cos(azimuth)).toFixed(3)}`;
+  const arc = `M${at(0, 5 * unit)}A${5 * unit} ${5 * unit} 0 0 ${turn > 0 ? 1 : 0} ${at(turn, 5 * unit)}`;
+  const tip = [-0.15, 0.15].map((side) => `M${at(turn, far)}L${at(turn + side, far - 1.6 * unit)}`).join("");
+  return s(
+    "g",
+    { class: "next-step", transform: `translate(${x_m} ${-y_m}) rotate(${answer.heading_deg})` },
+    s("title", {}, `Next step: ${step.text}`),
+    step.kind === "turn" && s("path", { d: arc }),
+    s("path", { d: `M${at(turn, step.kind === "turn" ? 5 * unit : 1.5 * unit)}L${at(turn, far)}${tip}` }),
   );
 }

@@ -11,6 +11,7 @@ import {
   percent,
   roomWords,
   seenWords,
+  stepWords,
   STAGES,
   viewWords,
 } from "./answer_words";
@@ -102,12 +103,14 @@ function planOf(answer: Answer, place: { floorplan_id: string; level: number | n
 function remarks(answer: Answer): HTMLElement[] {
   const { view, together } = answer,
     advice = adviceWords(answer),
+    step = stepWords(answer),
     looks = view == null ? null : roomWords(view),
     elsewhere = answer.probability_elsewhere ?? 0;
   const warnings = [...new Set([...answer.warnings, ...(view?.warnings ?? [])])].map((warning) =>
     h("p", { class: "warning" }, plainWords(warning)),
   );
   return [
+    ...(step === null ? [] : [h("p", { class: "advice", id: "next-step" }, step)]),
     ...(advice === null ? [] : [h("p", { class: "advice" }, advice)]),
     ...(together === undefined
       ? []

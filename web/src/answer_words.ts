@@ -85,6 +85,13 @@ export function adviceWords(answer: Answer): string | null {
     : `Turn around: ${seen}. Add photographs from the same spot, each turned by at most half the field of view, and choose “Taken from one spot, turning”.`;
 }
 
+/** Return the step that makes an unsure answer surest; null if there is none. */
+export function stepWords({ view }: Answer): string | null {
+  const step = view?.next_step;
+  if (step == null) return null;
+  return `Next: ${step.text}.`;
+}
+
 function seenDeg({ seen }: ViewAnswer): number {
   return seen.reduce((sum, { from_deg, to_deg }) => sum + to_deg - from_deg, 0);
 }

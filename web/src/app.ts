@@ -8,6 +8,8 @@ import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, FLAT } from "./example";
 import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
+import { LookAround } from "./look/look_around";
+import { PhoneLink } from "./look/phone_link";
 import { clearError, clearErrors, InputError, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
@@ -19,6 +21,7 @@ import { Venues } from "./venues";
 
 // For tests.
 export { layoutLines, layoutView } from "./layout";
+export { cameraAttitude } from "./look/orientation";
 export { toEarth, toPlan } from "./earth";
 export { heatMap } from "./heat";
 export { placesOf, remainder } from "./places";
@@ -66,6 +69,11 @@ class Page {
       this.answers.photos.choose(null);
     },
   });
+  private readonly look = new LookAround({
+    find: (frames, directions, signal) => this.answers.findTurn(frames, directions, signal),
+    findFilm: (film, signal) => this.answers.findFilm(film, signal),
+  });
+  private readonly phone = new PhoneLink();
   /** True once the user has chosen a plan, which the example must not replace. */
   private hasStarted = false;
 
@@ -76,6 +84,10 @@ class Page {
     scene.arrange(editor.underlay.element, answers.hints.element, [session.layer, ...editor.layers]);
     byId("edit-plan").addEventListener("click", () => this.edit(scene.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
+    byId("look-around").addEventListener("click", () => void this.look.open());
+    // Phones have no use for a code.
+    byId("phone-link").hidden = !matchMedia("(pointer: fine)").matches;
+    byId("phone-link").addEventListener("click", () => void this.showPhoneLink());
     addEventListener("hashchange", () => void this.open());
     await answers.start();
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
@@ -98,8 +110,22 @@ class Page {
     this.answers.cancelQuery();
   }
 
-  /** Show the answer or the session that the address names, if any. */
+  private async showPhoneLink(): Promise<void> {
+    clearError(byId("plan-error"));
+    try {
+      this.phone.open((this.scene.plan ?? (await this.storeExample())).id);
+    } catch (error) {
+      showError(byId("plan-error"), error);
+    }
+  }
+
+  /** Show the plan, the answer or the session that the address names, if any. */
   private async open(): Promise<boolean> {
+    const planId = named("plan");
+    if (planId !== null) {
+      await this.plans.choose(planId);
+      return true;
+    }
     const id = named("answer"),
       packed = named("answer-data");
     if (id === null && packed === null) return this.session.follow(named("session"));

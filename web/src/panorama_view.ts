@@ -3,21 +3,15 @@
 import { throughCamera } from "./camera";
 import { button, h, show } from "./dom";
 import { type LayoutLine, radians } from "./layout";
+import { linesLegend, strokeLines } from "./layout_strokes";
 import { InputError } from "./notices";
 import { equirectangular, type Gaze, perspective, type Size } from "./projection";
-import type { OpeningKind, Point, ViewAnswer } from "./types";
+import type { Point, ViewAnswer } from "./types";
 
 type Sphere = import("./sphere").Sphere;
 /** A full sphere from inside, the same as a flat picture, or another photograph. */
 type Shape = "around" | "whole" | "flat";
 
-// Dashes tell lines apart as well as colours, which are in the style sheet.
-const STROKES: Record<"edge" | OpeningKind, { variable: string; dash: number[]; name: string }> = {
-  edge: { variable: "--over-wall", dash: [], name: "walls" },
-  door: { variable: "--over-door", dash: [10, 4], name: "doors" },
-  window: { variable: "--over-window", dash: [3, 3], name: "windows" },
-  passage: { variable: "--over-passage", dash: [12, 4, 3, 4], name: "passages" },
-};
 const TURN_BY = radians(10);
 // Photo sphere metadata stand before the pixels.
 const METADATA_BYTES = 2 ** 18;
@@ -54,7 +48,7 @@ export class PanoramaView {
     private readonly gazed: (yaw: number, fov: number) => void,
   ) {
     this.shapes = {
-      around: button("Look around", () => this.setShape("around"), { "aria-pressed": "true" }),
+      around: button("From inside", () => this.setShape("around"), { "aria-pressed": "true" }),
       whole: button("Whole picture", () => this.setShape("whole"), { "aria-pressed": "false" }),
     };
     const lines = h("input", { type: "checkbox", id: "lines-shown", checked: true });
@@ -78,7 +72,7 @@ export class PanoramaView {
         () => void (document.fullscreenElement === null ? root.requestFullscreen() : document.exitFullscreen()),
         { id: "full-screen" },
       ),
-      legend(),
+      linesLegend(),
     );
     this.stage.append(this.holder, this.picture, this.canvas);
     show(root, this.stage, bar);
@@ -214,22 +208,8 @@ export class PanoramaView {
 
   /** Stroke the lines of the layout, `scale` times as thick as on the screen. */
   private stroke(context: CanvasRenderingContext2D, shape: Shape, size: Size, scale = 1): void {
-    context.lineJoin = context.lineCap = "round";
-    const style = getComputedStyle(this.canvas);
-    const paths = this.lines.map((line) => ({ line, paths: this.projected(line, shape, size) }));
-    for (const halo of [true, false]) {
-      for (const { line, paths: pieces } of paths) {
-        const { variable, dash } = STROKES[line.kind];
-        context.strokeStyle = halo ? "rgba(0, 0, 0, 0.55)" : style.getPropertyValue(variable).trim();
-        context.lineWidth = scale * (halo ? 5 : 2.5);
-        context.setLineDash(halo ? [] : dash.map((length) => scale * length));
-        for (const piece of pieces) {
-          context.beginPath();
-          piece.forEach(([x, y], index) => (index === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
-          context.stroke();
-        }
-      }
-    }
+    const seen = this.lines.map((line) => ({ kind: line.kind, pieces: this.projected(line, shape, size) }));
+    strokeLines(context, seen, scale);
   }
 
   private projected(line: LayoutLine, shape: Shape, size: Size): Point[][] {
@@ -261,12 +241,4 @@ async function isSphere(file: Blob, { naturalWidth, naturalHeight }: HTMLImageEl
   if (Math.abs(naturalWidth / naturalHeight - 2) <= 0.02) return true;
   const head = await file.slice(0, METADATA_BYTES).text();
   return head.includes("GPano:") && head.includes("equirectangular");
-}
-
-function legend(): HTMLElement {
-  return h(
-    "ul",
-    { class: "legend", "aria-label": "Lines over the photograph" },
-    ...Object.entries(STROKES).map(([kind, { name }]) => h("li", {}, h("span", { class: `swatch ${kind}` }), name)),
-  );
 }

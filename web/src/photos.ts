@@ -15,6 +15,8 @@ export interface Photo {
   settings: Record<string, string>;
   hints: Hints;
   answer: Answer | null;
+  /** Direction of a frame of a guided turn, degrees clockwise from its first, by a gyroscope. */
+  direction: number | null;
   /** Fields and photographs of the latest query, for code snippets. */
   asked: { fields: Record<string, string>; files: File[]; onDevice: boolean };
 }
@@ -93,18 +95,19 @@ export class Photos {
   }
 
   /** Add pictures and choose the first of them; those of examples give way to the user's own. */
-  add(files: File[], isExample = false): void {
+  add(files: File[], isExample = false, directions: readonly number[] | null = null): void {
     const rejected = files.filter((file) => !isPicture(file));
     clearErrors();
     const added = files
       .filter(isPicture)
-      .map((file): Photo => ({
+      .map((file, index): Photo => ({
         file,
         isExample,
         url: URL.createObjectURL(file),
         settings: { ...this.shared },
         hints: NO_HINTS,
         answer: null,
+        direction: directions?.[index] ?? null,
         asked: { fields: {}, files: [file], onDevice: false },
       }));
     if (added.length > 0) this.forgetGroup();
@@ -116,8 +119,20 @@ export class Photos {
     showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
   }
 
+  /** Take the frames of a guided turn instead of all photographs. */
+  takeTurn(frames: File[], directions: readonly number[] | null): void {
+    this.discard(this.all);
+    this.add(frames, false, directions);
+    this.choice.querySelector<HTMLInputElement>("input[value=turn]")!.checked = true;
+    this.onMotion();
+  }
+
   private discardExamples(): void {
-    for (const photo of this.all.filter(({ isExample }) => isExample)) {
+    this.discard(this.all.filter(({ isExample }) => isExample));
+  }
+
+  private discard(photos: readonly Photo[]): void {
+    for (const photo of [...photos]) {
       this.all.splice(this.all.indexOf(photo), 1);
       URL.revokeObjectURL(photo.url);
     }

@@ -1,6 +1,6 @@
 /** Scene of the plan: the floor plan with heat map, marker and other places of an answer, and the layers of other modules. */
 
-import { companions, ellipse, otherPlaces } from "./answer_overlay";
+import { companions, ellipse, otherPlaces, stepArrow } from "./answer_overlay";
 import { byId, s, show } from "./dom";
 import { heatMap } from "./heat";
 import { LocalisabilityLayer } from "./localisability_layer";
@@ -91,6 +91,7 @@ export class PlanScene {
     show(
       this.overlay,
       isHere && ellipse(answer),
+      isHere && selected === 0 && stepArrow(answer, box),
       companions(photos, photo, plan.id, box, actions.choose),
       otherPlaces(answer, plan.id, box, actions.select),
       this.marker.element,

@@ -3,11 +3,15 @@
 import { api } from "./api";
 import { device } from "./device/device";
 import { hintFields } from "./hints";
+import { InputError } from "./notices";
 import type { Group, Photo } from "./photos";
 import type { Answer, ChosenVenue, Plan, SequenceAnswer } from "./types";
 
 /** Plan or venue to search. */
 export type Place = Plan | ChosenVenue;
+
+// Warning about angles that the photographs do not tell.
+const NOT_LINKED = "the photographs overlap only within";
 
 const isVenue = (place: Place): place is ChosenVenue => "listed" in place;
 const placeFields = (place: Place): Record<string, string> =>
@@ -25,6 +29,15 @@ export async function askSingle(place: Place, photo: Photo, signal: AbortSignal)
   if (!signal.aborted) photo.answer = answer;
 }
 
+/** Ask for the film of a turn; return the answer to its first frame. */
+export async function askFilm(place: Place, film: File, signal: AbortSignal): Promise<Answer> {
+  if (device.isOn)
+    throw new InputError(
+      "Films are sent to the service. Untick “Keep this photograph on my device”, or add photographs.",
+    );
+  return answerOf(await api.localiseFilm(placeFields(place), film, { signal }), 0, "turn", place);
+}
+
 /** Ask for photographs of one visit together. */
 export async function askTogether(place: Place, { motion, photos }: Group, signal: AbortSignal): Promise<void> {
   const { heading_deg: _, heading_tolerance_deg: tolerance, ...shared } = photos[0]!.settings;
@@ -38,7 +51,16 @@ export async function askTogether(place: Place, { motion, photos }: Group, signa
   }
   const files = photos.map(({ file }) => file),
     onDevice = device.isOn;
-  const found = await device.send(files, fields, (pictures, own) => api.localiseSequence(own, pictures, { signal }));
+  const ask = (more: Record<string, string>): Promise<SequenceAnswer> =>
+    device.send(files, { ...fields, ...more }, (pictures, own) => api.localiseSequence(own, pictures, { signal }));
+  const directions = photos.map(({ direction }) => direction),
+    told =
+      motion === "turn" && !directions.includes(null) ? { relative_heading_deg: JSON.stringify(directions) } : null;
+  // Features do not overlap. Photographs tell angles and field of view better than a gyroscope, where they overlap.
+  let found = await ask(told !== null && onDevice ? told : {});
+  const [first] = found.poses;
+  if (told !== null && !onDevice && first?.view != null && found.warnings.some((text) => text.startsWith(NOT_LINKED)))
+    found = await ask({ ...told, hfov_deg: String(first.view.hfov.value_deg) });
   if (signal.aborted) return;
   photos.forEach((photo, index) => {
     photo.asked = { fields, files, onDevice };

@@ -22,6 +22,7 @@ from lalaloc_core.evaluate.bench.films import bench_films
 from lalaloc_core.evaluate.bench.localisability_accuracy import bench_localisability
 from lalaloc_core.evaluate.bench.service_latency import bench_service
 from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
+from lalaloc_core.evaluate.bench.steps import bench_steps
 from lalaloc_core.evaluate.bench.turns import bench_turns
 from lalaloc_core.evaluate.bench.uninformative import bench_uninformative
 
@@ -40,6 +41,7 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "turns": lambda: bench_turns(bundle, homes, textures),
         "films": lambda: bench_films(bundle, homes, textures),
         "bounds": lambda: bench_bounds(bundle, homes, textures),
+        "steps": lambda: bench_steps(bundle, homes, textures),
         "localisability": lambda: bench_localisability(bundle, homes, textures),
         "uninformative": lambda: bench_uninformative(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),

@@ -17,7 +17,6 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle, MatchingWeights
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
-from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.learn.data.views import ViewPhotograph
@@ -33,8 +32,8 @@ from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
-from lalaloc_core.photograph.turned import turn_views, turned_photographs
+from lalaloc_core.photograph.turn_angles import TurnAngles
+from lalaloc_core.photograph.turned import open_turn
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
@@ -198,17 +197,10 @@ class LocalModel:
         Raises:
             InvalidPhotographError: a photograph cannot be read, or is a sphere.
         """
-        stated, manifest = stated or StatedCamera(), self.bundle.manifest
-        sizes = {"sphere_size": sphere_size(manifest), "patch_size": patch_size(manifest)}
-        photographs = [open_photograph(content, stated=stated, overview=True, **sizes) for content in contents]
-        if any(photograph.overview is None for photograph in photographs):
-            raise InvalidPhotographError("a full sphere is among the photographs; localise it by itself")
-        views = turn_views(photographs)
-        angles = angles_of_turn(views)
-        for index, turned in enumerate(turned_photographs(photographs, views, stated, angles)):
-            if turned.stated is not None:
-                photographs[index] = turned.applied(open_photograph(contents[index], stated=turned.stated, **sizes))
-        return photographs, angles
+        manifest = self.bundle.manifest
+        return open_turn(
+            contents, stated or StatedCamera(), sphere_size=sphere_size(manifest), patch_size=patch_size(manifest)
+        )
 
     def localise_turn(
         self,

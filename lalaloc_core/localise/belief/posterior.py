@@ -94,11 +94,13 @@ class Support:
     Attributes:
         pose: (m,) number of the grid pose that each place comes from.
         position_m: (m, 2) the place, which refinement can have moved out of its room.
+        heading: (m,) heading of the photograph there (radians).
         weight: (m,) probability; the sum is one.
     """
 
     pose: Int[np.ndarray, "m"]
     position_m: Float[np.ndarray, "m 2"]
+    heading: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
 
 
@@ -186,7 +188,7 @@ class WeightedPlaces:
             position=min(float(weight[places.within(answer.position_m, RIGHT_WITHIN_M)].sum()), 1.0),
             candidate=tuple(shares),
             heading=float(weight[is_right].sum()),
-            support=Support(self.pose, self.position, weight),
+            support=Support(self.pose, self.position, self.heading, weight),
         )
 
 

@@ -1,0 +1,186 @@
+"""Guided turn on the page, with a fake camera that films a rendered home."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.filmed import encode, needs_ffmpeg, turn
+from tests.core.taken import jpeg, sphere, take
+from tests.service.conftest import StartApp, upload
+from tests.web.conftest import _ARGUMENTS, _BROWSERS, EXAMPLES, PHONE, Visit, visit
+
+FLAT = json.loads((EXAMPLES / "flat.json").read_text())
+STEP_DEG = 3.0
+PERMISSIONS = ["camera", "accelerometer", "gyroscope", "magnetometer"]
+CAMERA = Perspective.of_hfov(360, 640, math.radians(53.0))
+
+
+@pytest.fixture(scope="module")
+def service(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def camera(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Return a browser whose camera turns around in the example's living room."""
+    room = sphere("living_room")
+    film = tmp_path_factory.mktemp("film") / "turn.mjpeg"
+    frames = [jpeg(take(room, CAMERA, heading_deg=STEP_DEG * index)) for index in range(round(360.0 / STEP_DEG))]
+    # Each frame four times: the browser plays 30 frames per second, 22° of a turn.
+    film.write_bytes(b"".join(frame for frame in frames for _ in range(4)))
+    path = next(filter(None, map(shutil.which, _BROWSERS)))
+    arguments = [
+        *_ARGUMENTS,
+        "--use-fake-device-for-media-stream",
+        "--use-fake-ui-for-media-stream",
+        f"--use-file-for-fake-video-capture={film}",
+    ]
+    launched = browser.browser_type.launch(executable_path=path, args=arguments)
+    yield launched
+    launched.close()
+
+
+@pytest.fixture
+def phone(camera: Browser, service: httpx.Client) -> Iterator[Visit]:
+    yield from visit(
+        camera,
+        service,
+        viewport=PHONE,
+        has_touch=True,
+        is_mobile=True,
+        permissions=PERMISSIONS,
+        reduced_motion="reduce",
+    )
+
+
+def _open(visited: Visit) -> Page:
+    page = visited.open_example()
+    page.get_by_role("button", name="Look around").click()
+    return page
+
+
+def _no_violations(page: Page) -> None:
+    results = Axe().run(page)
+    assert results.violations_count == 0, results.generate_report()
+
+
+def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
+    page = _open(phone)
+    with page.expect_response("**/localise/sequence", timeout=120_000) as answered:
+        expect(page.locator("#look-dialog video")).to_be_visible()
+    poses = answered.value.json()["poses"]
+    assert 10 <= len(poses) <= 30
+    # Without a gyroscope, the photographs tell their angles.
+    assert {(pose["view"]["relative_heading"] or {}).get("source") for pose in poses} <= {"estimated", None}
+    _no_violations(page)
+    expect(page.get_by_role("button", name="Show on the plan")).to_be_visible(timeout=60_000)
+    # The room's lines move over the live picture.
+    page.wait_for_function(
+        """() => { const canvas = document.querySelector('#look-dialog canvas.lines');
+        const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+        return data.filter((value, index) => index % 4 === 3 && value > 0).length > 300; }"""
+    )
+    page.get_by_role("button", name="Show on the plan").press("Enter")
+    expect(page.locator("#look-dialog")).to_be_hidden()
+    expect(page.locator("#answer")).to_be_visible()
+    assert page.evaluate("document.querySelector('#look-dialog video').srcObject") is None
+
+
+def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
+    page = _open(phone)
+    protocol = page.context.new_cdp_session(page)
+
+    def hold(alpha: float, beta: float = 90.0) -> None:
+        angles = {"alpha": alpha, "beta": beta, "gamma": 0.0}
+        protocol.send("DeviceOrientation.setDeviceOrientationOverride", angles)
+
+    hold(0.0)
+    find = page.locator("#look-dialog .primary")
+    expect(find).to_have_text(re.compile("\\(1 photo"))
+    hold(0.0, beta=50.0)
+    expect(page.locator("#look-hint")).to_have_text("Hold the phone upright, and level.")
+    # Alpha grows to the left. A phone at rest takes no second photograph.
+    for number, alpha in enumerate((335.0, 310.0), start=2):
+        hold(alpha)
+        expect(find).to_have_text(re.compile(f"\\({number} photo"))
+    find.click()
+    expect(page.get_by_role("button", name="Show on the plan")).to_be_visible(timeout=60_000)
+    expect(page.locator("#photo-strip li")).to_have_count(3)
+
+
+def test_camera_stops_with_the_dialog_by_keyboard_alone(phone: Visit) -> None:
+    page = phone.open_example()
+    page.locator("#look-around").focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#look-dialog .primary")).to_be_enabled()
+    track = page.evaluate_handle("document.querySelector('#look-dialog video').srcObject.getVideoTracks()[0]")
+    take = page.get_by_role("button", name="Take a photograph")
+    before = page.locator("#look-dialog .primary").text_content() or ""
+    take.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#look-dialog .primary")).not_to_have_text(before)
+    page.keyboard.press("Escape")
+    expect(page.locator("#look-dialog")).to_be_hidden()
+    page.wait_for_function("track => track.readyState === 'ended'", arg=track)
+    expect(page.locator("#look-around")).to_be_focused()
+
+
+@needs_ffmpeg
+def test_page_without_https_takes_a_film_and_says_why(phone: Visit, tmp_path: Path) -> None:
+    page = phone.page
+    page.add_init_script("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
+    _open(phone)
+    expect(page.locator("#look-hint")).to_contain_text("Browsers allow the camera on HTTPS pages only")
+    (tmp_path / "broken.mp4").write_bytes(b"no film")
+    page.locator("#look-film").set_input_files(tmp_path / "broken.mp4")
+    expect(page.locator("#look-error")).to_contain_text("film")
+    encode(turn(), tmp_path / "turn.mp4")
+    page.locator("#look-film").set_input_files(tmp_path / "turn.mp4")
+    expect(page.locator("#look-dialog")).to_be_hidden(timeout=60_000)
+    expect(page.locator("#answer-body")).to_contain_text("photographs together")
+
+
+def test_link_for_the_phone_opens_the_same_plan_and_has_no_key(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Flat on a phone"})
+    page = desktop.open(f"/#plan={plan_id}")
+    expect(page.locator("#plan-name")).to_have_text("Flat on a phone")
+    page.evaluate("sessionStorage.setItem('lalaloc-key', 'lalaloc_secret')")
+    page.get_by_role("button", name="On a phone").click()
+    link = page.locator("#phone-dialog a")
+    assert (link.get_attribute("href") or "").endswith(f"/#plan={plan_id}")
+    expect(page.get_by_role("img", name="QR code")).to_be_visible()
+    assert "secret" not in page.locator("#phone-dialog").inner_html()
+    assert desktop.client.get("/").headers["Permissions-Policy"].startswith("camera=(self), microphone=()")
+    _no_violations(page)
+
+
+@pytest.mark.parametrize(
+    ("angles", "attitude"),
+    [
+        ((0.0, 90.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((330.0, 90.0, 0.0, 0.0), (30.0, 0.0, 0.0)),
+        ((0.0, 110.0, 0.0, 0.0), (0.0, 20.0, 0.0)),
+        # The phone lies on its left side, and the screen is turned.
+        ((90.0, 0.0, -90.0, 90.0), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_attitude_of_the_rear_camera(
+    desktop: Visit, angles: tuple[float, ...], attitude: tuple[float, float, float]
+) -> None:
+    page = desktop.open()
+    found = page.evaluate(f"import('/web/app.js').then(({{ cameraAttitude }}) => cameraAttitude(...{list(angles)}))")
+    assert [found["yaw"], found["pitch"], found["roll"]] == pytest.approx(attitude, abs=1e-6)

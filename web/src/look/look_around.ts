@@ -1,0 +1,237 @@
+/** “Look around”: the rear camera takes the photographs of a turn by itself, and shows the plan's lines afterwards. */
+
+import { button, h } from "../dom";
+import { clearError, showError } from "../notices";
+import { FrameJudge, takeFrame } from "./frames";
+import { drawLive, type LiveAnswer } from "./live_lines";
+import { Orientation } from "./orientation";
+import { Ring } from "./ring";
+import { type Hint, HINTS, Turn } from "./turn";
+
+const TICK_MS = 120,
+  LEAST_FRAMES = 2;
+
+export interface LookActions {
+  /** Find the place of frames, with their directions (degrees) if a gyroscope told them; null if it was stopped. */
+  find: (frames: File[], directions: number[] | null, signal: AbortSignal) => Promise<FoundPlace | null>;
+  /** Find the place of a film. */
+  findFilm: (film: File, signal: AbortSignal) => Promise<boolean>;
+}
+
+/** Answer in words, and for the live picture; null until the walls of its plan are loaded. */
+export interface FoundPlace {
+  words: string;
+  live: () => LiveAnswer | null;
+}
+
+/** Dialog with the camera's picture. */
+export class LookAround {
+  private readonly video = h("video", { playsinline: true, muted: true, "aria-label": "Picture of the camera" });
+  private readonly lines = h("canvas", { class: "lines", "aria-hidden": "true" });
+  private readonly ring = new Ring();
+  private readonly hint = h("p", { id: "look-hint", role: "status" });
+  private readonly error = h("div", { class: "error", id: "look-error", role: "alert", hidden: true });
+  private readonly film = h("input", { id: "look-film", type: "file", accept: "video/mp4,video/quicktime,video/webm" });
+  private readonly instead = h(
+    "div",
+    { id: "look-instead", hidden: true },
+    h(
+      "p",
+      { class: "hint" },
+      "Film one slow turn on the spot with the phone's camera app, held upright, and choose it here.",
+    ),
+    h("label", { class: "file" }, this.film, h("span", {}, "Choose a film")),
+  );
+  private readonly find = button("Find the place", () => void this.localise(), { class: "primary", disabled: true });
+  private readonly take = button("Take a photograph", () => void this.takeNow());
+  private readonly close = button("Cancel", () => this.dialog.close());
+  private readonly stage = h("div", { class: "look-stage" }, this.video, this.lines, this.ring.element);
+  private readonly dialog = h(
+    "dialog",
+    { id: "look-dialog", "aria-labelledby": "look-title" },
+    h("h2", { id: "look-title" }, "Look around"),
+    this.stage,
+    this.hint,
+    this.error,
+    this.instead,
+    h("div", { class: "ask" }, this.find, this.take, this.close),
+  );
+  private readonly orientation = new Orientation();
+  private stream: MediaStream | null = null;
+  private judge = new FrameJudge();
+  private turn = new Turn();
+  private frames: File[] = [];
+  private state: "off" | "looking" | "finding" | "found" = "off";
+  private found: FoundPlace | null = null;
+  private live: LiveAnswer | null = null;
+  private query: AbortController | null = null;
+  private timer: number | undefined;
+  private before = 0;
+  private said: Hint | null = null;
+  private isTaking = false;
+
+  constructor(private readonly actions: LookActions) {
+    document.body.append(this.dialog);
+    this.dialog.addEventListener("close", () => this.stop());
+    this.film.addEventListener("change", () => void this.localiseFilm());
+    // The camera's light goes out when the page is left, too.
+    addEventListener("pagehide", () => this.dialog.close());
+    document.addEventListener("visibilitychange", () => {
+      if (document.visibilityState === "hidden" && this.stream !== null) this.dialog.close();
+    });
+  }
+
+  /** Open the dialog and begin. */
+  async open(): Promise<void> {
+    this.frames = [];
+    this.turn = new Turn();
+    this.judge = new FrameJudge();
+    this.found = this.live = this.said = null;
+    this.before = 0;
+    clearError(this.error);
+    this.lines.getContext("2d")?.clearRect(0, 0, this.lines.width, this.lines.height);
+    this.close.textContent = "Cancel";
+    this.find.hidden = this.take.hidden = false;
+    this.find.textContent = "Find the place";
+    this.find.disabled = true;
+    this.ring.show([], 0, 0);
+    this.dialog.showModal();
+    // iOS asks for both permissions within the click.
+    const sensors = this.orientation.start();
+    try {
+      this.stream = await rearCamera();
+      if (!this.dialog.open) return this.stop();
+      this.video.srcObject = this.stream;
+      await this.video.play();
+    } catch (error) {
+      this.offerFilm(reasonOf(error));
+      return;
+    }
+    await sensors;
+    this.instead.hidden = true;
+    this.stage.hidden = false;
+    this.state = "looking";
+    this.timer = window.setInterval(() => void this.tick(), TICK_MS);
+  }
+
+  /** Say why there is no camera, and offer to choose a film. */
+  private offerFilm(reason: string): void {
+    this.stop();
+    if (!this.dialog.open) return;
+    this.stage.hidden = this.find.hidden = this.take.hidden = true;
+    this.instead.hidden = false;
+    this.hint.textContent = reason;
+    this.film.focus();
+  }
+
+  private stop(): void {
+    clearInterval(this.timer);
+    this.query?.abort();
+    this.query = null;
+    this.orientation.stop();
+    for (const track of this.stream?.getTracks() ?? []) track.stop();
+    this.stream = this.video.srcObject = null;
+    this.state = "off";
+  }
+
+  private async tick(): Promise<void> {
+    if (this.video.videoWidth === 0) return;
+    const now = performance.now() / 1000,
+      passed = this.before === 0 ? 0 : now - this.before;
+    this.before = now;
+    const { attitude, isWalking } = this.orientation;
+    const judged = this.judge.judge(this.video),
+      isUpright = this.video.videoHeight >= this.video.videoWidth;
+    const hint = this.turn.follow({ judged, attitude, isWalking, passed, isUpright });
+    this.ring.show(this.turn.taken, this.turn.halfStep, this.turn.yaw);
+    if (this.state === "found") {
+      this.live ??= this.found?.live() ?? null;
+      if (this.live !== null)
+        drawLive(this.lines, this.video, this.live, this.turn.yaw - (this.turn.taken[0] ?? 0), attitude);
+    }
+    if (this.state !== "looking") return;
+    if (hint !== this.said) this.hint.textContent = HINTS[(this.said = hint)];
+    if (hint === "done") await this.localise();
+    else if (this.turn.wants(hint)) await this.takeNow();
+  }
+
+  /** Take the current frame. */
+  private async takeNow(): Promise<void> {
+    if (this.isTaking || this.state !== "looking" || this.video.videoWidth === 0) return;
+    this.isTaking = true;
+    try {
+      this.turn.take(this.orientation.attitude);
+      const number = String(this.turn.taken.length).padStart(2, "0");
+      this.frames.push(await takeFrame(this.video, `turn-${number}.jpg`));
+      this.find.disabled = this.frames.length < LEAST_FRAMES;
+      this.find.textContent = `Find the place (${this.frames.length} photographs)`;
+    } catch (error) {
+      this.turn.taken.length = this.frames.length;
+      showError(this.error, error);
+    } finally {
+      this.isTaking = false;
+    }
+  }
+
+  private async localise(): Promise<void> {
+    if (this.state !== "looking" || this.frames.length < LEAST_FRAMES || this.isTaking) return;
+    this.state = "finding";
+    this.find.disabled = this.take.disabled = true;
+    this.hint.textContent = `Finding the place of ${this.frames.length} photographs…`;
+    const { signal } = (this.query = new AbortController());
+    try {
+      const directions = this.turn.hasGyroscope ? this.turn.taken.map((yaw) => yaw - this.turn.taken[0]!) : null;
+      const found = await this.actions.find(this.frames, directions, signal);
+      if (found === null || signal.aborted) return;
+      this.state = "found";
+      this.found = found;
+      this.hint.textContent = found.words;
+      this.find.hidden = this.take.hidden = true;
+      this.close.textContent = "Show on the plan";
+      this.close.focus();
+    } catch (error) {
+      if (signal.aborted) return;
+      this.state = "looking";
+      showError(this.error, error);
+    } finally {
+      this.find.disabled = this.take.disabled = false;
+    }
+  }
+
+  private async localiseFilm(): Promise<void> {
+    const film = this.film.files?.[0];
+    this.film.value = "";
+    if (film === undefined) return;
+    clearError(this.error);
+    this.hint.textContent = `Reading “${film.name}”…`;
+    const { signal } = (this.query = new AbortController());
+    try {
+      if (await this.actions.findFilm(film, signal)) this.dialog.close();
+    } catch (error) {
+      if (signal.aborted) return;
+      this.hint.textContent = "";
+      showError(this.error, error);
+    }
+  }
+}
+
+async function rearCamera(): Promise<MediaStream> {
+  // Browsers hide cameras from pages without HTTPS.
+  if ((navigator.mediaDevices as MediaDevices | undefined) === undefined) throw new DOMException("", "SecurityError");
+  return navigator.mediaDevices.getUserMedia({
+    audio: false,
+    video: { facingMode: { ideal: "environment" }, width: { ideal: 1920 }, height: { ideal: 1080 } },
+  });
+}
+
+/** Say why there is no camera. */
+function reasonOf(error: unknown): string {
+  const name = error instanceof DOMException ? error.name : "";
+  if (name === "SecurityError")
+    return "Browsers allow the camera on HTTPS pages only, and this page was loaded without. A film works as well.";
+  if (name === "NotAllowedError")
+    return "The browser was not allowed to use the camera. Allow it in the page's settings, or send a film.";
+  if (name === "NotFoundError" || name === "OverconstrainedError")
+    return "This device has no camera that the browser can use. A film works as well.";
+  return `The camera did not start${error instanceof Error ? `: ${error.message}` : ""}. A film works as well.`;
+}

@@ -1,0 +1,78 @@
+/** Attitude of the rear camera by the phone's gyroscope, and whether the person walks. */
+
+import { degrees, radians } from "../layout";
+
+export interface Attitude {
+  /** Azimuth of the optical axis, clockwise, from an arbitrary direction; degrees. */
+  yaw: number;
+  /** Elevation of the optical axis. */
+  pitch: number;
+  /** Clockwise rotation of the camera about it. */
+  roll: number;
+}
+
+// Smoothed acceleration (m/s²) of a person who walks; of one who turns it is far smaller.
+const WALKING = 1.4,
+  SMOOTHING = 0.05;
+
+interface WithPermission {
+  requestPermission?: () => Promise<"granted" | "denied">;
+}
+
+/** Return the attitude of the rear camera for the angles of an event; `screen` is the angle of the screen. */
+export function cameraAttitude(alpha: number, beta: number, gamma: number, screen: number): Attitude {
+  const [a, b, c, s] = [alpha, beta, gamma, screen].map(radians) as [number, number, number, number];
+  const [sa, ca, sb, cb, sc, cc] = [Math.sin(a), Math.cos(a), Math.sin(b), Math.cos(b), Math.sin(c), Math.cos(c)];
+  // The camera looks along the device's -z; the rows of the rotation are east, north and up.
+  const east = -(ca * sc + cc * sa * sb),
+    north = -(sa * sc - ca * cc * sb),
+    up = -(cb * cc);
+  // Elevation of the right side of the screen, which lies along the device's x or y.
+  const rising = Math.cos(s) * (-cb * sc) - Math.sin(s) * sb;
+  return {
+    yaw: degrees(Math.atan2(east, north)),
+    pitch: degrees(Math.asin(Math.max(-1, Math.min(1, up)))),
+    roll: -degrees(Math.asin(Math.max(-1, Math.min(1, rising)))),
+  };
+}
+
+/** Follows the phone's sensors. */
+export class Orientation {
+  /** Latest attitude; null on devices without a gyroscope, and without the permission. */
+  attitude: Attitude | null = null;
+  private acceleration = 0;
+
+  /** Ask for the permission that iOS wants, which needs the user's click, and follow the sensors. */
+  async start(): Promise<void> {
+    this.attitude = null;
+    this.acceleration = 0;
+    try {
+      await (globalThis.DeviceOrientationEvent as unknown as WithPermission | undefined)?.requestPermission?.();
+      await (globalThis.DeviceMotionEvent as unknown as WithPermission | undefined)?.requestPermission?.();
+    } catch {
+      // Without the permission there are no events, and overlap tells the angles.
+    }
+    addEventListener("deviceorientation", this.onTurn);
+    addEventListener("devicemotion", this.onMove);
+  }
+
+  stop(): void {
+    removeEventListener("deviceorientation", this.onTurn);
+    removeEventListener("devicemotion", this.onMove);
+  }
+
+  get isWalking(): boolean {
+    return this.acceleration > WALKING;
+  }
+
+  private readonly onTurn = ({ alpha, beta, gamma }: DeviceOrientationEvent): void => {
+    if (alpha === null || beta === null || gamma === null) return;
+    this.attitude = cameraAttitude(alpha, beta, gamma, globalThis.screen.orientation?.angle ?? 0);
+  };
+
+  private readonly onMove = ({ acceleration }: DeviceMotionEvent): void => {
+    if (acceleration === null) return;
+    const size = Math.hypot(acceleration.x ?? 0, acceleration.y ?? 0, acceleration.z ?? 0);
+    this.acceleration += SMOOTHING * (size - this.acceleration);
+  };
+}

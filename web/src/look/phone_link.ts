@@ -1,0 +1,55 @@
+/** QR code that opens the plan on a phone. The link holds the plan's id, never a key: the phone asks for one. */
+
+import { encode } from "uqr";
+
+import { button, h, s, show } from "../dom";
+
+/** Return the address of a plan on this page. */
+export const planLink = (planId: string): string => `${location.origin}${location.pathname}#plan=${planId}`;
+
+export class PhoneLink {
+  private readonly code = h("div", { class: "qr" });
+  private readonly link = h("a", {});
+  private readonly warning = h("p", { class: "hint" });
+  private readonly dialog = h(
+    "dialog",
+    { id: "phone-dialog", "aria-labelledby": "phone-title" },
+    h("h2", { id: "phone-title" }, "Open this plan on a phone"),
+    this.code,
+    h("p", {}, this.link),
+    this.warning,
+    h(
+      "div",
+      { class: "ask" },
+      button("Close", () => this.dialog.close()),
+    ),
+  );
+
+  constructor() {
+    document.body.append(this.dialog);
+  }
+
+  /** Show the code of a plan. */
+  open(planId: string): void {
+    const address = planLink(planId),
+      { data, size } = encode(address, { border: 2 });
+    const dark = data.flatMap((row, y) => row.flatMap((isDark, x) => (isDark ? [`M${x} ${y}h1v1h-1z`] : [])));
+    show(
+      this.code,
+      s(
+        "svg",
+        { viewBox: `0 0 ${size} ${size}`, role: "img", "aria-label": "QR code of the link below" },
+        s("rect", { class: "light", width: size, height: size }),
+        s("path", { class: "dark", d: dark.join("") }),
+      ),
+    );
+    this.link.href = this.link.textContent = address;
+    const isLocal = ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
+    this.warning.textContent = isLocal
+      ? "This address is of this computer alone: open the page by its name in the network."
+      : location.protocol === "https:"
+        ? "The phone asks for an API key if the service needs one."
+        : "Without HTTPS, phones do not allow the camera; a film can be chosen instead.";
+    this.dialog.showModal();
+  }
+}
