@@ -40,6 +40,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     errors.ChangedModelFileError: ProblemKind(503, "model-file-changed", "File of the model changed"),
     errors.RangeError: ProblemKind(416, "range-not-satisfiable", "Range not satisfiable"),
     core.InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between photographs"),
+    core.InvalidCorrectionError: ProblemKind(422, "invalid-correction", "Invalid correction of a pin"),
     core.InvalidHintError: ProblemKind(422, "invalid-hint", "Invalid hint"),
     core.InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
     core.InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
@@ -108,6 +109,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     core.CheckpointError: INTERNAL,
     core.ExportError: INTERNAL,
     core.InvalidStateError: INTERNAL,
+    core.InvalidEntryError: INTERNAL,
     core.DatasetError: INTERNAL,
     core.RunError: INTERNAL,
 }

@@ -45,6 +45,7 @@ LAYERS = {
     "lalaloc_core.localise.sequence": 9,
     "lalaloc_core.localise.venue": 9,
     "lalaloc_core.localise.tracking": 10,
+    "lalaloc_core.localise.album": 10,
     "lalaloc_core.draw": 10,
     "lalaloc_core.importers.common": 2,
     "lalaloc_core.importers.drawing": 3,
