@@ -9,6 +9,7 @@ with Client("http://127.0.0.1:8000") as service:
 Begin with `asynchronous/client.py`; `make client` generates `blocking/` from it.
 """
 
+from lalaloc_client.albums import AddedPhotograph, Album, AlbumPhotograph, MovedPin, Pin, PinPlace
 from lalaloc_client.answers import (
     BatchAnswer,
     Candidate,
@@ -30,6 +31,7 @@ from lalaloc_client.asynchronous.tracker import AsyncTracker
 from lalaloc_client.blocking.client import Client
 from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.errors import (
+    AlbumFailedError,
     ClientError,
     ConflictError,
     ConnectionFailedError,
@@ -77,6 +79,10 @@ from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOptions, TrackedPose
 
 __all__ = [
+    "AddedPhotograph",
+    "Album",
+    "AlbumFailedError",
+    "AlbumPhotograph",
     "AsyncClient",
     "AsyncTracker",
     "BatchAnswer",
@@ -100,12 +106,15 @@ __all__ = [
     "MalformedAnswerError",
     "Model",
     "Motion",
+    "MovedPin",
     "NotFoundError",
     "NotReadyError",
     "OnDeviceError",
     "OpeningPiece",
     "OverloadedError",
     "PathPoint",
+    "Pin",
+    "PinPlace",
     "PlanEvent",
     "PlanProbability",
     "Pool",

@@ -16,6 +16,7 @@ LaLaLocError
     ├── UnknownAlbumError           no album with this id, or an expired one
     ├── UnknownAlbumPhotographError no such photograph in the album
     ├── AlbumOutdatedError          another model encoded the photographs of the album
+    ├── FeaturelessModelError       the model gives no features, which albums need
     ├── TooManyAlbumsError          the tenant's quota of albums is used up
     ├── TooManyPhotographsError     the album is full
     ├── UnanchoredPlanError         the floor plan has no anchor
@@ -195,6 +196,13 @@ class AlbumOutdatedError(ServiceError):
             f"album '{album_id}' has the features of an earlier model and can only be read: create a new album and "
             "send its photographs again"
         )
+
+
+class FeaturelessModelError(ServiceError):
+    """The model gives no features, which albums need."""
+
+    def __init__(self, model: str) -> None:
+        super().__init__(f"model '{model}' gives no features of photographs, of which albums are made; use another one")
 
 
 class TooManyAlbumsError(ServiceError):

@@ -58,6 +58,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     errors.UnknownAlbumError: ProblemKind(404, "unknown-album", "Unknown album"),
     errors.UnknownAlbumPhotographError: ProblemKind(404, "unknown-photograph", "Unknown photograph"),
     errors.AlbumOutdatedError: ProblemKind(409, "album-outdated", "Album of an earlier model"),
+    errors.FeaturelessModelError: ProblemKind(501, "model-without-features", "Model without features"),
     errors.TooManyAlbumsError: ProblemKind(507, "too-many-albums", "Too many albums"),
     errors.TooManyPhotographsError: ProblemKind(507, "too-many-photographs", "Album is full"),
     errors.UnanchoredPlanError: ProblemKind(409, "floorplan-unanchored", "Floor plan has no anchor"),

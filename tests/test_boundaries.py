@@ -108,6 +108,7 @@ SERVICE_LAYERS = (
     "grids security decoding plan_files",
     "http venues",
     "query http.middleware",
+    "albums",
     "runtime",
     "routes",
     "app openapi",

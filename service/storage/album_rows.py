@@ -7,18 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from sqlalchemy import (
-    ColumnElement,
-    Connection,
-    Row,
-    and_,
-    delete,
-    exists,
-    func,
-    or_,
-    select,
-    update,
-)
+from sqlalchemy import ColumnElement, Connection, Row, and_, delete, exists, func, or_, select, update
 
 from service.errors import AlbumOutdatedError, RevisionMismatchError, UnknownAlbumError, UnknownAlbumPhotographError
 from service.storage.stored_bytes import ROW_BYTES, deleted_bytes

@@ -14,7 +14,6 @@ from service.errors import (
     RevisionMismatchError,
     TooManyAlbumsError,
     TooManyPhotographsError,
-    UnknownAlbumError,
     UnknownFloorPlanError,
     UnknownVenueError,
 )

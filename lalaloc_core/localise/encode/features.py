@@ -128,7 +128,7 @@ class FeatureEncoder:
         Raises:
             BundleError: a file is missing or altered, or the model gives no features.
         """
-        if not _gives_features(bundle.manifest):
+        if not gives_features(bundle.manifest):
             raise BundleError(
                 f"model '{bundle.manifest.name}' (architecture '{bundle.manifest.architecture}') gives no features; "
                 "send the photograph instead"
@@ -145,7 +145,7 @@ class FeatureEncoder:
             InvalidPhotographError: the model gives no features of such photographs.
         """
         manifest = self._bundle.manifest
-        if photograph.sphere is not None and _encodes_spheres(manifest):
+        if photograph.sphere is not None and encodes_spheres(manifest):
             by_height = [self._spheres.outputs(photograph.sphere, height_m) for height_m in RING_HEIGHTS_M]
             outputs = by_height[RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
         elif photograph.sphere is None and self._views is not None:
@@ -175,12 +175,12 @@ def is_features(content: bytes) -> bool:
     return content.startswith(_MAGIC)
 
 
-def _gives_features(manifest: Manifest) -> bool:
+def gives_features(manifest: Manifest) -> bool:
     """Return whether a model gives features of any photographs."""
-    return manifest.view is not None or _encodes_spheres(manifest)
+    return manifest.view is not None or encodes_spheres(manifest)
 
 
-def _encodes_spheres(manifest: Manifest) -> bool:
+def encodes_spheres(manifest: Manifest) -> bool:
     """Return whether the encoder of spheres depends on the camera height as `at_height` presumes."""
     return bool(manifest.ring_sectors and manifest.room_types)
 
@@ -344,7 +344,7 @@ def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
     for name, is_wrong in faults.items():
         if is_wrong:
             raise InvalidFeaturesError(f"{name} of the header is out of range")
-    if manifest.view is None if header.patches else not _encodes_spheres(manifest):
+    if manifest.view is None if header.patches else not encodes_spheres(manifest):
         raise InvalidFeaturesError(f"model '{manifest.name}' gives no features of {header.projection} photographs")
     if not header.patches and header.projection != "equirectangular":
         raise InvalidFeaturesError(f"the projection is '{header.projection}', and there are no patches")
