@@ -50,7 +50,7 @@ def solve_album(
     *,
     memory: AlbumMemory | None = None,
     by_time: bool = True,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int], object] = lambda _: None,
 ) -> Album:
     """Pin the photographs of an album.
 
@@ -123,7 +123,7 @@ def _compare(
     encoder: PhotographEncoder,
     photographs: Sequence[AlbumPhotograph],
     memory: AlbumMemory,
-    progress: Callable[[int], None],
+    progress: Callable[[int], object],
 ) -> None:
     """Fill the memory with the evidence of photographs that it does not know."""
     new = [each for each in photographs if each.id not in memory.evidence]
