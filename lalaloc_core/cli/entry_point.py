@@ -8,7 +8,7 @@ import os
 import sys
 
 from lalaloc_core import __version__
-from lalaloc_core.cli import encoding, evaluation, localising, measuring, plans, synthesis, tracking, training
+from lalaloc_core.cli import encoding, evaluation, localising, measuring, pinning, plans, synthesis, tracking, training
 from lalaloc_core.errors import InvalidInputError, LaLaLocError
 
 # The exit code that shells use for a command ended by Ctrl-C.
@@ -53,7 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (localising, encoding, tracking, plans, evaluation, measuring, synthesis, training):
+    for group in (localising, pinning, encoding, tracking, plans, evaluation, measuring, synthesis, training):
         group.add_commands(commands)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'

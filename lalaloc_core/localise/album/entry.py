@@ -1,9 +1,9 @@
 """Entry of a photograph in an album: what is kept of it instead of its pixels, as a small file.
 
 A file has 4 bytes "LLAP", the version (uint16) and the length of the header (uint32), the header in JSON, the features
-as `localise.encode.features` writes them, compressed, and the descriptors: 16 bytes and two uint16 each, the place as
-shares of width and height. All numbers are little-endian. The ring of spheres is left out (zeros): albums compare
-walls, not latents.
+as `localise.encode.features` writes them, compressed, 64 bytes of colours, and the descriptors: 16 bytes and two uint16
+each, the place as shares of width and height. All numbers are little-endian. The ring of spheres is left out (zeros):
+albums compare walls, not latents.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import zlib
 from dataclasses import dataclass, field
 from datetime import datetime
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -35,6 +36,11 @@ _MAX_HEADER_BYTES, _MAX_SIDE = 4096, 2**16
 # A descriptor with its place.
 _RECORD = np.dtype([("bits", "u1", DESCRIPTOR_BYTES), ("place", "<u2", 2)])
 _WHOLE = 2**16 - 1
+# Colours: bins of each of the two axes of CIE Lab's hue plane, as OpenCV scales them, and their borders.
+_HUES = 8
+_BORDERS = np.array([0.0, 118.0, 122.0, 125.0, 128.0, 131.0, 134.0, 138.0, 256.0])
+_THUMBNAIL = (64, 48)
+COLOURS = _HUES**2
 _COMPRESSION = 9
 
 
@@ -63,6 +69,7 @@ class Descriptors:
         return len(self.bits)
 
 
+NO_COLOURS = np.zeros(COLOURS, np.uint8)
 NO_DESCRIPTORS = Descriptors(np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
 
 
@@ -75,6 +82,7 @@ class AlbumPhotograph:
         view: the photograph with its features instead of pixels; `view.hfov` is the field of view and its origin.
         taken: time, maker, model and size in pixels; each None or empty where unknown.
         descriptors: what tells overlap with others; none for spheres, and for features that a client computed.
+        colours: (64,) square roots of the shares of hues, times 255; zeros for features that a client computed.
         correction: what a person stated; None without.
     """
 
@@ -82,6 +90,7 @@ class AlbumPhotograph:
     view: Photograph
     taken: Taken = field(default=Taken())
     descriptors: Descriptors = field(default=NO_DESCRIPTORS)
+    colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: NO_COLOURS)
     correction: Correction | None = None
 
     @property
@@ -114,14 +123,14 @@ class AlbumPhotograph:
             features=len(features),
         )
         text = json.dumps(dataclasses.asdict(header), allow_nan=False).encode()
-        used = _PREFIX.size + len(text) + len(features)
+        used = _PREFIX.size + len(text) + len(features) + COLOURS
         room = (MAX_ENTRY_BYTES - used) // _RECORD.itemsize
         if room < 0:
             raise InvalidEntryError(f"the entry has {used} bytes; the limit is {MAX_ENTRY_BYTES}")
         records = np.zeros(min(len(self.descriptors), room), _RECORD)
         records["bits"] = self.descriptors.bits[: len(records)]
         records["place"] = np.rint(np.clip(self.descriptors.place[: len(records)], 0.0, 1.0) * _WHOLE)
-        return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + features + records.tobytes()
+        return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + features + self.colours.tobytes() + records.tobytes()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +168,17 @@ def photograph_entry(id: str, view: Photograph, taken: Taken | None = None) -> A
         overview=None,
     )
     descriptors = NO_DESCRIPTORS if view.overview is None else Descriptors.of(view.overview.features)
-    return AlbumPhotograph(id=id, view=light, taken=taken or Taken(), descriptors=descriptors)
+    pixels = view.thumbnail if view.sphere is None else view.sphere
+    colours = NO_COLOURS if pixels is None else _colours(pixels)
+    return AlbumPhotograph(id=id, view=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
+
+
+def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:
+    """Return the hues of a picture: floors, walls and curtains of a room have their own."""
+    lab = cv2.cvtColor(cv2.resize(pixels, _THUMBNAIL, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2LAB)
+    across, up = (np.searchsorted(_BORDERS, lab[..., axis].ravel(), side="right") - 1 for axis in (1, 2))
+    share = np.bincount(across * _HUES + up, minlength=COLOURS) / across.size
+    return np.rint(255.0 * np.sqrt(share)).astype(np.uint8)
 
 
 def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
@@ -182,12 +201,12 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
         "width": not 0 <= header.width <= _MAX_SIDE,
         "height": not 0 <= header.height <= _MAX_SIDE,
-        "features": not 0 < header.features <= len(body),
+        "features": not 0 < header.features <= len(body) - COLOURS,
     }
     for name, is_wrong in faults.items():
         if is_wrong:
             raise InvalidEntryError(f"{name} of the entry is out of range")
-    rest = body[header.features :]
+    colours, rest = body[header.features :][:COLOURS], body[header.features + COLOURS :]
     if len(rest) % _RECORD.itemsize or len(rest) > MAX_DESCRIPTORS * _RECORD.itemsize:
         raise InvalidEntryError(
             f"the descriptors have {len(rest)} bytes; they have {_RECORD.itemsize} each, at most {MAX_DESCRIPTORS}"
@@ -196,7 +215,9 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
     descriptors = Descriptors(records["place"] / _WHOLE, records["bits"].copy())
     view = read_features(_inflated(body[: header.features]), bundle)
     taken = Taken(at=at, make=header.make, model=header.model, width=header.width, height=header.height)
-    return AlbumPhotograph(id=header.id, view=view, taken=taken, descriptors=descriptors)
+    return AlbumPhotograph(
+        id=header.id, view=view, taken=taken, descriptors=descriptors, colours=np.frombuffer(colours, np.uint8).copy()
+    )
 
 
 def _split(content: bytes) -> tuple[_Header, bytes]:
