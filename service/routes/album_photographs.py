@@ -117,7 +117,7 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
     are_features = bool(parts.named(FEATURES))
     files = parts.named(PHOTO) or parts.named(FEATURES)
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))
-    adding = _Adding(call, album, are_features=are_features)
+    adding = _Adding(call, album, len(files), are_features=are_features)
     lines = BatchLines(call, adding.add, adding.line).lines([(file, file) for file in files])
     return LinesResponse(lines, call.settings.requests.request_deadline_s)
 
@@ -125,13 +125,17 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
 class _Adding:
     """Photographs of one request that are added to an album."""
 
-    def __init__(self, call: ApiCall, album: AlbumRecord, *, are_features: bool) -> None:
+    def __init__(self, call: ApiCall, album: AlbumRecord, count: int, *, are_features: bool) -> None:
         self._call = call
         self._album = album
         self._document = AlbumDocument.model_validate_json(album.options)
         self._are_features = are_features
+        # Photographs are read side by side, and stored in the order of the request.
+        self._done = [asyncio.Event() for _ in range(count)]
 
-    async def add(self, file: UploadedFile, _: Content, context: QueryContext) -> tuple[PhotographRecord, bool]:
+    async def add(
+        self, index: int, file: UploadedFile, _: Content, context: QueryContext
+    ) -> tuple[PhotographRecord, bool]:
         """Store a photograph, and return it with True if it is new."""
         call, album = self._call, self._album
         content, sha256 = await call.upload(self._read, file)
@@ -142,6 +146,8 @@ class _Adding:
         query = AlbumPhotographQuery(document=self._document, content=content, sha256=sha256, context=context)
         entry = await call.runtime.localiser.album_entry(place, query)
         new = NewPhotograph(sha256=sha256, name=_clean(file.name), facts=entry.facts, entry=entry.entry)
+        if index:
+            await self._done[index - 1].wait()
         storage = call.settings.storage
         ttl_s, limit = storage.album_ttl_s, storage.max_album_photographs
         added = await call.upload(
@@ -168,7 +174,8 @@ class _Adding:
         problem: Problem | None,
         retry_after_s: int | None,
     ) -> AlbumLine:
-        """Return the line of a photograph."""
+        """Return the line of a photograph, after which the next one can be stored."""
+        self._done[index].set()
         if added is None:
             assert problem is not None
             return AlbumLine(

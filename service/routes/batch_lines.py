@@ -47,12 +47,12 @@ class BatchLines(Generic[T]):
 
     Args:
         call: the request.
-        answer: answers one photograph; called again while the tenant's other queries have all slots.
+        answer: answers the photograph of a number; called again while the tenant's other queries have all slots.
         line: makes the line of a photograph, see `LineOf`.
     """
 
     def __init__(
-        self, call: ApiCall, answer: Callable[[UploadedFile, Content, QueryContext], Awaitable[T]], line: LineOf[T]
+        self, call: ApiCall, answer: Callable[[int, UploadedFile, Content, QueryContext], Awaitable[T]], line: LineOf[T]
     ) -> None:
         self._call = call
         self._answer_one = answer
@@ -86,7 +86,7 @@ class BatchLines(Generic[T]):
     async def _line(self, index: int, file: UploadedFile, photograph: Content) -> str:
         answer = problem = retry_after_s = None
         try:
-            answer = await self._answer(file, photograph)
+            answer = await self._answer(index, file, photograph)
         except Exception as error:
             if not isinstance(error, LaLaLocError):
                 logging.getLogger(LOGGER_NAME).exception("unexpected error")
@@ -101,7 +101,7 @@ class BatchLines(Generic[T]):
         # In ASCII: names and details quote the request, which is not always encodable as UTF-8.
         return json.dumps(line.model_dump(mode="json", exclude_none=problem is not None))
 
-    async def _answer(self, file: UploadedFile, photograph: Content) -> T:
+    async def _answer(self, index: int, file: UploadedFile, photograph: Content) -> T:
         """Answer one photograph; wait for a slot while the tenant's other queries have them all."""
         settings = self._call.settings
         limit = settings.photographs.max_photograph_bytes
@@ -114,7 +114,7 @@ class BatchLines(Generic[T]):
             if self._common_error is not None:
                 raise self._common_error
             try:
-                return await self._answer_one(file, photograph, context)
+                return await self._answer_one(index, file, photograph, context)
             except errors.OverloadedError:
                 if context.left_s < _BUSY_PAUSE_S:
                     raise

@@ -64,7 +64,7 @@ async def localise_batch(call: Call) -> Response:
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(photographs))
     place = await call.place(form.floorplan_id, form.venue_id)
 
-    async def answer(_file: UploadedFile, content: Content, context: QueryContext) -> LocaliseAnswer:
+    async def answer(_index: int, _file: UploadedFile, content: Content, context: QueryContext) -> LocaliseAnswer:
         found = await call.runtime.localiser.localise(place, PhotographQuery(form, content, context))
         return await keep_answer(found, call)
 

@@ -52,7 +52,7 @@ class States:
             room=arrays["room"],
             heading=arrays["hypothesis"] * (TWO_PI / headings),
             log=arrays["log_likelihood"].astype(float),
-            offset=arrays["offset"],
+            offset=arrays["offset"].astype(int),
         )
 
     def best_of_rooms(self, rooms: int) -> Float[np.ndarray, "r"]:
