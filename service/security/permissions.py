@@ -34,7 +34,7 @@ class Permission(StrEnum):
 # Open to everyone, so that monitoring needs no key.
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 # Pages, open without a key; they ask for one themselves.
-PAGES = frozenset({"/", "/docs", "/web/{name}", "/favicon.ico"})
+PAGES = frozenset({"/", "/pin", "/docs", "/web/{name}", "/favicon.ico"})
 
 # Scopes of all other routes. With keys on, a route without a row does not exist.
 NEEDED: Mapping[tuple[str, str], Permission] = {
