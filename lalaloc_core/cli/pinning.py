@@ -118,9 +118,7 @@ def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], li
     if len(found) < len(files):
         notes.append(f"'{folder}' has files that are no pictures, which are left out: {len(files) - len(found)}")
     if folders:
-        notes.append(
-            f"{len(folders)} folder{'s' if len(folders) > 1 else ''} in '{folder}' are left out; pin them alone"
-        )
+        notes.append(f"'{folder}' has folders, which are left out: {len(folders)}; pin them by themselves")
     if not found:
         raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(_SUFFIXES))})")
     if len(found) > MAX_PHOTOGRAPHS:

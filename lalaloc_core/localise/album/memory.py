@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import zipfile
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,7 @@ from lalaloc_core.localise.album.ground import AlbumGround
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
 _MAX_BYTES = 2**28
+_DAMAGE = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RecursionError, zipfile.BadZipFile)
 
 
 @dataclass(eq=False)
@@ -81,5 +83,5 @@ class AlbumMemory:
                     for first, second, matches, turn in head["links"]
                 }
                 return cls(str(head["key"]), evidence, links)
-        except (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RecursionError) as error:
+        except _DAMAGE as error:
             raise InvalidEntryError(f"the memory of the album is damaged: {error}") from error

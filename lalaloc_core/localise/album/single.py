@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import ROOM_TYPES, TWO_PI
+from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.binned_ground import BinnedGround
 from lalaloc_core.localise.album.comparison import Comparison
@@ -69,7 +69,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
     """Compare a photograph with all poses.
 
     Returns:
-        `pose`, `position_m`, `room`, `hypothesis`, `log_likelihood` and `offset` of the states that are kept;
+        `pose`, `position_m`, `room`, `hypothesis` and `log_likelihood` of the states that are kept;
         `room_types` (r,), the log likelihood of the type of every room; `heights` (j,), the log evidence of each height
         offset; `chance`, the log likelihood of the best of as many poses of other homes.
     """
@@ -81,8 +81,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
     log -= usual
     log -= _ceilings(searched.plan, query, weights)[searched.poses.room_index, None, :].astype(np.float32)
     heights = np.array([_log_sum(log[:, :, number]) for number in range(len(OFFSETS))], np.float32)
-    offset = log.argmax(axis=2).astype(np.uint8)
-    best = np.take_along_axis(log, offset[:, :, None].astype(np.intp), axis=2)[:, :, 0]
+    best = log.max(axis=2)
     kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {
@@ -91,7 +90,6 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         "room": searched.poses.room_index[pose].astype(np.int32),
         "hypothesis": hypothesis.astype(np.uint8),
         "log_likelihood": best.ravel()[kept].astype(np.float32),
-        "offset": offset.ravel()[kept],
         "room_types": _room_types(searched, query, weights).astype(np.float32),
         "heights": heights,
         "chance": np.array(_by_chance(encoder, compared, usual), np.float32),
@@ -105,13 +103,6 @@ def _by_chance(encoder: PhotographEncoder, compared: Comparison, usual: Float[np
         return -math.inf
     layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))
     return float((compared.log_likelihood(BinnedGround.of(layouts)) - usual).max())
-
-
-def headings_of(hypothesis: Int[np.ndarray, "m"], view: Photograph, encoder: PhotographEncoder) -> np.ndarray:
-    """Return the headings (radians) of hypotheses: one for each sector of the ring, or each column of the horizon."""
-    manifest = encoder.manifest
-    count = manifest.ring_sectors if view.is_sphere else manifest.profile_columns
-    return hypothesis * (TWO_PI / count)
 
 
 def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:

@@ -33,7 +33,6 @@ class States:
         room: (m,) number of its room.
         heading: (m,) azimuth of the photograph's centre, radians.
         log: (m,) log likelihood.
-        offset: (m,) number of the height offset that fits best.
     """
 
     pose: Int[np.ndarray, "m"]
@@ -41,7 +40,6 @@ class States:
     room: Int[np.ndarray, "m"]
     heading: Float[np.ndarray, "m"]
     log: Float[np.ndarray, "m"]
-    offset: Int[np.ndarray, "m"]
 
     @classmethod
     def of(cls, arrays: Arrays, headings: int) -> States:
@@ -52,7 +50,6 @@ class States:
             room=arrays["room"],
             heading=arrays["hypothesis"] * (TWO_PI / headings),
             log=arrays["log_likelihood"].astype(float),
-            offset=arrays["offset"].astype(int),
         )
 
     def best_of_rooms(self, rooms: int) -> Float[np.ndarray, "r"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -198,16 +197,11 @@ def _sphere(shot: Shot, renderers: RendererCache) -> UInt8[np.ndarray, "h w 3"]:
     return renderers.renderer(*_SPHERE_SIZE, (1, 1)).render([shot])[0].cpu().numpy()
 
 
-def cut_albums(
-    rooms: Sequence[tuple[FloorPlan, UInt8[np.ndarray, "h w 3"]]], field_deg: float, rng: np.random.Generator
-) -> list[list[UInt8[np.ndarray, "h w 3"]]]:
-    """Return two level views of each sphere, at a random turn and half a turn and up to 45° on."""
+def two_views(
+    sphere: UInt8[np.ndarray, "h w 3"], field_deg: float, rng: np.random.Generator
+) -> list[tuple[UInt8[np.ndarray, "h w 3"], float]]:
+    """Return two level views of a sphere and their azimuths (radians): a random one, and half a turn ± 45° on."""
     camera = Perspective.of_hfov(*_SIZE, math.radians(field_deg))
-    found = []
-    for _, sphere in rooms:
-        first = float(rng.uniform(0.0, TWO_PI))
-        second = first + math.pi + float(rng.uniform(-0.25, 0.25)) * math.pi
-        found.append(
-            [cut_view(sphere, camera, azimuth=float(azimuth), pitch=0.0, roll=0.0) for azimuth in (first, second)]
-        )
-    return found
+    first = float(rng.uniform(0.0, TWO_PI))
+    azimuths = first, first + math.pi * float(rng.uniform(0.75, 1.25))
+    return [(cut_view(sphere, camera, azimuth=azimuth, pitch=0.0, roll=0.0), azimuth) for azimuth in azimuths]
