@@ -9,6 +9,7 @@ with Client("http://127.0.0.1:8000") as service:
 Begin with `asynchronous/client.py`; `make client` generates `blocking/` from it.
 """
 
+from lalaloc_client.albums import AddedPhotograph, Album, AlbumPhotograph, MovedPin, Pin, PinPlace
 from lalaloc_client.answers import (
     BatchAnswer,
     Candidate,
@@ -31,6 +32,7 @@ from lalaloc_client.asynchronous.tracker import AsyncTracker
 from lalaloc_client.blocking.client import Client
 from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.errors import (
+    AlbumFailedError,
     ClientError,
     ConflictError,
     ConnectionFailedError,
@@ -78,6 +80,10 @@ from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOptions, TrackedPose
 
 __all__ = [
+    "AddedPhotograph",
+    "Album",
+    "AlbumFailedError",
+    "AlbumPhotograph",
     "AsyncClient",
     "AsyncTracker",
     "BatchAnswer",
@@ -101,6 +107,7 @@ __all__ = [
     "MalformedAnswerError",
     "Model",
     "Motion",
+    "MovedPin",
     "NextStep",
     "NotFoundError",
     "NotReadyError",
@@ -108,6 +115,8 @@ __all__ = [
     "OpeningPiece",
     "OverloadedError",
     "PathPoint",
+    "Pin",
+    "PinPlace",
     "PlanEvent",
     "PlanProbability",
     "Pool",

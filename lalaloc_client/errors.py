@@ -51,15 +51,27 @@ class FloorPlanFailedError(ClientError):
         super().__init__(f"floor plan '{floorplan_id}' could not be prepared: {reason or 'no reason given'}")
 
 
+class AlbumFailedError(ClientError):
+    """The service could not solve the album.
+
+    Attributes:
+        reason: the service's explanation.
+    """
+
+    def __init__(self, album_id: str, reason: str | None) -> None:
+        self.reason = reason
+        super().__init__(f"album '{album_id}' could not be solved: {reason or 'no reason given'}")
+
+
 class OnDeviceError(ClientError):
     """The features of a photograph cannot be computed on this device."""
 
 
 class NotReadyError(ClientError, TimeoutError):
-    """The plan was still preparing at the timeout."""
+    """The plan was still preparing, or the album still being solved, at the timeout."""
 
-    def __init__(self, floorplan_id: str, waited_s: float, progress: float) -> None:
-        super().__init__(f"floor plan '{floorplan_id}' is still preparing after {waited_s:.1f} s ({progress:.0%} done)")
+    def __init__(self, resource_id: str, waited_s: float, progress: float, what: str = "floor plan") -> None:
+        super().__init__(f"{what} '{resource_id}' is still preparing after {waited_s:.1f} s ({progress:.0%} done)")
 
 
 class ProblemError(ClientError):

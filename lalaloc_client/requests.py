@@ -135,7 +135,10 @@ def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[s
     return {"base_url": address, "headers": headers, "timeout": timeout_s}
 
 
-def resource_path(collection: Literal["floorplans", "venues", "answers", "sessions"], resource_id: str) -> str:
+Collection = Literal["floorplans", "venues", "answers", "sessions", "albums", "photographs"]
+
+
+def resource_path(collection: Collection, resource_id: str) -> str:
     """Return the path of a resource.
 
     Raises:

@@ -12,7 +12,9 @@ LaLaLocError
 │   ├── InvalidPoseError         a position, heading or height is outside its limits
 │   ├── InvalidHintError         a hint is invalid; names the hint
 │   ├── InvalidMotionError       a motion between two photographs is invalid
+│   ├── InvalidCorrectionError   a correction of a pin is incomplete or does not fit the plan
 │   └── DatasetError             a file of a data set is missing, damaged or invalid; names scene, room and path
+├── InvalidEntryError            the stored entry of a photograph of an album is damaged
 ├── ConfigError                  unknown key or value of a wrong type in a configuration
 ├── BundleError                  a model bundle is missing, incomplete or altered
 ├── CheckpointError              a checkpoint is missing or belongs to another configuration
@@ -122,6 +124,14 @@ class InvalidHintError(InvalidInputError):
 
 class InvalidMotionError(InvalidInputError):
     """A motion between two photographs is outside its limits or incomplete."""
+
+
+class InvalidCorrectionError(InvalidInputError):
+    """A correction of a pin is incomplete, out of range, or names what the plan does not have."""
+
+
+class InvalidEntryError(LaLaLocError):
+    """The stored entry of a photograph of an album is damaged, too large, or of another version."""
 
 
 class InvalidStateError(LaLaLocError):

@@ -102,7 +102,12 @@ async def _lifespan(
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control
         app.state.audit_trail = runtime.audit_trail
-        yield
+        solving = asyncio.create_task(runtime.albums.run())
+        try:
+            yield
+        finally:
+            solving.cancel()
+            await asyncio.wait({solving})
         logger.info("service is stopping")
     logger.info("service stopped")
 

@@ -13,6 +13,12 @@ LaLaLocError
     ├── SessionOutdatedError        the plan, the venue or the model of the session has changed
     ├── PhotographOutOfOrderError   the photograph is not the next one of the session
     ├── TooManySessionsError        the tenant's quota of sessions is used up
+    ├── UnknownAlbumError           no album with this id, or an expired one
+    ├── UnknownAlbumPhotographError no such photograph in the album
+    ├── AlbumOutdatedError          another model encoded the photographs of the album
+    ├── FeaturelessModelError       the model gives no features, which albums need
+    ├── TooManyAlbumsError          the tenant's quota of albums is used up
+    ├── TooManyPhotographsError     the album is full
     ├── UnanchoredPlanError         the floor plan has no anchor
     ├── UnmeasuredModelError        the model's errors were not measured
     ├── NoPlanNearbyError           no anchored floor plan near the given place
@@ -163,6 +169,57 @@ class TooManySessionsError(ServiceError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"{limit} sessions are open; the limit is {limit} (LALALOC_MAX_SESSIONS): delete some")
+
+
+class UnknownAlbumError(ServiceError):
+    """No album has this id."""
+
+    def __init__(self, album_id: str) -> None:
+        super().__init__(
+            f"album '{album_id[:64]}' does not exist; albums expire (album_ttl_s) and are deleted with their floor "
+            "plan or venue"
+        )
+
+
+class UnknownAlbumPhotographError(ServiceError):
+    """The album has no photograph with this id."""
+
+    def __init__(self, album_id: str, photograph_id: str) -> None:
+        super().__init__(f"album '{album_id}' has no photograph '{photograph_id[:64]}'")
+
+
+class AlbumOutdatedError(ServiceError):
+    """Another model than the running one encoded the photographs of the album."""
+
+    def __init__(self, album_id: str) -> None:
+        super().__init__(
+            f"album '{album_id}' has the features of an earlier model and can only be read: create a new album and "
+            "send its photographs again"
+        )
+
+
+class FeaturelessModelError(ServiceError):
+    """The model gives no features, which albums need."""
+
+    def __init__(self, model: str) -> None:
+        super().__init__(f"model '{model}' gives no features of photographs, of which albums are made; use another one")
+
+
+class TooManyAlbumsError(ServiceError):
+    """The tenant's quota of albums is used up."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"the limit of {limit} albums is reached (LALALOC_MAX_ALBUMS); delete one")
+
+
+class TooManyPhotographsError(ServiceError):
+    """The album is full."""
+
+    def __init__(self, album_id: str, limit: int) -> None:
+        super().__init__(
+            f"album '{album_id}' has {limit} photographs; the limit is {limit} (LALALOC_MAX_ALBUM_PHOTOGRAPHS): create "
+            "another album for the rest"
+        )
 
 
 class UnanchoredPlanError(ServiceError):

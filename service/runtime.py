@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, TypeVar
 
 from fastapi import Request
@@ -15,6 +16,7 @@ from sqlalchemy.engine import make_url
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from service.albums.album_solver import AlbumSolver
 from service.capacity.admission_control import Admission, AdmissionLimits
 from service.capacity.cores import usable_cores
 from service.capacity.cpu_accounts import PROBES
@@ -22,7 +24,7 @@ from service.capacity.fair_share import FairSemaphore, with_headroom
 from service.capacity.threads import BoundedReads, IdleCores, Threads
 from service.decoding.decoder import Decoder
 from service.grids import GridProvider, Sweeper
-from service.http.events import HEARTBEAT_S, PlanEvents
+from service.http.events import ALBUM_ENDS, PLAN_ENDS, ProgressEvents, album_look, heartbeat_s, plan_look
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
 from service.query import (
@@ -36,6 +38,8 @@ from service.query import (
     QueryParts,
 )
 from service.schemas import ModelAnswer
+from service.schemas.albums import AlbumEvent
+from service.schemas.stored_plans import PlanEvent
 from service.security import AccessControl, AuditTrail
 from service.settings import Settings
 from service.storage import PlanLookup, Store, open_store
@@ -58,11 +62,11 @@ _MAX_PENDING_RENDITIONS = 16
 _PLAN_CACHE_AGE_S = 600.0
 # Timeout of an event stream; the client then reconnects.
 STREAM_DEADLINE_S = 900.0
-# Minimum interval at which a stream checks its API key.
-_MIN_HEARTBEAT_S = 1.0
 # Longest time that a thread keeps the interpreter while others wait. Python's 5 ms add up in a query, which waits for
 # it several times beside other tenants' queries that compute.
 _SWITCH_INTERVAL_S = 0.0005
+# Timeout (s) of reading or writing the features and pins of an album.
+_ALBUM_WAIT_S = 30.0
 # Share of the stop timeout in which running LPO jobs can finish.
 _LPO_DRAIN = 0.1
 
@@ -87,6 +91,7 @@ class Runtime:
         plan_indices: indices of venues in this process.
         renditions: files made from stored plans.
         permits: permits to compute, of which each piece of work holds one.
+        albums: solves albums, while its `run` does.
     """
 
     settings: Settings
@@ -102,7 +107,9 @@ class Runtime:
     admission: Admission
     access_control: AccessControl
     audit_trail: AuditTrail
-    events: PlanEvents
+    events: ProgressEvents[PlanEvent]
+    album_events: ProgressEvents[AlbumEvent]
+    albums: AlbumSolver
     uploads: Threads
     file_uploads: Threads
     reads: BoundedReads
@@ -193,10 +200,9 @@ def start_runtime(
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
     plans, plan_indices = components.venue_plans(), _closing(cleanup, components.plan_indices())
     indices: IndexSource = plan_indices if backends.indices is None else backends.indices(settings)
-    own = _closing(cleanup, components.localiser(plans, indices))
-    localiser: LocaliserBackend = own
+    localiser: LocaliserBackend = _closing(cleanup, components.localiser(plans, indices))
     if backends.localiser is not None:
-        localiser = backends.localiser(own.model, settings, telemetry)
+        localiser = backends.localiser(localiser.model, settings, telemetry)
     renditions = RenditionCache(
         store.plans,
         converter,
@@ -208,6 +214,15 @@ def start_runtime(
         turns=FairSemaphore(1, telemetry.cpu_accounts),
         permits=components.permits,
     )
+    lookup = PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S)
+    album_reads = _closing(cleanup, BoundedReads(threads=2, max_pending=16, wait_s=_ALBUM_WAIT_S))
+    streams = partial(
+        ProgressEvents,
+        admission=components.admission,
+        reads=event_reads,
+        max_s=STREAM_DEADLINE_S,
+        heartbeat_s=heartbeat_s(settings),
+    )
     _log_start(bundle, grids, telemetry)
     if not store.plans.any_stored():
         fields = {"database": make_url(settings.database_url).render_as_string(hide_password=True)}
@@ -218,7 +233,7 @@ def start_runtime(
         bundle=bundle,
         store=store,
         grids=grids,
-        plan_lookup=PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S),
+        plan_lookup=lookup,
         optimiser=components.optimiser,
         decoder=components.decoder,
         converter=converter,
@@ -226,7 +241,9 @@ def start_runtime(
         admission=components.admission,
         access_control=access_control,
         audit_trail=audit_trail,
-        events=_plan_events(store, grids, components.admission, event_reads, settings),
+        events=streams(partial(plan_look, store, grids), PlanEvent(status="deleted"), PLAN_ENDS),
+        album_events=streams(partial(album_look, store, bundle.sha256), AlbumEvent(status="deleted"), ALBUM_ENDS),
+        albums=AlbumSolver(store, lookup, localiser, album_reads, settings, telemetry),
         uploads=uploads,
         file_uploads=file_uploads,
         reads=components.reads,
@@ -312,7 +329,8 @@ class _QueryComponents:
             ),
             executor=executor,
         )
-        return Localiser(parts, queries)
+        albums = Threads("albums", 1, self.telemetry.cpu_accounts)
+        return Localiser(parts, queries, albums, self.permits)
 
     def venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""
@@ -369,18 +387,6 @@ async def get_runtime(request: Request) -> Runtime:
     A coroutine, because the framework would call a plain function on a thread pool that slow reads can fill.
     """
     return request.app.state.runtime
-
-
-def _plan_events(
-    store: Store, grids: GridProvider, admission: Admission, reads: BoundedReads, settings: Settings
-) -> PlanEvents:
-    # The key of a stream is checked at every heartbeat.
-    heartbeat_s = (
-        max(min(settings.access.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S)
-        if settings.access.api_keys
-        else HEARTBEAT_S
-    )
-    return PlanEvents(store, grids, admission, reads, max_s=STREAM_DEADLINE_S, heartbeat_s=heartbeat_s)
 
 
 def _log_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> None:

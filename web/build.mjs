@@ -47,7 +47,7 @@ mkdirSync(out, { recursive: true });
 await build({
   absWorkingDir: here,
   entryPoints: [
-    ...["app.ts", "sphere.ts", "docs.ts", "style.css", "docs.css"].map((name) => ({
+    ...["app.ts", "pin.ts", "sphere.ts", "docs.ts", "style.css", "docs.css"].map((name) => ({
       in: `src/${name}`,
       out: name.replace(/\..*/, ""),
     })),
@@ -65,7 +65,8 @@ await build({
   chunkNames: "[name]-[hash]",
   logLevel: "warning",
 });
-for (const name of ["index.html", "docs.html", "icon.svg"]) copyFileSync(join(here, "src", name), join(out, name));
+for (const name of ["index.html", "pin.html", "docs.html", "pin.css", "icon.svg"])
+  copyFileSync(join(here, "src", name), join(out, name));
 for (const name of ["swagger-ui-bundle.js", "swagger-ui-bundle.js.LICENSE.txt", "swagger-ui.css"]) {
   copyFileSync(join(here, "node_modules", "swagger-ui-dist", name), join(out, name));
 }

@@ -14,9 +14,9 @@ import httpx
 from httpx_sse import EventSource
 
 from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.asynchronous.albums import AsyncAlbums
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.tracker import AsyncTracker
-from lalaloc_client.asynchronous.transport import AsyncTransport
 from lalaloc_client.errors import (
     ConnectionFailedError,
     FloorPlanFailedError,
@@ -69,7 +69,7 @@ _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _RECONNECT_S = 3.0
 
 
-class AsyncClient(AsyncTransport):
+class AsyncClient(AsyncAlbums):
     """Client of a LaLaLoc service; close it, or use it in an `async with` block. One event loop uses a client.
 
     Every method raises `ProblemError` if the service answers with a problem, `ConnectionFailedError` if it does not

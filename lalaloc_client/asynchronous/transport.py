@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import httpx
 
+from lalaloc_client.albums import Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.asynchronous.device import AsyncDevice
@@ -30,8 +31,8 @@ from lalaloc_client.requests import (
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
-StoredT = TypeVar("StoredT", FloorPlan, Venue)
-PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage)
+StoredT = TypeVar("StoredT", FloorPlan, Venue, Album, AlbumPhotograph)
+PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage, AlbumPage, AlbumPhotographPage)
 
 # Used when the service does not state its limit; every service allows this many.
 _DEFAULT_MAX_QUERIES = 3

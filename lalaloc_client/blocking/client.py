@@ -15,9 +15,9 @@ import httpx
 from httpx_sse import EventSource
 
 from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.blocking.albums import Albums
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.tracker import Tracker
-from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import (
     ConnectionFailedError,
     FloorPlanFailedError,
@@ -70,7 +70,7 @@ _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _RECONNECT_S = 3.0
 
 
-class Client(Transport):
+class Client(Albums):
     """Client of a LaLaLoc service; close it, or use it in a `with` block. Threads can share a client.
 
     Every method raises `ProblemError` if the service answers with a problem, `ConnectionFailedError` if it does not

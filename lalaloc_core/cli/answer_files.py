@@ -80,7 +80,7 @@ def _csv(answers: Sequence[dict[str, Any]]) -> str:
     writer = csv.writer(text)
     writer.writerow(_COLUMNS)
     for answer in answers:
-        writer.writerow([_unread(answer["photograph"]), *_cells(answer), _unread(answer.get("error", ""))])
+        writer.writerow([unread(answer["photograph"]), *_cells(answer), unread(answer.get("error", ""))])
     return text.getvalue()
 
 
@@ -95,7 +95,7 @@ def _cells(answer: dict[str, Any]) -> list[str]:
         (xx, xy), (_, yy) = covariance
         within = f"{ellipse_m((xx, xy, yy))[0]:.3f}"
     return [
-        _unread(answer["room"]),
+        unread(answer["room"]),
         f"{answer['position']['x_m']:.3f}",
         f"{answer['position']['y_m']:.3f}",
         f"{answer['heading_deg']:.1f}",
@@ -104,7 +104,7 @@ def _cells(answer: dict[str, Any]) -> list[str]:
     ]
 
 
-def _unread(text: str) -> str:
+def unread(text: str) -> str:
     """Return text that a spreadsheet does not read as a formula."""
     return f"'{text}" if text.startswith(_FORMULA) else text
 

@@ -14,6 +14,7 @@ from lalaloc_core.cli import (
     evaluation,
     localising,
     measuring,
+    pinning,
     plans,
     synthesis,
     tracking,
@@ -63,7 +64,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (localising, encoding, tracking, plans, evaluation, measuring, synthesis, training, assistants):
+    groups = (localising, pinning, encoding, tracking, plans, evaluation, measuring, synthesis, training, assistants)
+    for group in groups:
         group.add_commands(commands)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'

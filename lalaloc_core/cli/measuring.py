@@ -24,6 +24,7 @@ _GROUPS = (
     "films",
     "bounds",
     "steps",
+    "albums",
     "localisability",
     "uninformative",
     "evidence",
@@ -44,6 +45,9 @@ def add_commands(commands: Any) -> None:
         "--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each (default: %(default)s)"
     )
     bench.add_argument("--out", type=Path, metavar="FILE", help="also write the JSON to FILE; --only updates FILE")
+    bench.add_argument(
+        "--annotated", type=Path, metavar="DIR", help="folder of annotated photographs, for albums of real rooms"
+    )
     bench.add_argument("--only", choices=_GROUPS, action="append", help="one group of figures; repeat for more")
     bench.add_argument(
         "--profile", action="store_true", help="print the time of each stage of a query instead of measuring figures"
@@ -107,7 +111,9 @@ def _bench(arguments: argparse.Namespace) -> None:
     from lalaloc_core.evaluate.bench.benchmarks import run_bench
 
     groups = arguments.only or _GROUPS
-    report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
+    report = run_bench(
+        arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures, annotated=arguments.annotated
+    )
     if arguments.out is not None:
         keep = bool(arguments.only) and arguments.out.exists()
         before = json.loads(arguments.out.read_text(encoding="utf-8")) if keep else {}

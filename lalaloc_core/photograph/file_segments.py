@@ -105,14 +105,14 @@ def _check_jpeg(content: bytes) -> None:
 
 
 def _check_png(content: bytes) -> None:
-    for chunks, _ in enumerate(_chunks(content), start=1):
+    for chunks, _ in enumerate(png_chunks(content), start=1):
         if chunks > _MAX_CHUNKS:
             raise InvalidPhotographError(
                 f"the photograph is a PNG with more than {_MAX_CHUNKS} chunks, the limit; save it again"
             )
 
 
-def _chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
+def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
     """Yield the kind of each chunk of a PNG, and where its frame begins and ends."""
     position = len(_PNG)
     while position < len(content):
@@ -134,7 +134,7 @@ def without_large_texts(content: bytes) -> tuple[bytes, int]:
     if not content.startswith(_PNG):
         return content, 0
     budget, position, kept = MAX_TEXT_BYTES, 0, []
-    for kind, begin, end in _chunks(content):
+    for kind, begin, end in png_chunks(content):
         if kind not in _TEXTS:
             continue
         text = content[begin + 8 : end - 4] if budget > end - begin else b""
@@ -171,7 +171,7 @@ def _inflated(data: bytes, limit: int) -> bytes:
 def xmp_packets(content: bytes) -> tuple[list[bytes], int]:
     """Return the XMP packets of a JPEG or PNG, the first ones and an extension's begin, and the number left out."""
     if content.startswith(_PNG):
-        texts = (content[begin + 8 : end - 4] for kind, begin, end in _chunks(content) if kind == b"iTXt")
+        texts = (content[begin + 8 : end - 4] for kind, begin, end in png_chunks(content) if kind == b"iTXt")
         found = [text.removeprefix(_PNG_XMP) for text in texts if text.startswith(_PNG_XMP)]
         packets = [
             _inflated(_text_of(rest), MAX_TEXT_BYTES) if rest[:1] == b"\1" else _text_of(rest)

@@ -147,7 +147,7 @@ def find_links(
         steps = min(second - first, count - second + first)
         limits = (_MIN_MATCHES, _MIN_SHARE) if steps <= _NEAR_STEPS else (_FAR_MIN_MATCHES, _FAR_MIN_SHARE)
         tilt_sd = math.hypot(attitudes[first].pitch_sd, attitudes[second].pitch_sd)
-        turned = _turned(*level, *limits, _MAX_TILT + 2.0 * tilt_sd, rng)
+        turned = turn_between(*level, *limits, _MAX_TILT + 2.0 * tilt_sd, rng)
         if turned is None:
             continue
         turn, agreed = turned
@@ -161,7 +161,7 @@ def _rays_of(features: Features, camera: Camera) -> Float[np.ndarray, "n 3"]:
     return camera.rays(features.place * (camera.width, camera.height))
 
 
-def _turned(
+def turn_between(
     one: Float[np.ndarray, "m 3"],
     other: Float[np.ndarray, "m 3"],
     min_matches: int,
@@ -169,7 +169,7 @@ def _turned(
     max_tilt: float,
     rng: np.random.Generator,
 ) -> tuple[float, Bool[np.ndarray, "m"]] | None:
-    """Return the turn that explains most of some matches of about level rays, and which; None if too few agree."""
+    """Return the turn that explains most of some matches of about level rays, and which agree; None if too few do."""
     count = len(one)
     least = max(min_matches, min_share * count)
     if count < least:

@@ -36,7 +36,7 @@ REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 BATCH = "/localise/batch"
 _QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose", BATCH})
-_STREAMS, _PHOTOGRAPHS = "/events", "/photographs"
+_STREAMS, _PHOTOGRAPHS, _ALBUMS = "/events", "/photographs", "/albums/"
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
@@ -62,7 +62,9 @@ def is_stream(method: str, path: str) -> bool:
 
 def bounds_itself(method: str, path: str) -> bool:
     """Return True for answers that are sent part by part, and bound the time of each part."""
-    return is_stream(method, path) or path == BATCH
+    if is_stream(method, path) or path == BATCH:
+        return True
+    return method == "POST" and path.startswith(_ALBUMS) and path.endswith(_PHOTOGRAPHS)
 
 
 class _Pace:

@@ -20,6 +20,7 @@ from lalaloc_core.photograph.film import Film, read_film
 from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.photograph import open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
+from lalaloc_core.photograph.taken import Taken, read_taken
 from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_turn
 from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
@@ -41,6 +42,14 @@ class DecodeJob:
     content: bytes | UploadedFile
     stated: StatedCamera
     overview: bool = False
+
+
+@dataclass(frozen=True)
+class AlbumJob:
+    """Uploaded photograph of an album to read for the encoders, with what tells its overlap with others."""
+
+    content: bytes | UploadedFile
+    stated: StatedCamera
 
 
 @dataclass(frozen=True)
@@ -83,8 +92,8 @@ class DecodeRefusal:
     is_film: bool = False
 
 
-Job = DecodeJob | FilmJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | Film | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
+Job = DecodeJob | AlbumJob | FilmJob | TurnJob | ShowJob | RasteriseJob
+Result = Photograph | tuple[Photograph, Taken] | Film | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -114,15 +123,17 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
         try:
             if isinstance(job, FilmJob):
                 return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
-            if isinstance(job, DecodeJob):
-                return open_photograph(
+            if isinstance(job, DecodeJob | AlbumJob):
+                is_of_album = isinstance(job, AlbumJob)
+                photograph = open_photograph(
                     job.content,
                     sphere_size=sizes.sphere,
                     stated=job.stated,
                     patch_size=sizes.patch,
                     limits=limits,
-                    overview=job.overview,
+                    overview=is_of_album or job.overview,
                 )
+                return (photograph, read_taken(job.content, limits)) if is_of_album else photograph
             return _shown(job, job.content, limits)
         except (InvalidPhotographError, InvalidFilmError) as error:
             return DecodeRefusal(str(error), isinstance(error, InvalidFilmError))

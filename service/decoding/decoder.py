@@ -18,10 +18,12 @@ from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
+from lalaloc_core.photograph.taken import Taken
 from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView
 from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
+    AlbumJob,
     DecodeJob,
     DecodeRefusal,
     DecodeSizes,
@@ -122,6 +124,18 @@ class Decoder:
             return content
         result = await self._run_job(DecodeJob(content, stated, overview), deadline, client)
         assert isinstance(result, Photograph)
+        return result
+
+    async def decode_for_album(
+        self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str = ""
+    ) -> tuple[Photograph, Taken]:
+        """Decode an uploaded photograph of an album, with its overview; return when and by which camera it was taken.
+
+        Raises:
+            LaLaLocError: as `decode`.
+        """
+        result = await self._run_job(AlbumJob(content, stated), deadline, client)
+        assert isinstance(result, tuple)
         return result
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:

@@ -86,6 +86,7 @@ class Sweeper:
                     self._store.idempotency_keys.purge()
                     self._store.answers.purge(kept_s=self._keep_answers_s)
                     self._store.sessions.purge()
+                    self._store.albums.purge()
                     self._store.audit_log.purge()
                     self._store.quota.recount()
             except StoreUnavailableError:

@@ -8,5 +8,5 @@ Routes check form fields with `fields.py`, handle headers and cursors with `acce
 `api_description.py` describes the app.
 """
 
-from service.http.events import PlanEvents
+from service.http.events import ProgressEvents
 from service.http.idempotent_request import IdempotentRequest

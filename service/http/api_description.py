@@ -12,6 +12,7 @@ from service.capacity import admission_control as admission
 from service.http.problems import add_problems
 from service.schemas import EarthPoint, SessionDocument
 from service.schemas.admin import KeyDocument, RotationDocument, TenantLimitsDocument
+from service.schemas.albums import AlbumDocument, AlbumEvent, PhotographChangeDocument
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.oscp import OscpRequest
 from service.schemas.photographs import StatedIntrinsics
@@ -31,6 +32,9 @@ _SERVERS = [
 ]
 # Models that only hand-written parts of the description use.
 _BY_HAND = (
+    AlbumDocument,
+    AlbumEvent,
+    PhotographChangeDocument,
     EarthPoint,
     FloorPlanDocument,
     KeyDocument,

@@ -22,6 +22,11 @@ from service.errors import DeadlineExceededError, OverloadedError
 from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
 from service.query import (
+    SOLVE_S,
+    AlbumEntry,
+    AlbumOutcome,
+    AlbumPhotographQuery,
+    AlbumQuery,
     Nearby,
     PhotographQuery,
     PictureRequest,
@@ -31,7 +36,8 @@ from service.query import (
     TrackQuery,
     Where,
 )
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
+from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
+from service.schemas.query_fields import HeightFields
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
@@ -166,7 +172,15 @@ class RemoteLocaliser:
         """See `Localiser.track`."""
         return await self._call("track", where, query.context, query)
 
-    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None:
+    async def album_entry(self, where: PlanRecord | VenueRecord, query: AlbumPhotographQuery) -> AlbumEntry:
+        """See `Localiser.album_entry`."""
+        return await self._call("album_entry", where, query.context, query)
+
+    async def solve_album(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
+        """See `Localiser.solve_album`."""
+        return await self._call("solve_album", where, query.context.with_time(SOLVE_S), query)
+
+    async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """See `Localiser.check`."""
         context = QueryContext.starting(where.tenant, self._settings.requests.request_deadline_s)
         await self._call("check", where, context, form)

@@ -1,12 +1,12 @@
 """Queries: from a decoded request to the answer, in a plan or in plans of a venue.
 
 Begin with `single_query.py`, whose `_search` shows the flow: photograph, ground, steps, answer. `sequence_query.py`
-does the same for several photographs and `session_query.py` for the next photograph of a session; `localiser.py` calls
-the three. `photograph_reader.py` decodes and encodes photographs, those of one place as a spot (`spots.py`).
-`grounds.py` waits for the plan or venue of a query and returns its `ground.py`. `executor.py` runs the steps,
-`lpo_pool.py` the refinement in worker processes, and `answers.py` composes the answer. `stated_pose.py` reads the
-fields about the camera, `geopose.py` and `oscp.py` translate answers. `queries.py` has the queries, `backends.py` the
-interfaces of what can run elsewhere.
+does the same for several photographs and `session_query.py` for the next photograph of a session, `album_search.py` for
+albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs, those of one place as a spot
+(`spots.py`). `grounds.py` waits for the plan or venue of a query and returns its `ground.py`. `executor.py` runs the
+steps, `lpo_pool.py` the refinement in worker processes, and `answers.py` composes the answer. `stated_pose.py` reads
+the fields about the camera, `geopose.py` and `oscp.py` translate answers. `queries.py` has the queries, `backends.py`
+the interfaces of what can run elsewhere.
 """
 
 from service.capacity.query_context import QueryContext
@@ -17,6 +17,12 @@ from service.query.localiser import Localiser
 from service.query.lpo_pool import LpoPool
 from service.query.photograph_reader import PhotographReader
 from service.query.queries import (
+    SOLVE_S,
+    AlbumEntry,
+    AlbumOutcome,
+    AlbumPhotographQuery,
+    AlbumProgress,
+    AlbumQuery,
     Content,
     Nearby,
     PhotographQuery,

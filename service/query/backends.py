@@ -8,8 +8,20 @@ from typing import Protocol
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.pools import PoolState
-from service.query.queries import PhotographQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery, Where
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
+from service.query.queries import (
+    AlbumEntry,
+    AlbumOutcome,
+    AlbumPhotographQuery,
+    AlbumQuery,
+    PhotographQuery,
+    PictureRequest,
+    SequenceQuery,
+    TrackOutcome,
+    TrackQuery,
+    Where,
+)
+from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
+from service.schemas.query_fields import HeightFields
 from service.storage.records import PlanRecord, VenueRecord
 
 
@@ -29,7 +41,11 @@ class LocaliserBackend(Protocol):
 
     async def track(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome: ...
 
-    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None: ...
+    async def album_entry(self, where: PlanRecord | VenueRecord, query: AlbumPhotographQuery) -> AlbumEntry: ...
+
+    async def solve_album(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome: ...
+
+    async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None: ...
 
 
 class OptimiserBackend(Protocol):

@@ -24,8 +24,8 @@ from service.query.executor import Executor
 from service.query.ground import Ground
 from service.query.queries import Nearby, Where
 from service.query.stated_pose import stated_height, stated_hints
-from service.schemas import LocaliseForm, SessionDocument
-from service.schemas.query_fields import CameraFields, HintFields
+from service.schemas import SessionDocument
+from service.schemas.query_fields import HeightFields, HintFields
 from service.storage.records import PlanRecord, VenueRecord
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
@@ -61,7 +61,7 @@ class Grounds:
     async def site(
         self,
         where: Where,
-        form: CameraFields,
+        form: HeightFields,
         hinted: HintFields | SessionDocument | None = None,
         *,
         heights_m: Sequence[float | None] = (),
@@ -92,7 +92,7 @@ class Grounds:
         hints = VenueHints(anchor=anchor) if hinted is None else VenueHints.from_form(hinted, anchor)
         return VenueSite(self, where, form, hints, anchor, gap_m, max_poses)
 
-    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None:
+    async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """Check what a request states about a plan or a venue.
 
         Raises:
@@ -102,12 +102,14 @@ class Grounds:
         """
         if isinstance(where, PlanRecord):
             stated_height(form, where)
-            stated_hints(form, where.plan).check(where.plan)
+            if isinstance(form, HintFields | SessionDocument):
+                stated_hints(form, where.plan).check(where.plan)
             return
         members = await self.members(where)
         if not members:
             raise VenueUnsearchableError(where.id, 0)
-        VenueHints.from_form(form, where.anchor).check(members)
+        if isinstance(form, HintFields | SessionDocument):
+            VenueHints.from_form(form, where.anchor).check(members)
 
     async def members(self, where: VenueRecord | Nearby) -> PlanList:
         """Return the current row of every plan of a venue or near a place.
@@ -165,7 +167,7 @@ class PlanSite:
         self,
         grounds: Grounds,
         record: PlanRecord,
-        form: CameraFields,
+        form: HeightFields,
         hinted: HintFields | SessionDocument | None,
         heights_m: Sequence[float | None],
     ) -> None:
@@ -206,7 +208,7 @@ class VenueSite:
         self,
         grounds: Grounds,
         where: VenueRecord | Nearby,
-        form: CameraFields,
+        form: HeightFields,
         hints: VenueHints,
         anchor: Anchor | None,
         gap_m: float,

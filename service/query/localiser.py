@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 from service.capacity.admission_control import Slots
-from service.query.queries import PhotographQuery, PictureRequest, SequenceQuery, TrackOutcome, TrackQuery, Where
+from service.capacity.fair_share import FairSemaphore
+from service.capacity.threads import Threads
+from service.query.album_search import AlbumSearch
+from service.query.queries import (
+    AlbumEntry,
+    AlbumOutcome,
+    AlbumPhotographQuery,
+    AlbumQuery,
+    PhotographQuery,
+    PictureRequest,
+    SequenceQuery,
+    TrackOutcome,
+    TrackQuery,
+    Where,
+)
 from service.query.query_parts import QueryParts
 from service.query.sequence_query import SequenceSearch
 from service.query.session_query import SessionSearch
 from service.query.single_query import SingleSearch
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SessionDocument
+from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
+from service.schemas.query_fields import HeightFields
 from service.storage.records import PlanRecord, VenueRecord
 
 
 class Localiser:
     """Localisation of photographs in stored plans and venues."""
 
-    def __init__(self, parts: QueryParts, queries: Slots) -> None:
+    def __init__(self, parts: QueryParts, queries: Slots, album_threads: Threads, permits: FairSemaphore) -> None:
         self._parts = parts
+        self._albums = AlbumSearch(parts, queries, album_threads, permits)
         self._queries = queries
         self._single, self._sequences, self._sessions = SingleSearch(parts), SequenceSearch(parts), SessionSearch(parts)
 
@@ -71,7 +87,20 @@ class Localiser:
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._sessions.answer(where, query)
 
-    async def check(self, where: PlanRecord | VenueRecord, form: LocaliseForm | SessionDocument) -> None:
+    async def album_entry(self, where: PlanRecord | VenueRecord, query: AlbumPhotographQuery) -> AlbumEntry:
+        """Return what an album in a plan or venue keeps of a photograph; raises the errors of decoding."""
+        async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
+            return await self._albums.entry(query)
+
+    async def solve_album(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
+        """Pin the photographs of an album; it holds a slot until its plans are loaded.
+
+        Raises:
+            LaLaLocError: see `localise`.
+        """
+        return await self._albums.solve(where, query)
+
+    async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """Check what a request states about a plan or a venue.
 
         Raises:
@@ -83,4 +112,5 @@ class Localiser:
 
     def close(self) -> None:
         """Wait for the computations in progress, and stop the threads."""
+        self._albums.close()
         self._parts.executor.close()

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.photograph import Photograph
 from service.capacity.query_context import QueryContext
 from service.schemas import EarthPoint, LocaliseForm, PhotographForm, SequenceForm, SessionDocument, StoredPose
+from service.schemas.albums import AlbumDocument
+from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord
 from service.uploaded_file import UploadedFile
 
+# Timeout (s) of the solve of an album, after its plans are loaded.
+SOLVE_S = 900.0
 # Photograph of a query: a file, or a photograph that was encoded on its device (`localise.encode.features`).
 Content = bytes | UploadedFile | Photograph
 
@@ -94,6 +98,66 @@ class TrackOutcome:
 
     state: bytes
     stored: StoredPose
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlbumPhotographQuery:
+    """Photograph that is added to an album.
+
+    Attributes:
+        document: the request that created the album.
+        content: the uploaded picture file, or what was read of its features.
+        sha256: digest of the uploaded file.
+        context: client, deadline and clock.
+    """
+
+    document: AlbumDocument
+    content: Content
+    sha256: str
+    context: QueryContext
+
+
+@dataclass(frozen=True)
+class AlbumEntry:
+    """What an album keeps of a photograph: its features, and size, time and camera as JSON."""
+
+    entry: bytes
+    facts: str
+
+
+@dataclass(eq=False)
+class AlbumProgress:
+    """Progress of a solve, 0 to 1, which the caller can stop; between processes it is not shared."""
+
+    share: float = 0.0
+    stopped: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlbumQuery:
+    """Album that is solved.
+
+    Attributes:
+        album_id: id of the album.
+        document: the request that created it.
+        photographs: its photographs, with corrections and earlier pins.
+        context: client, deadline of the preparation, and clock.
+        progress: progress of the solve.
+    """
+
+    album_id: str
+    document: AlbumDocument
+    photographs: Sequence[AlbumPart]
+    context: QueryContext
+    progress: AlbumProgress
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlbumOutcome:
+    """Solution of an album: the common part and the pin of each photograph, by id, as JSON."""
+
+    solution: str
+    pins: Mapping[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)

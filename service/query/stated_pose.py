@@ -9,11 +9,11 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Hints, Near, rooms_named, stated_pose
 from service.grids import check_height_m
 from service.schemas import SequenceForm, SessionDocument
-from service.schemas.query_fields import CameraFields, EarthPoint, HintFields, PlanPoint
+from service.schemas.query_fields import EarthPoint, HeightFields, HintFields, PlanPoint
 from service.storage.records import PlanRecord
 
 
-def stated_height(form: CameraFields, record: PlanRecord) -> CameraHeight:
+def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:
     """Return the camera height in the request, else the plan's, else an unknown one.
 
     Raises:

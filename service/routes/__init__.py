@@ -6,6 +6,8 @@ caller and look-ups; `descriptions.py` has the errors, headers and bodies that t
 
 from service.routes import (
     admin,
+    album_photographs,
+    albums,
     floorplans,
     kept_answers,
     localise,
@@ -33,6 +35,8 @@ ROUTERS = tuple(
         localise_sequence,
         sessions,
         session_stream,
+        albums,
+        album_photographs,
         oscp,
         model_files,
         kept_answers,

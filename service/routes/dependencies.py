@@ -20,6 +20,7 @@ from service.runtime import Runtime, get_runtime
 from service.security import caller_of
 from service.settings import Settings
 from service.storage import Store
+from service.storage.album_rows import AlbumRecord
 from service.storage.records import Cursor, PlanRecord, PlanSummary, VenueRecord
 from service.stored_plan import Rendition, RenditionKind
 from service.telemetry import add_log_fields
@@ -152,13 +153,13 @@ class ApiCall:
             raise UnknownVenueError(venue_id)
         return record
 
-    def expected_revision(self, stored: PlanSummary | VenueRecord) -> str | None:
+    def expected_revision(self, stored: PlanSummary | VenueRecord | AlbumRecord) -> str | None:
         """Return the revision that a change needs, by the request's preconditions; see `expected_revision`.
 
         Raises:
-            RevisionMismatchError: the plan or venue has another one.
+            RevisionMismatchError: it has another one.
         """
-        what = "venue" if isinstance(stored, VenueRecord) else "floor plan"
+        what = {VenueRecord: "venue", AlbumRecord: "album"}.get(type(stored), "floor plan")
         return expected_revision(self.request, stored.id, stored.revision_id, what=what)
 
     async def place(self, floorplan_id: str | None, venue_id: str | None) -> PlanRecord | VenueRecord:

@@ -45,6 +45,12 @@ def index(request: Request) -> Response:
     return _file(request, "index.html")
 
 
+@router.get("/pin")
+def pin(request: Request) -> Response:
+    """Return the page that pins a folder of photographs."""
+    return _file(request, "pin.html")
+
+
 @router.get("/docs")
 def docs(request: Request) -> Response:
     """Return the API documentation."""

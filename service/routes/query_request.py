@@ -40,6 +40,7 @@ PHOTO, FEATURES, FILM = "photo", "features", "film"
 PANORAMA = "panorama"
 VARY = {"Vary": "Accept"}
 Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
+AnyForm = TypeVar("AnyForm", bound=BaseModel)
 Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 
 
@@ -82,7 +83,23 @@ async def read_query(
     repeated: Mapping[str, Repeats] | None = None,
     film: bool = False,
 ) -> tuple[Form, Parts, QueryContext]:
-    """Read the form of a query and start the clock of its deadline.
+    """Read the form of a query as `read_files` does, with at most as many candidates as the settings allow."""
+    form, parts, context = await read_files(call, form_type, limit, files=files, repeated=repeated, film=film)
+    if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
+        form = form.model_copy(update={"top_k": min(form.top_k, call.settings.photographs.max_top_k)})
+    return form, parts, context
+
+
+async def read_files(
+    call: ApiCall,
+    form_type: type[AnyForm],
+    limit: Settable,
+    *,
+    files: Collection[str] = (),
+    repeated: Mapping[str, Repeats] | None = None,
+    film: bool = False,
+) -> tuple[AnyForm, Parts, QueryContext]:
+    """Read a form with photographs and start the clock of its deadline.
 
     Args:
         call: the request.
@@ -129,10 +146,7 @@ async def read_query(
     if settings.photographs.require_features and (parts.named(PHOTO) or parts.named(FILM)):
         raise errors.FeaturesRequiredError
     context = QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
-    form = validate_fields(form_type, parts.fields, bounds)
-    if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
-        form = form.model_copy(update={"top_k": min(form.top_k, settings.photographs.max_top_k)})
-    return form, parts, context
+    return validate_fields(form_type, parts.fields, bounds), parts, context
 
 
 def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[Content]:

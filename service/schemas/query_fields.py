@@ -15,8 +15,8 @@ from service.schemas.fields import Finite
 from service.schemas.form_validators import parse_json, reject_underscores
 
 
-class CameraFields(BaseModel):
-    """Form fields for the camera height and the number of candidates."""
+class HeightFields(BaseModel):
+    """Form fields for the camera height."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -33,6 +33,12 @@ class CameraFields(BaseModel):
         description="Standard deviation of the camera height, whose exact value is then solved for. 0: the height is "
         f"exact. Default: the plan's, else {DEFAULT_STD_M:g}.",
     )
+    _check_heights = field_validator("camera_height_m", "camera_height_std_m", mode="before")(reject_underscores)
+
+
+class CameraFields(HeightFields):
+    """Form fields for the camera height and the number of candidates."""
+
     top_k: int = Field(
         5,
         ge=1,
@@ -40,9 +46,7 @@ class CameraFields(BaseModel):
         json_schema_extra={"maximum": 100},
     )
 
-    _check_camera_numbers = field_validator("camera_height_m", "camera_height_std_m", "top_k", mode="before")(
-        reject_underscores
-    )
+    _check_count = field_validator("top_k", mode="before")(reject_underscores)
 
     @field_validator("top_k")
     @classmethod

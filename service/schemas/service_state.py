@@ -42,6 +42,8 @@ class LimitsAnswer(ResponseModel):
     max_film_pixels: int = Field(description="Pixels of a film: width times height.")
     max_film_cpu_s: float = Field(description="CPU time limit for decoding a film.")
     max_batch_photographs: int = Field(description="Photographs of a batch.")
+    max_albums: int = Field(description="Albums per tenant.")
+    max_album_photographs: int = Field(description="Photographs of an album.")
     max_pixels: int = Field(description="Pixels of a photograph.")
     require_features: bool = Field(description="Photographs are refused; queries need features.")
     max_scans: int = Field(description="Scans of a progressive JPEG.")
@@ -72,6 +74,7 @@ class StoredBytesByKind(ResponseModel):
     venues: int = Field(description="Venues.")
     answers: int = Field(description="Kept answers.")
     sessions: int = Field(description="Sessions of tracked cameras.")
+    albums: int = Field(description="Albums, with the features and pins of their photographs.")
     idempotency: int = Field(description="Idempotency keys and their answers.")
 
 

@@ -34,7 +34,7 @@ class Permission(StrEnum):
 # Open to everyone, so that monitoring needs no key.
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 # Pages, open without a key; they ask for one themselves.
-PAGES = frozenset({"/", "/docs", "/web/{name}", "/favicon.ico"})
+PAGES = frozenset({"/", "/pin", "/docs", "/web/{name}", "/favicon.ico"})
 
 # Scopes of all other routes. With keys on, a route without a row does not exist.
 NEEDED: Mapping[tuple[str, str], Permission] = {
@@ -73,6 +73,16 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/sessions/{session_id}"): Permission.LOCALISE,
     ("DELETE", "/sessions/{session_id}"): Permission.LOCALISE,
     ("POST", "/sessions/{session_id}/photographs"): Permission.LOCALISE,
+    ("GET", "/albums"): Permission.LOCALISE,
+    ("POST", "/albums"): Permission.LOCALISE,
+    ("GET", "/albums/{album_id}"): Permission.LOCALISE,
+    ("DELETE", "/albums/{album_id}"): Permission.LOCALISE,
+    ("GET", "/albums/{album_id}/events"): Permission.LOCALISE,
+    ("GET", "/albums/{album_id}/photographs"): Permission.LOCALISE,
+    ("POST", "/albums/{album_id}/photographs"): Permission.LOCALISE,
+    ("GET", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
+    ("PATCH", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
+    ("DELETE", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
     ("GET", "/admin/keys"): Permission.ADMIN,
     ("POST", "/admin/keys"): Permission.ADMIN,
     ("GET", "/admin/keys/{key_id}"): Permission.ADMIN,

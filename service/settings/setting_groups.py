@@ -321,7 +321,7 @@ class StorageSettings(SettingGroup):
     max_stored_bytes: Count | None = Field(
         default=None,
         description="Stored bytes per tenant: floor plans with their revisions and files, pose grids, venues, kept "
-        "answers, sessions, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. "
+        "answers, sessions, albums, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. "
         "Default: 10 GiB, with SQLite at most half of its volume.",
     )
     max_idempotency_bytes: int = Field(
@@ -364,6 +364,13 @@ class StorageSettings(SettingGroup):
     )
     max_sessions: Count = Field(
         default=1000, description="Sessions of tracked cameras per tenant; further ones get 507."
+    )
+    album_ttl_s: float = Field(
+        default=90 * 86400.0, ge=1.0, le=3660 * 86400.0, description="Lifetime of an album after its last change."
+    )
+    max_albums: Count = Field(default=1000, description="Albums per tenant; further ones get 507.")
+    max_album_photographs: int = Field(
+        default=500, ge=1, le=500, description="Photographs of an album; further ones get 507."
     )
     audit_keep_s: float = Field(
         default=365 * 86400.0, ge=86400.0, le=3660 * 86400.0, description="Lifetime of entries of the audit log."

@@ -10,6 +10,8 @@
     venues           id, tenant, name, revision, anchor, created_at, updated_at
     └── venue_plans      floor plan, level, name
     sessions         plan or venue, state of the tracked camera, photographs, claim, expires_at
+    albums           plan or venue, revision, model, expires_at, state and lease of the solution
+    └── album_photographs    digest, features, correction, pin
     tenants          limits of each tenant
     api_keys         tenant, name, hash, scopes, rate, created_at, expires_at, revoked_at, last_used_at, key it replaces
     audit_log        actor, tenant, address, action, resource, status, result, count, created_at

@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, tru
 from lalaloc_core.floorplan import FloorPlan
 from service.capacity.single_flight import SingleFlight
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.storage.album_rows import delete_albums
 from service.storage.database import Database
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_rows import (
@@ -25,7 +26,7 @@ from service.storage.plan_rows import (
 from service.storage.records import Cursor, NewPlan, PlanRecord, PlanSummary
 from service.storage.statements import damaged, lock_plan_of, newest_first, select_revisions, select_summaries
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
+from service.storage.tables import ALBUMS, FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
 from service.stored_plan import PlanDocument, StoredPlan
 
@@ -249,7 +250,7 @@ class Plans:
         return self._summaries(select_summaries().where(FLOORPLANS.c.id.in_(plan_ids)))
 
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
-        """Delete a plan with its revisions, files and grids, and remove it from its venues.
+        """Delete a plan with its revisions, files, grids, sessions and albums, and remove it from its venues.
 
         Args:
             tenant: owner of the plan.
@@ -300,8 +301,13 @@ class Plans:
         members = remove_from_venues(connection, plan_id)
         answers = deleted_bytes(connection, delete(KEPT_ANSWERS).where(KEPT_ANSWERS.c.plan_id == plan_id))
         sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.plan_id == plan_id))
+        albums = delete_albums(connection, ALBUMS.c.plan_id == plan_id)
         freed = replace(
-            _delete_revisions(connection, own), venues=ROW_BYTES * members, answers=answers, sessions=sessions
+            _delete_revisions(connection, own),
+            venues=ROW_BYTES * members,
+            answers=answers,
+            sessions=sessions,
+            albums=albums,
         )
         connection.execute(delete(FLOORPLANS).where(*mine))
         self._quota.settle(connection, tenant, StoredBytes() - freed)

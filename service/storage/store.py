@@ -17,6 +17,8 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
 from service.settings import Settings
+from service.storage.album_jobs import AlbumJobs
+from service.storage.albums import Albums
 from service.storage.api_keys import ApiKeys
 from service.storage.audit_log import AuditLog
 from service.storage.database import Database, State
@@ -61,6 +63,8 @@ class Store:
         audit_log: actions of callers and operators.
         answers: kept answers.
         sessions: sessions of tracked cameras.
+        albums: albums.
+        album_jobs: leases on the solution of albums.
         quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
         tenant_limits: the same limits in memory.
@@ -117,6 +121,8 @@ class Store:
         self.audit_log = AuditLog(database, keep_s=audit_keep_s, max_entries=max_audit_entries)
         self.answers = KeptAnswers(database, self.quota)
         self.sessions = Sessions(database, self.quota, claim_s)
+        self.albums = Albums(database, self.quota)
+        self.album_jobs = AlbumJobs(database)
         self.tenants = Tenants(database)
         self.tenant_limits = TenantLimits(self.tenants)
 

@@ -15,6 +15,8 @@ from sqlalchemy import ColumnElement, Connection, Delete, Row, Table, delete, fu
 from service.errors import StorageQuotaError
 from service.storage.database import Database
 from service.storage.tables import (
+    ALBUM_PHOTOGRAPHS,
+    ALBUMS,
     FLOORPLANS,
     IDEMPOTENCY,
     KEPT_ANSWERS,
@@ -40,6 +42,7 @@ class StoredBytes:
         venues: venues and the rows of their plans.
         answers: kept answers.
         sessions: sessions of tracked cameras.
+        albums: albums and their photographs.
         idempotency: idempotency keys and their answers.
     """
 
@@ -48,6 +51,7 @@ class StoredBytes:
     venues: int = 0
     answers: int = 0
     sessions: int = 0
+    albums: int = 0
     idempotency: int = 0
 
     @property
@@ -174,7 +178,7 @@ class StorageQuota:
 
     def recount(self) -> None:
         """Count everything again: earlier versions of the service, running beside, change the tables uncounted."""
-        tables = (FLOORPLANS, VENUES, KEPT_ANSWERS, SESSIONS, IDEMPOTENCY, TENANTS)
+        tables = (FLOORPLANS, VENUES, KEPT_ANSWERS, SESSIONS, ALBUMS, IDEMPOTENCY, TENANTS)
         with self._database.reading() as connection:
             tenants = {name for table in tables for name in connection.scalars(select(table.c.tenant).distinct())}
         for tenant in sorted(tenants):
@@ -210,6 +214,7 @@ def _count(connection: Connection, tenant: str) -> StoredBytes:
     """Return the sums of the rows of a tenant."""
     own_plans = FLOORPLANS.join(REVISIONS, REVISIONS.c.plan_id == FLOORPLANS.c.id)
     own_grids = own_plans.join(LATENT_GRIDS, LATENT_GRIDS.c.revision_id == REVISIONS.c.id)
+    own_photographs = ALBUMS.join(ALBUM_PHOTOGRAPHS, ALBUM_PHOTOGRAPHS.c.album_id == ALBUMS.c.id)
     own_members = VENUES.join(VENUE_PLANS, VENUE_PLANS.c.venue_id == VENUES.c.id)
 
     def total(summed: Any, source: Any, owner: Any) -> int:
@@ -224,5 +229,7 @@ def _count(connection: Connection, tenant: str) -> StoredBytes:
         venues=ROW_BYTES * venue_rows,
         answers=total(func.sum(KEPT_ANSWERS.c.stored_bytes), KEPT_ANSWERS, KEPT_ANSWERS.c.tenant),
         sessions=total(func.sum(SESSIONS.c.stored_bytes), SESSIONS, SESSIONS.c.tenant),
+        albums=total(func.sum(ALBUMS.c.stored_bytes), ALBUMS, ALBUMS.c.tenant)
+        + total(func.sum(ALBUM_PHOTOGRAPHS.c.stored_bytes), own_photographs, ALBUMS.c.tenant),
         idempotency=total(func.sum(IDEMPOTENCY.c.stored_bytes), IDEMPOTENCY, IDEMPOTENCY.c.tenant),
     )

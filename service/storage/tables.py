@@ -200,7 +200,7 @@ TENANTS = Table(
     # Counters of stored bytes by kind, see `stored_bytes.py`.
     *(
         Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
-        for kind in ("plans", "grids", "venues", "answers", "sessions", "idempotency")
+        for kind in ("plans", "grids", "venues", "answers", "sessions", "albums", "idempotency")
     ),
     # Number of changes of plans, grids and venues, and the stored bytes that these changes added. Earlier versions of
     # the service, running beside, count their bytes alone.
@@ -291,6 +291,75 @@ SESSIONS = Table(
     Index("sessions_by_age", "expires_at"),
     Index("sessions_by_plan", "plan_id"),
     Index("sessions_by_venue", "venue_id"),
+)
+
+ALBUMS = Table(
+    "albums",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("name", Text, nullable=False),
+    # As in `floorplans`.
+    Column("folded_name", Text, nullable=False),
+    # Either a plan or a venue.
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
+    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
+    # The request that created the album, as JSON.
+    Column("options", Text, nullable=False),
+    # The model that encoded its photographs.
+    Column("model_sha256", String(64), nullable=False),
+    # Revision, which changes with the photographs and their corrections.
+    Column("revision_id", String(32), nullable=False),
+    Column("number", Integer, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
+    Column("expires_at", UtcDateTime, nullable=False),
+    Column("photographs", Integer, nullable=False),
+    # State that was solved last: number of the album's revision (0: none), revision of the plan or venue, and the
+    # highest number of a change of the venue's plans (`floorplans.changed`).
+    Column("solved_number", Integer, nullable=False),
+    Column("place_revision_id", String(32)),
+    Column("place_change", BigInteger, nullable=False),
+    # Common part of the solution as JSON, or the reason why there is none.
+    Column("solution", Text),
+    Column("failure", Text),
+    # Lease of the replica that solves it: seconds since 1970 by `Database.now_s`, 0 without one.
+    Column("owner", String(32), nullable=False),
+    Column("lease_until_s", Double, nullable=False),
+    Column("lease_s", Double),
+    Column("progress", Double, nullable=False),
+    # Number of attempts since it was last solved or changed.
+    Column("attempts", Integer, nullable=False),
+    _stored_bytes(),
+    Index("albums_by_tenant_and_age", "tenant", "created_at", "id"),
+    Index("albums_by_age", "expires_at"),
+    Index("albums_by_plan", "plan_id"),
+    Index("albums_by_venue", "venue_id"),
+)
+
+ALBUM_PHOTOGRAPHS = Table(
+    "album_photographs",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("album_id", String(32), ForeignKey("albums.id", ondelete="CASCADE"), nullable=False),
+    # Position in the album, in the order of uploads.
+    Column("number", Integer, nullable=False),
+    # Digest of the picture's file, or of its features.
+    Column("sha256", String(64), nullable=False),
+    # Revision, which changes with the correction.
+    Column("revision_id", String(32), nullable=False),
+    Column("name", Text),
+    Column("created_at", UtcDateTime, nullable=False),
+    # Size, time and camera as JSON.
+    Column("facts", Text, nullable=False),
+    # Features; pictures are not stored.
+    Column("entry", LargeBinary, nullable=False),
+    # JSON.
+    Column("correction", Text),
+    Column("pin", Text),
+    _stored_bytes(),
+    UniqueConstraint("album_id", "sha256", name="photographs_of_album"),
+    Index("album_photographs_by_number", "album_id", "number"),
 )
 
 IDEMPOTENCY = Table(

@@ -16,12 +16,13 @@ from sqlalchemy import Connection, FromClause, Row, and_, case, delete, distinct
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, UnknownVenueError
+from service.storage.album_rows import delete_albums
 from service.storage.database import Database
 from service.storage.plan_places import lies_in_box
 from service.storage.records import Cursor, VenueCounts, VenueMember, VenuePlace, VenueRecord, VenueState
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES
+from service.storage.tables import ALBUMS, FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES
 from service.storage.venue_rows import (
     check_count,
     check_members,
@@ -282,7 +283,7 @@ class Venues:
             return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
 
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
-        """Delete a venue with its sessions, but none of its plans; False without one.
+        """Delete a venue with its sessions and albums, but none of its plans; False without one.
 
         Raises:
             RevisionMismatchError: the venue has another revision than `expected`.
@@ -295,8 +296,10 @@ class Venues:
                 return False
             rows = 1 + count_members(connection, venue_id)
             sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.venue_id == venue_id))
+            albums = delete_albums(connection, ALBUMS.c.venue_id == venue_id)
             connection.execute(delete(VENUES).where(VENUES.c.id == venue_id))
-            self._quota.settle(connection, tenant, StoredBytes(venues=-ROW_BYTES * rows, sessions=-sessions))
+            freed = StoredBytes(venues=ROW_BYTES * rows, sessions=sessions, albums=albums)
+            self._quota.settle(connection, tenant, StoredBytes() - freed)
             return True
 
         return self._database.freeing(work)

@@ -89,6 +89,9 @@ class Telemetry:
         self.grid_seconds = self._histogram(
             "lalaloc_grid_seconds", "Duration of the computation of a pose grid.", buckets=_GRID_SECONDS
         )
+        self.album_seconds = self._histogram(
+            "lalaloc_album_seconds", "Duration of the solution of an album.", buckets=_GRID_SECONDS
+        )
 
     def observe_answer(self, timings_ms: Mapping[str, float], stage: str) -> None:
         """Count an answer that ends at a stage, with the durations (ms) of all stages."""

@@ -21,7 +21,7 @@ from service.capacity.bounded_cache import BoundedCache
 from service.capacity.threads import BoundedReads, IdleCores
 from service.grids import GridProvider
 from service.schemas import EarthPoint
-from service.schemas.query_fields import CameraFields
+from service.schemas.query_fields import HeightFields
 from service.storage import Store
 from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord, VenueCounts, VenueState
@@ -216,7 +216,7 @@ def possible_plans(ready: PlanList, log_prior: Float[np.ndarray, "p"]) -> PlanLi
     return ready.chosen(possible)
 
 
-def venue_height(form: CameraFields, ready: PlanList) -> CameraHeight:
+def venue_height(form: HeightFields, ready: PlanList) -> CameraHeight:
     """Return the camera height in the request, else the one that all plans of a venue share, else an unknown one."""
     if form.camera_height_m is not None:
         std_m = DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m

@@ -21,7 +21,7 @@ from service.capacity.admission_control import Slots
 from service.capacity.query_context import QueryContext
 from service.errors import VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
-from service.schemas.query_fields import CameraFields
+from service.schemas.query_fields import HeightFields
 from service.storage.records import PlanRecord
 from service.venues.plan_indices import IndexSource
 from service.venues.plan_list import PlanList
@@ -109,7 +109,7 @@ class VenueSearch:
         ready: PlanList,
         queries: Sequence[Query],
         *,
-        form: CameraFields,
+        form: HeightFields,
         hints: VenueHints,
         warnings: list[str],
         context: QueryContext,
@@ -178,7 +178,7 @@ class VenueSearch:
         )
 
 
-def _height_is_possible(record: PlanRecord, form: CameraFields) -> bool:
+def _height_is_possible(record: PlanRecord, form: HeightFields) -> bool:
     if form.camera_height_m is None:
         return True
     try:

@@ -7,6 +7,7 @@ import itertools
 import json
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -17,7 +18,8 @@ import pytest
 from service import runtime
 from service.app import create_app
 from service.grids import builder
-from service.http.events import PlanEvents
+from service.http.events import PLAN_ENDS, ProgressEvents, plan_look
+from service.schemas.stored_plans import PlanEvent
 from service.settings import Settings
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, serve, upload, wait_for
@@ -170,8 +172,14 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
             return True
 
         async def read() -> list[bytes]:
-            events = PlanEvents(
-                runtime.store, runtime.grids, runtime.admission, runtime.reads, max_s=0.5, heartbeat_s=0.05
+            events = ProgressEvents(
+                partial(plan_look, runtime.store, runtime.grids),
+                PlanEvent(status="deleted"),
+                PLAN_ENDS,
+                runtime.admission,
+                runtime.reads,
+                max_s=0.5,
+                heartbeat_s=0.05,
             )
             return [chunk async for chunk in events.stream(plan_id, authorised)]
 

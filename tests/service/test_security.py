@@ -208,7 +208,10 @@ def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: s
 def test_key_with_only_the_scope_is_accepted(guarded: Guarded, method: str, path: str) -> None:
     plan_id = guarded.send("POST", "/floorplans", guarded.key).json()["id"]
     key = make_key(guarded.store, scopes=(NEEDED[method, path],))
-    if path.endswith("/events"):
+    if path.startswith("/albums/") or (method, path) == ("POST", "/albums"):
+        # The test's model gives no features, so that there is no album; test_albums.py reads and changes some.
+        assert guarded.send(method, path, key, plan_id).status_code not in (401, 403)
+    elif path.endswith("/events"):
         with guarded.client.stream(method, path.replace(f"{{{PLAN}}}", plan_id), headers=bearer(key)) as response:
             assert response.status_code == 200
     else:

@@ -17,6 +17,7 @@ from sqlalchemy import func, select
 from lalaloc_core.floorplan import FloorPlan
 from service.cli.entry_point import main
 from service.errors import StorageQuotaError
+from service.storage.album_rows import NewAlbum, NewPhotograph
 from service.storage.records import (
     Claimed,
     ComputedGrid,
@@ -137,6 +138,14 @@ def test_stored_bytes_follow_every_change(store: Store) -> None:
     _keep_answer(store, "a", "k", 1000)
     _recounted(store, "a")
     used = store.quota.account("a").used
+    album = NewAlbum(name="a", plan_id="q" * 32, venue_id=None, options="{}", model_sha256="m1")
+    store.albums.add("a", "c" * 32, album, ttl_s=60.0, limit=9)
+    photograph = NewPhotograph(sha256="0" * 64, name="p.jpg", facts="{}", entry=bytes(1000))
+    for _ in range(2):
+        store.albums.add_photograph("a", "c" * 32, photograph, ttl_s=60.0, limit=9)
+    _recounted(store, "a")
+    used = store.quota.account("a").used
+    assert 1000 < used.albums < 10_000
     # No session was begun.
     assert {kind for kind, size in vars(used).items() if size == 0} == {"sessions"}
     assert store.answers.delete("a", kept[-1] or "")

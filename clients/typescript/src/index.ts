@@ -123,6 +123,37 @@ export class Client {
   /** Send the next photograph of a session, with the motion since the one before. */
   addPhotograph = (id: string, fields: Fields<"addPhotograph">, photo: Picture, options: CallOptions = {}) =>
     this.json<Schemas["SessionAnswer"]>(of("sessions", id, "/photographs"), { ...options, ...query(fields, photo) });
+  albums = (name = "", cursor: string | null = null) =>
+    this.json<Schemas["AlbumList"]>(`/albums?${page(name, cursor)}`);
+  /** Create an album, whose photographs are pinned together. */
+  createAlbum = (album: Schemas["AlbumDocument"]) => this.json<Schemas["AlbumAnswer"]>("/albums", json("POST", album));
+  album = (id: string) => this.json<Schemas["AlbumAnswer"]>(of("albums", id));
+  deleteAlbum = (id: string) => this.delete(of("albums", id));
+  /** Add photographs to an album; yield a line for each, in order, as they are stored. The same picture is stored once. */
+  async *addToAlbum(id: string, photos: Picture[], options: CallOptions = {}): AsyncGenerator<Schemas["AlbumLine"]> {
+    const init = { timeoutMs: 0, ...options, onProgress: undefined, ...query({}, ...photos) };
+    for await (const line of linesOf(await this.request(of("albums", id, "/photographs"), init)))
+      yield JSON.parse(line);
+  }
+  /** Return the photographs of an album with their pins, at most 500. */
+  albumPhotographs = (id: string) =>
+    this.json<Schemas["AlbumPhotographList"]>(of("albums", id, "/photographs?limit=500"));
+  /** Return the pins of an album as a file; a drawing of a venue needs a plan. */
+  albumFile = async (id: string, media: "application/geo+json" | "text/csv" | "image/svg+xml", planId?: string) =>
+    (
+      await this.request(
+        of("albums", id, `/photographs${planId ? `?floorplan_id=${encodeURIComponent(planId)}` : ""}`),
+        { headers: { Accept: media } },
+      )
+    ).blob();
+  /** State where a photograph of an album was taken; null undoes it. The rest is then solved again. */
+  correctPhotograph = (id: string, photographId: string, correction: Schemas["CorrectionDocument"] | null) =>
+    this.json<Schemas["AlbumPhotographAnswer"]>(
+      of("albums", id, `/photographs/${encodeURIComponent(photographId)}`),
+      json("PATCH", { correction }),
+    );
+  deleteAlbumPhotograph = (id: string, photographId: string) =>
+    this.delete(of("albums", id, `/photographs/${encodeURIComponent(photographId)}`));
   /** Return a file of the image encoder, with which devices compute features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`. */
   modelFile = async (name: string, options: CallOptions = {}) =>
     (await this.request(of("model", name), options)).arrayBuffer();

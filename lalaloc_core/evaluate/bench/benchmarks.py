@@ -16,6 +16,7 @@ from lalaloc_core.evaluate.bench.accuracy import (
     bench_terms,
     bench_views,
 )
+from lalaloc_core.evaluate.bench.albums import bench_albums
 from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
 from lalaloc_core.evaluate.bench.bounds import bench_bounds
 from lalaloc_core.evaluate.bench.films import bench_films
@@ -27,10 +28,13 @@ from lalaloc_core.evaluate.bench.turns import bench_turns
 from lalaloc_core.evaluate.bench.uninformative import bench_uninformative
 
 
-def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:
+def run_bench(
+    bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None, annotated: Path | None = None
+) -> dict[str, Any]:
     """Measure groups of figures with one bundle.
 
-    `homes` is the number of test homes, and `textures` the folder of textures for the renderer.
+    `homes` is the number of test homes, `textures` the folder of textures for the renderer, and `annotated` one of
+    annotated photographs, for albums.
     """
     bundle = Bundle.open(bundle_folder)
     measure: Mapping[str, Callable[[], dict[str, Any]]] = {
@@ -42,6 +46,7 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "films": lambda: bench_films(bundle, homes, textures),
         "bounds": lambda: bench_bounds(bundle, homes, textures),
         "steps": lambda: bench_steps(bundle, homes, textures),
+        "albums": lambda: bench_albums(bundle, homes, textures, annotated),
         "localisability": lambda: bench_localisability(bundle, homes, textures),
         "uninformative": lambda: bench_uninformative(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),

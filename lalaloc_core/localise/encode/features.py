@@ -12,6 +12,7 @@ import dataclasses
 import json
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,10 +41,11 @@ MAX_BYTES = 2**18
 # Files of a bundle that `FeatureEncoder` reads, those that it has.
 DEVICE_FILES = (MANIFEST_NAME, IMAGE_ONNX, VIEW_ONNX, OBJECTS_ONNX)
 _MAGIC, _VERSION, _PREFIX = b"LLFT", 2, struct.Struct("<4sHI")
+_VERSION_WITHOUT_OBJECTS = 1
 _MAX_HEADER_BYTES, _MAX_PATCHES, _MAX_SIDE = 2**14, 16, 2**16
 _MAX_WARNINGS, _MAX_WARNING_CHARACTERS = 8, 300
 # Camera heights (m) of the rings. The ring is the only output that depends on the height other than by its log.
-_RING_HEIGHTS_M = (0.5, 1.0, 1.5, 2.0, 3.0)
+RING_HEIGHTS_M = (0.5, 1.0, 1.5, 2.0, 3.0)
 # Modes of the distance that the encoder of views predicts at each azimuth.
 _VIEW_MODES = 2
 _WALLS = (*PROFILE_OUTPUTS, SHARE_OUTPUT)
@@ -126,7 +128,7 @@ class FeatureEncoder:
         Raises:
             BundleError: a file is missing or altered, or the model gives no features.
         """
-        if not _gives_features(bundle.manifest):
+        if not gives_features(bundle.manifest):
             raise BundleError(
                 f"model '{bundle.manifest.name}' (architecture '{bundle.manifest.architecture}') gives no features; "
                 "send the photograph instead"
@@ -143,9 +145,9 @@ class FeatureEncoder:
             InvalidPhotographError: the model gives no features of such photographs.
         """
         manifest = self._bundle.manifest
-        if photograph.sphere is not None and _encodes_spheres(manifest):
-            by_height = [self._spheres.outputs(photograph.sphere, height_m) for height_m in _RING_HEIGHTS_M]
-            outputs = by_height[_RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
+        if photograph.sphere is not None and encodes_spheres(manifest):
+            by_height = [self._spheres.outputs(photograph.sphere, height_m) for height_m in RING_HEIGHTS_M]
+            outputs = by_height[RING_HEIGHTS_M.index(1.0)] | {"ring": np.stack([row["ring"] for row in by_height])}
         elif photograph.sphere is None and self._views is not None:
             outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0)
             if self._objects is not None:
@@ -155,10 +157,17 @@ class FeatureEncoder:
                 f"the photograph is {photograph.projection}, of which model '{manifest.name}' gives no features; send "
                 "the photograph itself"
             )
-        text = json.dumps(dataclasses.asdict(_header_of(photograph, self._bundle)), allow_nan=False).encode()
-        shapes = _layout(manifest, len(photograph.patches), _VERSION)
-        arrays = (np.asarray(outputs[name], "<f4").reshape(shape).tobytes() for name, shape in shapes.items())
-        return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + b"".join(arrays)
+        return write_features(photograph, outputs, self._bundle)
+
+
+def write_features(photograph: Photograph, outputs: Mapping[str, np.ndarray], bundle: Bundle) -> bytes:
+    """Return outputs of the image encoders for a photograph as a file; without objects, one of version 1."""
+    text = json.dumps(dataclasses.asdict(_header_of(photograph, bundle)), allow_nan=False).encode()
+    has_objects = bundle.manifest.objects is None or outputs.keys() >= set(OBJECT_OUTPUTS)
+    version = _VERSION if has_objects or photograph.is_sphere else _VERSION_WITHOUT_OBJECTS
+    shapes = _layout(bundle.manifest, len(photograph.patch_azimuths), version)
+    arrays = (np.asarray(outputs[name], "<f4").reshape(shape).tobytes() for name, shape in shapes.items())
+    return _PREFIX.pack(_MAGIC, version, len(text)) + text + b"".join(arrays)
 
 
 def is_features(content: bytes) -> bool:
@@ -166,12 +175,12 @@ def is_features(content: bytes) -> bool:
     return content.startswith(_MAGIC)
 
 
-def _gives_features(manifest: Manifest) -> bool:
+def gives_features(manifest: Manifest) -> bool:
     """Return whether a model gives features of any photographs."""
-    return manifest.view is not None or _encodes_spheres(manifest)
+    return manifest.view is not None or encodes_spheres(manifest)
 
 
-def _encodes_spheres(manifest: Manifest) -> bool:
+def encodes_spheres(manifest: Manifest) -> bool:
     """Return whether the encoder of spheres depends on the camera height as `at_height` presumes."""
     return bool(manifest.ring_sectors and manifest.room_types)
 
@@ -219,7 +228,7 @@ def at_height(features: PhotographFeatures, camera_height_m: float) -> dict[str,
 
 def _ring_at(rings: Float[np.ndarray, "h c s"], camera_height_m: float) -> Float[np.ndarray, "c s"]:
     """Return the ring for a camera height: a polynomial in its log through all rings, constant beyond them."""
-    knots = [math.log(height_m) for height_m in _RING_HEIGHTS_M]
+    knots = [math.log(height_m) for height_m in RING_HEIGHTS_M]
     place = min(max(math.log(camera_height_m), knots[0]), knots[-1])
     weights = [math.prod((place - knot) / (own - knot) for knot in knots if knot != own) for own in knots]
     return np.tensordot(np.array(weights, np.float32), rings, 1)
@@ -232,7 +241,7 @@ def _layout(manifest: Manifest, patches: int, version: int) -> dict[str, tuple[i
         modes = manifest.image_config.get("modes", 1)
         names, shape = (_WALLS[:2], (columns,)) if modes == 1 else (_WALLS, (columns, modes))
         walls = dict.fromkeys(names, shape)
-        ring = (len(_RING_HEIGHTS_M), manifest.layout_config["channels"], manifest.ring_sectors)
+        ring = (len(RING_HEIGHTS_M), manifest.layout_config["channels"], manifest.ring_sectors)
         return {"ring": ring, **walls, **_structure((), columns)}
     assert manifest.view is not None
     columns = manifest.view.sectors * columns // manifest.ring_sectors
@@ -285,7 +294,7 @@ def _header_of(photograph: Photograph, bundle: Bundle) -> _Header:
         pitch=angle(photograph.pitch),
         roll=angle(photograph.roll),
         seen_deg=(math.degrees(photograph.azimuths[0]), math.degrees(photograph.azimuths[1])),
-        patches=[round(patch.azimuth_rad / column) for patch in photograph.patches],
+        patches=[round(azimuth / column) for azimuth in photograph.patch_azimuths],
         compass_deg=None if photograph.compass_heading is None else math.degrees(photograph.compass_heading),
         camera=_camera_model(photograph),
         warnings=[text[:_MAX_WARNING_CHARACTERS] for text in photograph.warnings[:_MAX_WARNINGS]],
@@ -335,7 +344,7 @@ def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
     for name, is_wrong in faults.items():
         if is_wrong:
             raise InvalidFeaturesError(f"{name} of the header is out of range")
-    if manifest.view is None if header.patches else not _encodes_spheres(manifest):
+    if manifest.view is None if header.patches else not encodes_spheres(manifest):
         raise InvalidFeaturesError(f"model '{manifest.name}' gives no features of {header.projection} photographs")
     if not header.patches and header.projection != "equirectangular":
         raise InvalidFeaturesError(f"the projection is '{header.projection}', and there are no patches")

@@ -12,13 +12,13 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.localise.encode.features import at_height
+from lalaloc_core.localise.encode.features import RING_HEIGHTS_M, at_height
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder, seen_objects
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects
-from lalaloc_core.photograph import PatchSize, Photograph
+from lalaloc_core.photograph import PatchSize, Photograph, PhotographFeatures
 
 
 class PhotographEncoder(LayoutEncoder):
@@ -95,6 +95,25 @@ class PhotographEncoder(LayoutEncoder):
         objects = self._seen_objects(turned)
         searched = None if query.searched is None else replace(query.searched, objects=objects)
         return replace(query, objects=objects, searched=searched)
+
+    def with_features(self, photograph: Photograph) -> Photograph:
+        """Return a decoded photograph with its features, as for albums: those of spheres have an empty ring.
+
+        Raises:
+            InvalidPhotographError: the model cannot encode the photograph.
+        """
+        if photograph.features is not None:
+            return photograph
+        self.check(photograph)
+        if photograph.sphere is not None:
+            outputs = self.spheres.outputs(photograph.sphere, 1.0)
+            outputs["ring"] = np.zeros((len(RING_HEIGHTS_M), *outputs["ring"].shape), np.float32)
+            return replace(photograph, features=PhotographFeatures(outputs))
+        assert self._views is not None
+        outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0)
+        if self._objects is not None:
+            outputs |= self._objects.outputs(photograph)
+        return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
 
     def _seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
         """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""

@@ -52,8 +52,8 @@ class WallMode(NamedTuple):
 
 
 def precisions(
-    log_m: Float[np.ndarray, "k w"], log_scale: Float[np.ndarray, "k w"], reach_m: float, tail: float
-) -> Float[np.ndarray, "k w"]:
+    log_m: Float[np.ndarray, "*n"], log_scale: Float[np.ndarray, "*n"], reach_m: float, tail: float
+) -> Float[np.ndarray, "*n"]:
     """Return 1 / (κ s) for every hypothesis and azimuth, the factor of differences of log distance."""
     scale = np.maximum(np.exp(log_scale), _MIN_SCALE)
     return 1.0 / (tail * np.hypot(scale, reach_m * np.exp(-log_m)))

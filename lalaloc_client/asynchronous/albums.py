@@ -1,0 +1,187 @@
+"""Albums of the client for asyncio."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import aclosing
+from time import monotonic
+from typing import Any, Unpack
+
+import httpx
+
+from lalaloc_client.albums import (
+    FORMAT_MEDIA,
+    AddedPhotograph,
+    Album,
+    AlbumFormat,
+    AlbumPage,
+    AlbumPhotograph,
+    AlbumPhotographPage,
+)
+from lalaloc_client.asynchronous.backend import run_blocking, sleep
+from lalaloc_client.asynchronous.transport import AsyncTransport
+from lalaloc_client.errors import AlbumFailedError, ConnectionFailedError, NotReadyError
+from lalaloc_client.parsing import parse
+from lalaloc_client.requests import (
+    NDJSON,
+    Photograph,
+    Request,
+    ViewOptions,
+    json_request,
+    query_request,
+    resource_path,
+    text_values,
+)
+
+_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
+
+
+class AsyncAlbums(AsyncTransport):
+    """Methods about albums: photographs that are pinned together to a plan or venue."""
+
+    async def create_album(
+        self,
+        floorplan_id: str | None = None,
+        *,
+        venue_id: str | None = None,
+        name: str | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        idempotency_key: str | None = None,
+        **options: Unpack[ViewOptions],
+    ) -> Album:
+        """Create an album, whose photographs are pinned together.
+
+        Args:
+            floorplan_id: id of the plan; None with `venue_id`.
+            venue_id: id of a venue instead, with all its plans.
+            name: name of the album.
+            camera_height_m: camera height, as in `QueryOptions`.
+            camera_height_std_m: its standard deviation, as in `QueryOptions`.
+            idempotency_key: as for `upload_floorplan`.
+            **options: camera of all photographs, see `ViewOptions`.
+        """
+        given = {
+            "floorplan_id": floorplan_id,
+            "venue_id": venue_id,
+            "name": name,
+            "camera_height_m": camera_height_m,
+            "camera_height_std_m": camera_height_std_m,
+            **options,
+        }
+        document = {key: value for key, value in given.items() if value is not None}
+        key = idempotency_key or uuid.uuid4().hex
+        return await self._stored(Album, json_request("POST", "/albums", document, idempotency_key=key))
+
+    async def album(self, album_id: str) -> Album:
+        """Return an album."""
+        return await self._stored(Album, Request("GET", resource_path("albums", album_id)))
+
+    async def albums(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Album]:
+        """Yield the albums, newest first, page by page; with `name`, those with this text in their name."""
+        async for page in self._pages(AlbumPage, "/albums", name=name, limit=page_size):
+            for album in page.albums:
+                yield album
+
+    async def delete_album(self, album_id: str, *, if_match: str | None = None) -> None:
+        """Delete an album with its photographs."""
+        headers = {} if if_match is None else {"If-Match": if_match}
+        await self._send(Request("DELETE", resource_path("albums", album_id), headers=headers))
+
+    async def add_to_album(self, album_id: str, panoramas: Sequence[Photograph]) -> AsyncIterator[AddedPhotograph]:
+        """Add photographs to an album; yield an answer for each, in order, as they are stored.
+
+        The same picture is stored once, so that sending photographs again is safe. A photograph that cannot be read
+        does not stop the others; `AddedPhotograph.result` raises its error.
+
+        Args:
+            album_id: id of the album.
+            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+
+        Raises:
+            ConnectionFailedError: the connection broke off before the last answer.
+        """
+        path = f"{resource_path('albums', album_id)}/photographs"
+        async with self._concurrency.hold():
+            request = await run_blocking(query_request, path, panoramas, {}, accept=NDJSON, streamed=True)
+            async with aclosing(await self._send(request)) as response:
+                try:
+                    async for line in response.aiter_lines():
+                        yield parse(AddedPhotograph, line, "line")
+                except httpx.TransportError as error:
+                    raise ConnectionFailedError(
+                        f"POST {path} broke off: {type(error).__name__} {error}".rstrip()
+                    ) from error
+
+    async def album_photographs(self, album_id: str, *, page_size: int = 100) -> AsyncIterator[AlbumPhotograph]:
+        """Yield the photographs of an album with their pins, in the order in which they were added."""
+        path = f"{resource_path('albums', album_id)}/photographs"
+        async for page in self._pages(AlbumPhotographPage, path, limit=page_size):
+            for photograph in page.photographs:
+                yield photograph
+
+    async def album_photograph(self, album_id: str, photograph_id: str) -> AlbumPhotograph:
+        """Return a photograph of an album."""
+        return await self._stored(AlbumPhotograph, Request("GET", _photograph_path(album_id, photograph_id)))
+
+    async def album_file(self, album_id: str, album_format: AlbumFormat, *, floorplan_id: str | None = None) -> bytes:
+        """Return the pins of an album as a file.
+
+        Args:
+            album_id: id of the album.
+            album_format: `geojson`, for plans with an anchor; `csv`; `svg`, a drawing of the plan.
+            floorplan_id: plan of a venue whose pins are wanted; a drawing needs it.
+        """
+        if album_format not in FORMAT_MEDIA:
+            raise ValueError(f"album_format is {album_format!r}; it must be one of {', '.join(FORMAT_MEDIA)}")
+        path = f"{resource_path('albums', album_id)}/photographs"
+        params = text_values({"floorplan_id": floorplan_id})
+        return await self.content(Request("GET", path, params, {"Accept": FORMAT_MEDIA[album_format]}))
+
+    async def correct_photograph(
+        self, album_id: str, photograph_id: str, correction: Mapping[str, Any] | None, *, if_match: str | None = None
+    ) -> AlbumPhotograph:
+        """State where a photograph was taken; the rest of the album is then solved again.
+
+        Args:
+            album_id: id of the album.
+            photograph_id: id of the photograph.
+            correction: {"room_id": ...}, {"position": {"x_m": 3.5, "y_m": 2.0}, "heading_deg": 90},
+                {"elsewhere": True} or {"confirmed": True}; None undoes it. In a venue with `floorplan_id` as well.
+            if_match: `etag` that the photograph must have.
+        """
+        path = _photograph_path(album_id, photograph_id)
+        return await self._stored(
+            AlbumPhotograph, json_request("PATCH", path, {"correction": correction}, if_match=if_match)
+        )
+
+    async def delete_album_photograph(self, album_id: str, photograph_id: str) -> None:
+        """Delete a photograph of an album; the rest is solved again."""
+        await self._send(Request("DELETE", _photograph_path(album_id, photograph_id)))
+
+    async def wait_until_solved(self, album_id: str, timeout_s: float = 300.0) -> Album:
+        """Wait until the pins of an album are those of its latest change; return the album.
+
+        Raises:
+            AlbumFailedError: the album could not be solved.
+            NotReadyError: it was not solved in time.
+        """
+        begin_s, pause_s = monotonic(), _FIRST_POLL_S
+        while True:
+            album = await self.album(album_id)
+            if album.state == "failed":
+                raise AlbumFailedError(album_id, album.reason)
+            if album.state != "solving":
+                return album
+            spent_s = monotonic() - begin_s
+            if spent_s >= timeout_s:
+                raise NotReadyError(album_id, spent_s, album.progress, "album")
+            # The last poll is at the timeout.
+            await sleep(min(pause_s, timeout_s - spent_s))
+            pause_s = min(1.5 * pause_s, _MAX_POLL_S)
+
+
+def _photograph_path(album_id: str, photograph_id: str) -> str:
+    photograph = resource_path("photographs", photograph_id)
+    return f"{resource_path('albums', album_id)}{photograph}"

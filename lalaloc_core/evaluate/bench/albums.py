@@ -1,0 +1,221 @@
+"""Accuracy of albums: photographs of a walk through generated homes, spheres, and photographs of real rooms."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+from lalaloc_core.evaluate.runs.score import expected_calibration_error
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
+from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
+from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
+from lalaloc_core.learn.data.views import encode_jpeg
+from lalaloc_core.localise.album.corrections import Correction
+from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.localise.query import stated_height
+from lalaloc_core.photograph import StatedCamera, open_photograph
+from lalaloc_core.photograph.taken import Taken
+
+_PHOTOGRAPHS, _PLAN = 20, "plan"
+# Annotated rooms of an album, their distance (m), and the field of view (degrees) of their two photographs.
+_ROOMS, _APART_M, _FIELD_DEG = 10, 3.0, 70.0
+_BEGIN = datetime(2026, 1, 1, 12)
+_NEAR_M, _TURNED = 1.0, math.radians(30.0)
+
+
+class _Truth(NamedTuple):
+    position_m: Float[np.ndarray, "2"]
+    room_id: str
+    heading: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """An album with the true poses of its photographs."""
+
+    ground: AlbumGround
+    photographs: list[AlbumPhotograph]
+    truth: list[_Truth]
+
+
+class _Score(NamedTuple):
+    """Of one photograph: right room, pose within 1 m and 30°, within 1 m, and the confidence of the room."""
+
+    room: bool
+    pose: bool
+    near: bool
+    confidence: float
+
+
+def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: Path | None) -> dict[str, Any]:
+    """Measure albums of 20 photographs, with unknown field of view, camera height and heading.
+
+    Rows: in the order of a walk, without order, each alone, and as spheres; with `annotated`, a folder of annotated
+    photographs, two views of each in albums of ten rooms, without doors or order.
+    """
+    model = LocalModel(bundle)
+    scores: dict[str, list[_Score]] = {}
+    clicks, seconds, again_s = list[int](), list[float](), list[float]()
+    for index in range(homes):
+        case = _home(model, index, textures, spheres=False)
+        memory, begin = AlbumMemory(), time.perf_counter()
+        _add(scores, "walk", _solved(model, case, memory))
+        seconds.append(time.perf_counter() - begin)
+        _add(scores, "without_order", _solved(model, case, memory, by_time=False))
+        _add(scores, "each_alone", _alone(model, case))
+        begin = time.perf_counter()
+        count = _clicks(model, case, memory)
+        clicks.append(count)
+        again_s.append((time.perf_counter() - begin) / (count + 1))
+        _add(scores, "spheres", _solved(model, _home(model, index, textures, spheres=True), AlbumMemory()))
+    for case in [] if annotated is None else _annotated(model, annotated):
+        _add(scores, "annotated", _solved(model, case, AlbumMemory()))
+        _add(scores, "annotated_each_alone", _alone(model, case))
+    figures: dict[str, Any] = {row: _summary(found) for row, found in scores.items()}
+    figures["clicks_per_album"] = float(np.mean(clicks))
+    figures["median_solve_s"], figures["median_again_s"] = float(np.median(seconds)), float(np.median(again_s))
+    return figures
+
+
+def _home(model: LocalModel, index: int, textures: Path | None, *, spheres: bool) -> _Case:
+    album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=textures)
+    plan, rooms = album.plan, album.plan.rooms
+    photographs = [
+        _entry(model, number, each.pixels, "equirectangular" if spheres else "perspective", each.taken_s)
+        for number, each in enumerate(album.photographs)
+    ]
+    truth = [_Truth(each.position_m, rooms[each.room_index].id, each.heading) for each in album.photographs]
+    return _Case(_ground(model, plan), photographs, truth)
+
+
+def _annotated(model: LocalModel, folder: Path) -> list[_Case]:
+    """Return an album for every photograph that counts: its room with nine others, drawn at random."""
+    usable = [photograph for photograph in AnnotatedPhotographs(folder).photographs if photograph.counts]
+    cases = []
+    for number, own in enumerate(usable):
+        rng = np.random.default_rng([7, number])
+        others = [photograph for photograph in usable if photograph is not own]
+        chosen = [own, *(others[index] for index in rng.permutation(len(others))[: _ROOMS - 1])]
+        places, left_m = [], 0.0
+        for photograph in chosen:
+            outline_m = photograph.outlines[0].polygon_m
+            places.append(np.array([left_m, 0.0]) - outline_m.min(axis=0))
+            left_m += float(np.ptp(outline_m[:, 0])) + _APART_M
+        moved = [each.outlines[0].moved(place) for each, place in zip(chosen, places, strict=True)]
+        plan = plan_of_rooms(f"rooms with {own.name}", moved, CAMERA_HEIGHT_M)
+        photographs, truth = list[AlbumPhotograph](), list[_Truth]()
+        for photograph, place in zip(chosen, places, strict=True):
+            room = plan.rooms[int(plan.room_index_at(place[None])[0])]
+            for pixels, azimuth in two_views(photograph.photograph.image(512, 1024), _FIELD_DEG, rng):
+                photographs.append(_entry(model, len(photographs), pixels, "perspective", None))
+                truth.append(_Truth(place, room.id, azimuth))
+        cases.append(_Case(_ground(model, plan), photographs, truth))
+    return cases
+
+
+def _ground(model: LocalModel, plan: FloorPlan) -> AlbumGround:
+    return AlbumGround.of_plan(_PLAN, plan, model.grid(plan, plan.camera_height_m))
+
+
+def _entry(
+    model: LocalModel, number: int, pixels: UInt8[np.ndarray, "h w 3"], projection: str, taken_s: float | None
+) -> AlbumPhotograph:
+    manifest = model.bundle.manifest
+    view = open_photograph(
+        encode_jpeg(pixels),
+        sphere_size=sphere_size(manifest),
+        stated=StatedCamera(projection=projection),
+        patch_size=patch_size(manifest),
+        overview=True,
+    )
+    at = None if taken_s is None else _BEGIN + timedelta(seconds=int(taken_s))
+    taken = Taken(at=at, width=pixels.shape[1], height=pixels.shape[0])
+    return photograph_entry(f"{number:03d}", model.encoder.with_features(view), taken)
+
+
+def _solved(model: LocalModel, case: _Case, memory: AlbumMemory, *, by_time: bool = True) -> list[_Score]:
+    pins = solve_album(case.ground, model.encoder, case.photographs, memory=memory, by_time=by_time).pins
+    found = []
+    for pin, truth in zip(pins, case.truth, strict=True):
+        pose = pin.pose
+        if pose is None:
+            found.append(_Score(False, False, False, 0.0))
+            continue
+        place = np.array([pose.x_m, pose.y_m])
+        found.append(_score(truth, pose.room_id, place, pose.heading or 0.0, pin.confidence))
+    return found
+
+
+def _alone(model: LocalModel, case: _Case) -> list[_Score]:
+    """Localise each photograph alone, as the service does."""
+    ground, manifest = case.ground, model.bundle.manifest
+    found = []
+    for photograph, truth in zip(case.photographs, case.truth, strict=True):
+        query = model.encoder.query(photograph.view, None, stated_height(ground.plan, None))
+        answer = model.localise(ground.plan, ground.grid, query)
+        best = answer.candidates[0]
+        room_share = float(answer.posterior.pose[ground.grid.poses.room_index == best.room_index].sum())
+        confidence = answer.confidence(manifest.confidence_for(view=query.is_view))
+        fit = 1.0 if confidence is None else confidence.fit
+        room_id = ground.plan.rooms[best.room_index].id
+        heading = photograph_heading(query, best)
+        found.append(_score(truth, room_id, best.position_m, heading, fit * room_share))
+    return found
+
+
+def _score(truth: _Truth, room_id: str, place: np.ndarray, heading: float, confidence: float) -> _Score:
+    near = float(np.linalg.norm(place - truth.position_m)) < _NEAR_M
+    turned = abs(float(wrap_angle(heading - truth.heading)))
+    return _Score(room_id == truth.room_id, near and turned < _TURNED, near, confidence)
+
+
+def _clicks(model: LocalModel, case: _Case, memory: AlbumMemory) -> int:
+    """Return how many pins must be corrected, the least sure wrong one first, until all rooms are right."""
+    photographs = list(case.photographs)
+    for count in range(len(photographs)):
+        pins = solve_album(case.ground, model.encoder, photographs, memory=memory).pins
+        wrong = [
+            (pin.confidence, number)
+            for number, (pin, truth) in enumerate(zip(pins, case.truth, strict=True))
+            if pin.pose is None or pin.pose.room_id != truth.room_id
+        ]
+        if not wrong:
+            return count
+        number = min(wrong)[1]
+        stated = Correction(kind="room", plan_id=_PLAN, room_id=case.truth[number].room_id)
+        photographs[number] = replace(photographs[number], correction=stated)
+    return len(photographs)
+
+
+def _add(scores: dict[str, list[_Score]], row: str, found: Sequence[_Score]) -> None:
+    scores.setdefault(row, []).extend(found)
+
+
+def _summary(found: Sequence[_Score]) -> dict[str, float]:
+    room, pose, near, confidence = np.array(found, float).T
+    return {
+        "n": len(found),
+        "right_room": float(room.mean()),
+        "within_1m_30deg": float(pose.mean()),
+        "within_1m": float(near.mean()),
+        "mean_confidence": float(confidence.mean()),
+        "expected_calibration_error": expected_calibration_error(confidence, room > 0.0),
+    }

@@ -1,0 +1,126 @@
+"""Comparison of one photograph with all poses of an album's ground, for every error of the camera height."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.bundle import MatchingWeights
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.album.binned_ground import BINS, KINDS, BinnedGround, bin_centres
+from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.match.cost_terms import class_losses, median_distance_m, precisions, smoothed
+from lalaloc_core.localise.query import PredictedProfile, Query
+
+_CONFIG = MatchingConfig()
+# Poses compared at a time.
+_CHUNK = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Tables of one photograph.
+
+    Attributes:
+        columns: (s,) azimuth columns that the photograph shows, if it looks along azimuth 0.
+        shifts: (k,) columns that each hypothesis of the heading turns it by.
+        cost: (s, b k, j) summed cost of walls and openings by bin, kind, and height error.
+        likelihood: (s, b, j) likelihood of walls alone; at most 1 counts.
+        openings: (s, k) cost of each kind of opening.
+        factor: log likelihood of a unit of cost.
+    """
+
+    columns: np.ndarray
+    shifts: np.ndarray
+    cost: Float[np.ndarray, "s e j"]
+    likelihood: Float[np.ndarray, "s b j"]
+    openings: Float[np.ndarray, "s c"]
+    factor: float
+
+    @classmethod
+    def of(
+        cls, plan: FloorPlan, query: Query, reach_m: float, weights: MatchingWeights, offsets: Float[np.ndarray, "j"]
+    ) -> Comparison:
+        """Return the tables of a query with an unknown heading.
+
+        Args:
+            plan: the plan, whose drawn openings count.
+            query: the photograph.
+            reach_m: distance from the camera within which the best pose is.
+            weights: weights of the matching cost.
+            offsets: logs of true over stated camera height.
+        """
+        assert query.profile is not None
+        width = query.profile.log_m.shape[1]
+        columns = np.flatnonzero(np.isfinite(query.profile.log_scale[0]))
+        centres = bin_centres()[None, :, None] - offsets[None, None, :]
+        likelihood = np.zeros((len(columns), BINS, len(offsets)))
+        for centre, log_scale, odds in _modes(query.profile, columns):
+            precision = precisions(centre, log_scale, reach_m, weights.tail)
+            apart = (centres - centre[:, None, None]) * precision[:, None, None]
+            likelihood += odds[:, None, None] / (1.0 + np.square(apart))
+        walls = -np.log(np.minimum(likelihood, 1.0))
+        loss = _opening_losses(plan, query, reach_m, weights)[columns]
+        cost = walls[:, :, None, :] + loss[:, None, :, None]
+        return cls(
+            columns=columns,
+            shifts=np.rint(query.roll / TWO_PI * width).astype(int) % width,
+            cost=np.ascontiguousarray(cost.reshape(len(columns), BINS * KINDS, -1), np.float32),
+            likelihood=np.ascontiguousarray(likelihood, np.float32),
+            openings=loss.astype(np.float32),
+            factor=weights.temperature / width,
+        )
+
+    def log_likelihood(self, ground: BinnedGround) -> Float[np.ndarray, "n k j"]:
+        """Return the log likelihood of walls and openings of every pose under every hypothesis and height error."""
+        parts = [self._part(ground.part(slice(first, first + _CHUNK))) for first in range(0, len(ground), _CHUNK)]
+        return np.concatenate(parts)
+
+    def _part(self, ground: BinnedGround) -> Float[np.ndarray, "n k j"]:
+        width = ground.columns
+        total = np.zeros((len(ground), width, self.cost.shape[2]), np.float32)
+        for number, column in enumerate(self.columns.tolist()):
+            # A turn by s columns shows the wall of column c + s where the photograph shows it at c.
+            total += self.cost[number].take(ground.index[:, column : column + width], axis=0)
+            if len(ground.row):
+                turn = (ground.column - column) % width
+                own, kind = np.divmod(ground.own, KINDS)
+                either = self.likelihood[number][own] + ground.odds[:, None] * self.likelihood[number][ground.behind]
+                either = -np.log(np.minimum(either, 1.0)) + self.openings[number][kind][:, None]
+                total[ground.row, turn] += either - self.cost[number][ground.own]
+        total = total if len(self.shifts) == width else total[:, self.shifts]
+        total *= -self.factor
+        return total
+
+
+Mode = tuple[Float[np.ndarray, "s"], Float[np.ndarray, "s"], Float[np.ndarray, "s"]]
+
+
+def _modes(profile: PredictedProfile, columns: np.ndarray) -> list[Mode]:
+    """Return centre, log scale and odds of each predicted mode at some columns."""
+    modes = [(profile.log_m[0][columns], profile.log_scale[0][columns], np.ones(len(columns)))]
+    rival = profile.rival
+    if rival is not None:
+        modes.append((rival.log_m[0][columns], rival.log_scale[0][columns], rival.odds[0][columns]))
+    return modes
+
+
+def _opening_losses(
+    plan: FloorPlan, query: Query, reach_m: float, weights: MatchingWeights
+) -> Float[np.ndarray, "w c"]:
+    """Return the weighted cost of every kind of opening by column; zero if openings are not compared."""
+    predicted, profile = query.openings, query.profile
+    assert profile is not None
+    trust: Sequence[float] = [plan.opening_trust.get(kind, 0.0) for kind in OPENING_CLASSES]
+    if predicted is None or not any(trust):
+        return np.zeros((profile.log_m.shape[1], KINDS))
+    precision = precisions(profile.log_m[0], profile.log_scale[0], reach_m, weights.tail)
+    spread = reach_m / median_distance_m(profile.log_m[0], precision)
+    probability = smoothed(np.exp(predicted.log_probability[:1]), spread)[0]
+    loss = class_losses(probability, predicted.prior, trust, _CONFIG.floor, weights.appearance)
+    loss -= loss.min(axis=-1, keepdims=True)
+    return weights.openings * loss

@@ -1,0 +1,246 @@
+"""Entry of a photograph in an album: what is kept of it instead of its pixels, as a small file.
+
+A file has 4 bytes "LLAP", the version (uint16) and the length of the header (uint32), the header in JSON, the features
+as `localise.encode.features` writes them, compressed, 64 bytes of colours, and the descriptors: 16 bytes and two uint16
+each, the place as shares of width and height. All numbers are little-endian. The ring of spheres is left out (zeros):
+albums compare walls, not latents.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+import zlib
+from dataclasses import dataclass, field
+from datetime import datetime
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import ConfigError, InvalidEntryError
+from lalaloc_core.localise.album.corrections import Correction
+from lalaloc_core.localise.encode.features import MAX_BYTES, read_features, write_features
+from lalaloc_core.photograph import Photograph
+from lalaloc_core.photograph.overlap import Features
+from lalaloc_core.photograph.taken import MAX_NAME, Taken
+
+MAX_ENTRY_BYTES = 20_000
+MAX_DESCRIPTORS, DESCRIPTOR_BYTES = 256, 16
+MAX_ID = 200
+_MAGIC, _VERSION, _PREFIX = b"LLAP", 1, struct.Struct("<4sHI")
+_MAX_HEADER_BYTES, _MAX_SIDE = 4096, 2**16
+# A descriptor with its place.
+_RECORD = np.dtype([("bits", "u1", DESCRIPTOR_BYTES), ("place", "<u2", 2)])
+_WHOLE = 2**16 - 1
+# Colours: bins of each of the two axes of CIE Lab's hue plane, as OpenCV scales them, and their borders.
+_HUES = 8
+_BORDERS = np.array([0.0, 118.0, 122.0, 125.0, 128.0, 131.0, 134.0, 138.0, 256.0])
+_THUMBNAIL = (64, 48)
+COLOURS = _HUES**2
+_COMPRESSION = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Descriptors:
+    """Binary descriptors of corners and blobs of a photograph, the strongest first.
+
+    Attributes:
+        place: (n, 2) pixels from the top left corner, as shares of width and height.
+        bits: (n, 16) descriptors of 128 bits.
+    """
+
+    place: Float[np.ndarray, "n 2"]
+    bits: UInt8[np.ndarray, "n 16"]
+
+    @classmethod
+    def of(cls, features: Features) -> Descriptors:
+        """Return the first descriptors of features: each value over the median of its descriptor is a one."""
+        values = features.descriptor[:MAX_DESCRIPTORS]
+        if not len(values):
+            return NO_DESCRIPTORS
+        ones = values > np.median(values, axis=1, keepdims=True)
+        return cls(features.place[:MAX_DESCRIPTORS], np.packbits(ones, axis=1))
+
+    def __len__(self) -> int:
+        return len(self.bits)
+
+
+NO_COLOURS = np.zeros(COLOURS, np.uint8)
+NO_DESCRIPTORS = Descriptors(np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlbumPhotograph:
+    """A photograph of an album.
+
+    Attributes:
+        id: name within the album, such as the SHA-256 of the file.
+        view: the photograph with its features instead of pixels; `view.hfov` is the field of view and its origin.
+        taken: time, maker, model and size in pixels; each None or empty where unknown.
+        descriptors: what tells overlap with others; none for spheres, and for features that a client computed.
+        colours: (64,) square roots of the shares of hues, times 255; zeros for features that a client computed.
+        correction: what a person stated; None without.
+    """
+
+    id: str
+    view: Photograph
+    taken: Taken = field(default=Taken())
+    descriptors: Descriptors = field(default=NO_DESCRIPTORS)
+    colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: NO_COLOURS)
+    correction: Correction | None = None
+
+    @property
+    def camera_key(self) -> tuple[str, str, int, int]:
+        """Maker, model and size: photographs with the same share their field of view."""
+        sides = sorted((self.taken.width, self.taken.height))
+        return self.taken.make, self.taken.model, sides[0], sides[1]
+
+    @property
+    def has_stated_field(self) -> bool:
+        """True if the field of view is stated or in the metadata, not estimated."""
+        return self.view.hfov.source not in ("estimated", "assumed")
+
+    def to_bytes(self, bundle: Bundle) -> bytes:
+        """Return the entry as a file, without the correction.
+
+        Raises:
+            InvalidEntryError: the file would be too large even without descriptors.
+        """
+        assert self.view.features is not None
+        features = zlib.compress(write_features(self.view, self.view.features.outputs, bundle), _COMPRESSION)
+        taken = self.taken
+        header = _Header(
+            id=self.id,
+            taken_at=None if taken.at is None else taken.at.isoformat(),
+            make=taken.make,
+            model=taken.model,
+            width=taken.width,
+            height=taken.height,
+            features=len(features),
+        )
+        text = json.dumps(dataclasses.asdict(header), allow_nan=False).encode()
+        used = _PREFIX.size + len(text) + len(features) + COLOURS
+        room = (MAX_ENTRY_BYTES - used) // _RECORD.itemsize
+        if room < 0:
+            raise InvalidEntryError(f"the entry has {used} bytes; the limit is {MAX_ENTRY_BYTES}")
+        records = np.zeros(min(len(self.descriptors), room), _RECORD)
+        records["bits"] = self.descriptors.bits[: len(records)]
+        records["place"] = np.rint(np.clip(self.descriptors.place[: len(records)], 0.0, 1.0) * _WHOLE)
+        return _PREFIX.pack(_MAGIC, _VERSION, len(text)) + text + features + self.colours.tobytes() + records.tobytes()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    """Header of a file; `features` is the number of their bytes."""
+
+    id: str
+    taken_at: str | None
+    make: str
+    model: str
+    width: int
+    height: int
+    features: int
+
+
+def photograph_entry(id: str, view: Photograph, taken: Taken | None = None) -> AlbumPhotograph:
+    """Return the entry of a photograph that was encoded.
+
+    Args:
+        id: its name within the album.
+        view: the photograph with its features (`PhotographEncoder.with_features`, or features that a client sent); its
+            `overview` gives the descriptors.
+        taken: time and camera, from `photograph.taken.read_taken`; None for features.
+    """
+    assert view.features is not None
+    outputs = dict(view.features.outputs)
+    if "ring" in outputs:
+        outputs["ring"] = np.zeros_like(outputs["ring"])
+    light = dataclasses.replace(
+        view,
+        features=dataclasses.replace(view.features, outputs=outputs),
+        patches=(),
+        sphere=None,
+        thumbnail=None,
+        overview=None,
+    )
+    descriptors = NO_DESCRIPTORS if view.overview is None else Descriptors.of(view.overview.features)
+    pixels = view.thumbnail if view.sphere is None else view.sphere
+    colours = NO_COLOURS if pixels is None else _colours(pixels)
+    return AlbumPhotograph(id=id, view=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
+
+
+def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:
+    """Return the hues of a picture: floors, walls and curtains of a room have their own."""
+    lab = cv2.cvtColor(cv2.resize(pixels, _THUMBNAIL, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2LAB)
+    across, up = (np.searchsorted(_BORDERS, lab[..., axis].ravel(), side="right") - 1 for axis in (1, 2))
+    share = np.bincount(across * _HUES + up, minlength=COLOURS) / across.size
+    return np.rint(255.0 * np.sqrt(share)).astype(np.uint8)
+
+
+def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
+    """Read an entry.
+
+    Raises:
+        InvalidEntryError: the file is damaged, truncated or too large, or a value is out of range.
+        InvalidFeaturesError: the same of its features.
+        ForeignFeaturesError: the features are another model's.
+    """
+    header, body = _split(content)
+    try:
+        at = None if header.taken_at is None else datetime.fromisoformat(header.taken_at)
+    except ValueError as error:
+        raise InvalidEntryError(f"taken_at is '{header.taken_at!s:.50}', which is no time") from error
+    faults = {
+        "id": not 0 < len(header.id) <= MAX_ID or not header.id.isprintable(),
+        "taken_at": at is not None and at.tzinfo is not None,
+        "make": len(header.make) > MAX_NAME or not header.make.isprintable(),
+        "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
+        "width": not 0 <= header.width <= _MAX_SIDE,
+        "height": not 0 <= header.height <= _MAX_SIDE,
+        "features": not 0 < header.features <= len(body) - COLOURS,
+    }
+    for name, is_wrong in faults.items():
+        if is_wrong:
+            raise InvalidEntryError(f"{name} of the entry is out of range")
+    colours, rest = body[header.features :][:COLOURS], body[header.features + COLOURS :]
+    if len(rest) % _RECORD.itemsize or len(rest) > MAX_DESCRIPTORS * _RECORD.itemsize:
+        raise InvalidEntryError(
+            f"the descriptors have {len(rest)} bytes; they have {_RECORD.itemsize} each, at most {MAX_DESCRIPTORS}"
+        )
+    records = np.frombuffer(rest, _RECORD)
+    descriptors = Descriptors(records["place"] / _WHOLE, records["bits"].copy())
+    view = read_features(_inflated(body[: header.features]), bundle)
+    taken = Taken(at=at, make=header.make, model=header.model, width=header.width, height=header.height)
+    return AlbumPhotograph(
+        id=header.id, view=view, taken=taken, descriptors=descriptors, colours=np.frombuffer(colours, np.uint8).copy()
+    )
+
+
+def _split(content: bytes) -> tuple[_Header, bytes]:
+    if len(content) > MAX_ENTRY_BYTES:
+        raise InvalidEntryError(f"the entry has {len(content)} bytes; the limit is {MAX_ENTRY_BYTES}")
+    if len(content) < _PREFIX.size or not content.startswith(_MAGIC):
+        raise InvalidEntryError("the file does not begin as entries do")
+    _, version, length = _PREFIX.unpack_from(content)
+    if version != _VERSION:
+        raise InvalidEntryError(f"the entry has version {version}; this version reads {_VERSION}")
+    if length > min(_MAX_HEADER_BYTES, len(content) - _PREFIX.size):
+        raise InvalidEntryError(f"the header has {length} bytes; the limit is {_MAX_HEADER_BYTES}, and the rest")
+    end = _PREFIX.size + length
+    try:
+        header = build_config(_Header, json.loads(content[_PREFIX.size : end]), path="header")
+    except (ConfigError, ValueError, RecursionError) as error:
+        raise InvalidEntryError(f"not a valid header: {str(error)[:300]}") from error
+    return header, content[end:]
+
+
+def _inflated(data: bytes) -> bytes:
+    """Return the bytes of compressed features, at most one more than features may have."""
+    try:
+        return zlib.decompressobj().decompress(data, MAX_BYTES + 1)
+    except zlib.error as error:
+        raise InvalidEntryError(f"the features of the entry cannot be decompressed: {error}") from error

@@ -1,0 +1,198 @@
+"""Pins: the places of an album's photographs, with everything that was found on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from lalaloc_core.conventions import heading_to_degrees
+
+PinState = Literal["sure", "uncertain", "set_aside", "corrected"]
+# A pin moved if it did by more (m), or changed its room.
+MOVED_M = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class PinPose:
+    """A place in a plan, and the azimuth of the photograph's centre (radians); None where that is unknown.
+
+    Attributes:
+        plan_id, room_id, room: the plan, and the id and name of the room in it.
+        x_m, y_m: position in the frame of that plan.
+    """
+
+    plan_id: str
+    room_id: str
+    room: str
+    x_m: float
+    y_m: float
+    heading: float | None
+
+    @property
+    def heading_deg(self) -> float | None:
+        """Heading in degrees clockwise from the plan's +y."""
+        return None if self.heading is None else heading_to_degrees(self.heading)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomShare:
+    """Probability of a room."""
+
+    plan_id: str
+    room_id: str
+    room: str
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suggestion:
+    """A pose that the photograph can have been taken at, and its probability."""
+
+    pose: PinPose
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pin:
+    """The place of one photograph.
+
+    Attributes:
+        photograph_id: the photograph.
+        state: "sure": the room is probably right (`confidence` at least `solve.SURE`); "uncertain": less so;
+            "set_aside": of none of the rooms, or not usable, for `reason`; "corrected": a person stated it.
+        pose: the place; None if it is set aside.
+        confidence: probability that the room is right; 1 if it was stated.
+        within_1m: probability that the pose is right within 1 m.
+        reason: a sentence on why it is set aside or uncertain; empty otherwise.
+        rooms: the probable rooms, most probable first.
+        suggestions: up to five distinct poses, most probable first; the first is `pose`, if the pin has one.
+        warnings: what was assumed or left out.
+    """
+
+    photograph_id: str
+    state: PinState
+    pose: PinPose | None
+    confidence: float
+    within_1m: float
+    reason: str = ""
+    rooms: tuple[RoomShare, ...] = ()
+    suggestions: tuple[Suggestion, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedCamera:
+    """A camera of the album: photographs of one maker, model and size share their field of view.
+
+    Attributes:
+        make, model, width, height: as in the photographs; the sides in rising order.
+        photographs: number of its photographs.
+        hfov: horizontal field of view of the first of them, radians.
+        hfov_sd: its standard deviation; 0 if every photograph states it.
+    """
+
+    make: str
+    model: str
+    width: int
+    height: int
+    photographs: int
+    hfov: float
+    hfov_sd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlbumLink:
+    """Two photographs that show the same things.
+
+    Attributes:
+        first, second: ids of the photographs.
+        turn: heading of the second minus that of the first, radians; None if they are not from one spot.
+        matches: number of corners and blobs that agree.
+    """
+
+    first: str
+    second: str
+    turn: float | None
+    matches: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Album:
+    """Result of a solve.
+
+    Attributes:
+        pins: a pin for every photograph, in the order in which they were given.
+        cameras: the cameras and their fields of view.
+        camera_height_m: height of the cameras over the floor; None without photographs.
+        camera_height_sd_m: its standard deviation.
+        scale: factor of the plan's lengths that fits the photographs best, and its standard deviation.
+        scale_sd: its standard deviation.
+        compass_bias: azimuth of the compass's north in the plan minus that of true north, radians; the azimuth itself
+            if the plan does not state north. None without photographs that have a compass heading.
+        links: the links between photographs.
+        warnings: what was assumed or dropped for all photographs.
+    """
+
+    pins: tuple[Pin, ...]
+    cameras: tuple[SharedCamera, ...] = ()
+    camera_height_m: float | None = None
+    camera_height_sd_m: float = math.inf
+    scale: float = 1.0
+    scale_sd: float = 0.05
+    compass_bias: float | None = None
+    links: tuple[AlbumLink, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def counts(self) -> dict[PinState, int]:
+        """Number of pins by state."""
+        states: tuple[PinState, ...] = ("sure", "uncertain", "set_aside", "corrected")
+        return {state: sum(pin.state == state for pin in self.pins) for state in states}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovedPin:
+    """A pin that changed between two solves; `before` or `after` is None where it was set aside.
+
+    Attributes:
+        distance_m: how far it moved; None between plans, or if it was set aside.
+        new_room: whether its room is another.
+    """
+
+    photograph_id: str
+    before: PinPose | None
+    after: PinPose | None
+    distance_m: float | None
+    new_room: bool
+
+
+def moved_pins(before: Sequence[Pin], after: Sequence[Pin]) -> list[MovedPin]:
+    """Return the pins, in the order of `after`, that moved by more than 0.5 m or changed their room.
+
+    Photographs that are in one of the two only are left out.
+    """
+    known = {pin.photograph_id: pin.pose for pin in before}
+    found = []
+    for pin in after:
+        if pin.photograph_id not in known:
+            continue
+        old, new = known[pin.photograph_id], pin.pose
+        if old is None or new is None:
+            if old is not new:
+                changed = MovedPin(
+                    photograph_id=pin.photograph_id, before=old, after=new, distance_m=None, new_room=True
+                )
+                found.append(changed)
+            continue
+        same_plan = old.plan_id == new.plan_id
+        distance_m = math.hypot(new.x_m - old.x_m, new.y_m - old.y_m) if same_plan else None
+        new_room = not same_plan or old.room_id != new.room_id
+        if new_room or (distance_m is not None and distance_m > MOVED_M):
+            found.append(
+                MovedPin(
+                    photograph_id=pin.photograph_id, before=old, after=new, distance_m=distance_m, new_room=new_room
+                )
+            )
+    return found

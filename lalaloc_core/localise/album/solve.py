@@ -1,0 +1,258 @@
+"""Solve of an album: the pins of all photographs at once.
+
+Each photograph is compared with the plan alone (`single.py`); this is kept in the `AlbumMemory`. Overlap, compasses and
+corrections then change the evidence (`states.py`), and all photographs are assigned to rooms together
+(`room_assignment.py`), by their own evidence, the walk from one to the next (`walks.py`), and the pairs that look as if
+they are of one room (`links.py`). Within its room, a photograph is at the pose that fits it best.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.album.constraints import Constraint, constraint_of
+from lalaloc_core.localise.album.entry import AlbumPhotograph
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.links import Found, find_links, pair_odds
+from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.pins import Album, AlbumLink, Pin, Suggestion
+from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
+from lalaloc_core.localise.album.shared import camera_height, shared_cameras
+from lalaloc_core.localise.album.single import SearchedPlan, single_evidence
+from lalaloc_core.localise.album.states import States, by_compass, turned_together
+from lalaloc_core.localise.album.walks import expected_photographs, walk_of
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+
+MAX_PHOTOGRAPHS = 500
+# Pins whose room is right with at least this probability are sure.
+SURE = 0.8
+_SUGGESTIONS, _ROOMS = 5, 8
+# Share of photographs that must have a time for the order to count.
+_TIMED = 0.8
+# Log odds of a photograph of none of the rooms, beside the best pose of other homes.
+_ELSEWHERE = -3.0
+_CERTAIN = 1e4
+# How much the number of photographs of a room keeps to what its size lets expect.
+_TIGHTNESS = 2.5
+
+
+def solve_album(
+    ground: AlbumGround,
+    encoder: PhotographEncoder,
+    photographs: Sequence[AlbumPhotograph],
+    *,
+    memory: AlbumMemory | None = None,
+    by_time: bool = True,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Album:
+    """Pin the photographs of an album.
+
+    Args:
+        ground: the plan, or the plans of a venue.
+        encoder: encoder of the model that the entries were made with.
+        photographs: at most 500, with different ids; their order does not matter.
+        memory: what earlier solves found, filled in place; None for nothing.
+        by_time: use the times at which the photographs were taken.
+        progress: called with the number of photographs that were compared with the plan.
+
+    Raises:
+        InvalidInputError: there are too many photographs, or two with one id.
+        InvalidCorrectionError: a correction names a plan or a room that the ground does not have.
+    """
+    if len(photographs) > MAX_PHOTOGRAPHS:
+        raise InvalidInputError(f"the album has {len(photographs)} photographs; the limit is {MAX_PHOTOGRAPHS}")
+    ids = {photograph.id for photograph in photographs}
+    if len(ids) < len(photographs):
+        raise InvalidInputError("two photographs of the album have the same id; every photograph is added once")
+    constraints = {each.id: constraint_of(ground, each) for each in photographs if each.correction is not None}
+    memory = AlbumMemory() if memory is None else memory
+    memory.use(ground, encoder.manifest)
+    memory.keep(ids)
+    if not photographs:
+        return Album(pins=())
+    ordered = sorted(photographs, key=lambda each: (each.taken.at or datetime.max, each.id))
+    timed = sum(each.taken.at is not None for each in ordered)
+    has_order = by_time and timed >= _TIMED * len(ordered)
+    _compare(ground, encoder, ordered, memory, progress)
+    links = find_links(ordered, memory)
+    states, bias = _states(ground, encoder, ordered, memory, links)
+    share = _room_shares(ground, ordered, memory, states, links, constraints, has_order=has_order)
+    pins = {
+        each.id: _pin(ground, each, state, row, constraints.get(each.id))
+        for each, state, row in zip(ordered, states, share, strict=True)
+    }
+    height_m, height_sd_m, scale, scale_sd = camera_height(ground, [memory.evidence[each.id] for each in ordered])
+    north = ground.plan.north
+    warnings = []
+    if by_time and not has_order:
+        warnings.append(
+            f"{len(ordered) - timed} of {len(ordered)} photographs have no time, so their order was not used; send the "
+            "camera's original files"
+        )
+    return Album(
+        pins=tuple(pins[each.id] for each in photographs),
+        cameras=shared_cameras(ordered),
+        camera_height_m=height_m,
+        camera_height_sd_m=height_sd_m,
+        scale=scale,
+        scale_sd=scale_sd,
+        compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
+        links=tuple(
+            AlbumLink(
+                first=ordered[first].id,
+                second=ordered[second].id,
+                turn=None if math.isnan(turn) else turn,
+                matches=matches,
+            )
+            for (first, second), (matches, turn) in links.items()
+            if not math.isnan(turn)
+        ),
+        warnings=tuple(warnings),
+    )
+
+
+def _compare(
+    ground: AlbumGround,
+    encoder: PhotographEncoder,
+    photographs: Sequence[AlbumPhotograph],
+    memory: AlbumMemory,
+    progress: Callable[[int], object],
+) -> None:
+    """Fill the memory with the evidence of photographs that it does not know."""
+    new = [each for each in photographs if each.id not in memory.evidence]
+    if new:
+        searched = SearchedPlan.of(ground.plan, ground.grid, encoder.manifest.profile_columns)
+        for each in new:
+            memory.evidence[each.id] = single_evidence(searched, encoder, each.view)
+            progress(len(memory.evidence))
+
+
+def _states(
+    ground: AlbumGround,
+    encoder: PhotographEncoder,
+    photographs: Sequence[AlbumPhotograph],
+    memory: AlbumMemory,
+    links: dict[tuple[int, int], Found],
+) -> tuple[list[States], float | None]:
+    """Return the states of all photographs, with overlap and compasses, and the bias of the compass."""
+    manifest = encoder.manifest
+    states = [
+        States.of(memory.evidence[each.id], manifest.ring_sectors if each.view.is_sphere else manifest.profile_columns)
+        for each in photographs
+    ]
+    turns = {pair: turn for pair, (_, turn) in links.items() if not math.isnan(turn)}
+    poses = max(int(state.pose.max()) for state in states) + 1
+    states, bias = by_compass(states, [each.view.compass_heading for each in photographs], ground.plan.north)
+    return turned_together(states, turns, poses), bias
+
+
+def _room_shares(
+    ground: AlbumGround,
+    photographs: Sequence[AlbumPhotograph],
+    memory: AlbumMemory,
+    states: Sequence[States],
+    links: dict[tuple[int, int], Found],
+    constraints: dict[str, Constraint],
+    *,
+    has_order: bool,
+) -> Float[np.ndarray, "n s"]:
+    """Return the probability of every room for every photograph; the last is none of the rooms."""
+    rooms = len(ground.plan.rooms)
+    alone = np.empty((len(photographs), rooms + 1))
+    for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
+        arrays = memory.evidence[each.id]
+        alone[number, :rooms] = state.best_of_rooms(rooms) + arrays["room_types"]
+        alone[number, rooms] = float(arrays["chance"]) + _ELSEWHERE
+        if each.id in constraints:
+            wanted = constraints[each.id].room
+            alone[number] -= _CERTAIN
+            alone[number, rooms if wanted is None else wanted] += _CERTAIN
+    alone = np.maximum(alone, -2.0 * _CERTAIN)
+    evidence = RoomEvidence(
+        alone=alone,
+        walk=walk_of(ground) if has_order else None,
+        pairs=pair_odds(photographs, links),
+        expected=expected_photographs(ground, len(photographs)),
+        tightness=_TIGHTNESS,
+    )
+    return assign_rooms(evidence)
+
+
+def _pin(
+    ground: AlbumGround,
+    photograph: AlbumPhotograph,
+    states: States,
+    share: Float[np.ndarray, "s"],
+    constraint: Constraint | None,
+) -> Pin:
+    """Return the pin of a photograph by the probabilities of its rooms."""
+    rooms = len(ground.plan.rooms)
+    order = [int(room) for room in np.argsort(-share[:rooms], kind="stable")[:_ROOMS] if share[room] > 1e-3]
+    choices = [
+        Suggestion(
+            pose=ground.pose(states.position_m[row], room, float(states.heading[row])),
+            probability=float(share[room] * part),
+        )
+        for room in order
+        for row, part in zip(*states.modes(room), strict=True)
+    ]
+    # The best place of the most probable room comes first: rooms are surer than places.
+    choices = choices[:1] + sorted(choices[1:], key=lambda choice: -choice.probability)
+    suggestions = tuple(choices[:_SUGGESTIONS])
+    listed = tuple(ground.share(room, float(share[room])) for room in order)
+    base = Pin(
+        photograph_id=photograph.id,
+        state="uncertain",
+        pose=None,
+        confidence=0.0,
+        within_1m=0.0,
+        rooms=listed,
+        suggestions=suggestions,
+        warnings=photograph.view.warnings,
+    )
+    if constraint is not None:
+        return _corrected(ground, base, constraint)
+    if share[rooms] > 0.5 or not suggestions:
+        reason = "it fits none of the rooms of the plan better than rooms of other buildings"
+        return replace(base, state="set_aside", reason=reason)
+    confidence = float(share[order[0]])
+    is_sure = confidence >= SURE
+    also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3])
+    return replace(
+        base,
+        state="sure" if is_sure else "uncertain",
+        pose=suggestions[0].pose,
+        confidence=confidence,
+        within_1m=suggestions[0].probability,
+        reason="" if is_sure or not also else f"it also fits: {also}",
+    )
+
+
+def _corrected(ground: AlbumGround, base: Pin, constraint: Constraint) -> Pin:
+    """Return the pin of a photograph whose place a person stated."""
+    if constraint.room is None:
+        stated = replace(base, state="set_aside", rooms=(), suggestions=(), confidence=1.0)
+        return replace(stated, reason="a person stated that it is of none of the rooms")
+    pose = next((row.pose for row in base.suggestions), None)
+    if constraint.position_m is not None:
+        heading = constraint.heading
+        if heading is None and pose is not None:
+            heading = pose.heading
+        pose = ground.pose(constraint.position_m, constraint.room, heading)
+    suggestions = () if pose is None else (Suggestion(pose=pose, probability=1.0),)
+    within_1m = 1.0 if constraint.position_m is not None else base.suggestions[0].probability if suggestions else 0.0
+    return replace(
+        base,
+        state="corrected",
+        pose=pose,
+        confidence=1.0,
+        within_1m=within_1m,
+        suggestions=suggestions + base.suggestions[1:],
+    )

@@ -1,0 +1,222 @@
+"""Background job that solves albums, each by one replica, which holds its lease."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from time import monotonic
+from typing import Any, TypeVar
+
+from lalaloc_core.errors import InvalidInputError
+from service import errors
+from service.capacity.query_context import QueryContext
+from service.capacity.threads import BoundedReads
+from service.query import AlbumProgress, AlbumQuery, LocaliserBackend
+from service.schemas.albums import AlbumDocument
+from service.settings import Settings
+from service.storage import PlanLookup, Store
+from service.storage.album_jobs import AlbumJob
+from service.storage.records import PlanRecord, VenueRecord
+from service.telemetry import LOGGER_NAME, Telemetry
+
+# Albums solved at a time by a replica, one per tenant.
+_AT_A_TIME = 4
+# Renewals of the lease per its length.
+_HEARTBEATS = 8.0
+# Unfinished attempts, by any replicas, before an album counts as failed.
+_MAX_ATTEMPTS = 5
+# Pause (s) after an attempt that can succeed later, and limit of the pause after a solve, which is as long as the
+# solve, so that an album that grows does not keep a core busy.
+_RETRY_S, _MAX_REST_S = 2.0, 3.0
+# Solutions of albums that cannot succeed until something changes.
+_FINAL = (errors.PlanFailedError, errors.VenueUnsearchableError, InvalidInputError)
+# Errors that pass.
+_PASSING = (
+    errors.PlanNotReadyError,
+    errors.VenueNotReadyError,
+    errors.StoreUnavailableError,
+    errors.OverloadedError,
+    errors.DeadlineExceededError,
+    errors.StoppingError,
+    errors.UnknownFloorPlanError,
+    errors.UnknownVenueError,
+)
+# The service itself, in the place of a tenant.
+_SERVICE = ""
+
+T = TypeVar("T")
+
+
+class AlbumSolver:
+    """Solver of the albums of all tenants; for one event loop."""
+
+    def __init__(
+        self,
+        store: Store,
+        plans: PlanLookup,
+        localiser: LocaliserBackend,
+        reads: BoundedReads,
+        settings: Settings,
+        telemetry: Telemetry,
+    ) -> None:
+        """Prepare the job.
+
+        Args:
+            store: the store.
+            plans: plans in memory.
+            localiser: computes the solutions.
+            reads: threads for the database, whose calls can read and write the features of an album.
+            settings: the settings.
+            telemetry: the metrics.
+        """
+        self._store = store
+        self._plans = plans
+        self._localiser = localiser
+        self._reads = reads
+        self._settings = settings
+        self._telemetry = telemetry
+        self._owner = uuid.uuid4().hex
+        self._changed = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._running: dict[str, asyncio.Task[None]] = {}
+
+    def wake(self) -> None:
+        """Look for albums to solve now, from any thread; those that other replicas changed are found at intervals."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._changed.set)
+
+    async def run(self) -> None:
+        """Solve albums until the task is cancelled."""
+        self._loop = asyncio.get_running_loop()
+        try:
+            while True:
+                with suppress(errors.StoreUnavailableError):
+                    await self._begin_due()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(self._settings.grids.sweep_s):
+                        await self._changed.wait()
+                self._changed.clear()
+        finally:
+            self._loop = None
+            for task in self._running.values():
+                task.cancel()
+            await asyncio.gather(*self._running.values(), return_exceptions=True)
+
+    async def _begin_due(self) -> None:
+        """Start a task for each album that is due, of tenants without one."""
+        if (room := _AT_A_TIME - len(self._running)) <= 0:
+            return
+        find, sha256 = self._store.album_jobs.due, self._localiser.model.sha256
+        for tenant, album_id in await self._reads.run(_SERVICE, find, sha256, list(self._running), room):
+            task = self._running[tenant] = asyncio.create_task(self._solve(tenant, album_id))
+            task.add_done_callback(lambda _, tenant=tenant: self._end(tenant))
+
+    def _end(self, tenant: str) -> None:
+        self._running.pop(tenant, None)
+        self._changed.set()
+
+    async def _solve(self, tenant: str, album_id: str) -> None:
+        """Solve an album, if its lease is free, and rest."""
+        begin = monotonic()
+        try:
+            job = await self._call(
+                tenant, lambda: self._store.album_jobs.claim(album_id, self._owner, self._settings.grids.grid_lease_s)
+            )
+            if job is not None:
+                await self._attempt(job)
+        except errors.StoreUnavailableError:
+            await asyncio.sleep(_RETRY_S)
+        except Exception:
+            logging.getLogger(LOGGER_NAME).exception("solving an album failed", extra={"fields": {"album": album_id}})
+            await asyncio.sleep(_RETRY_S)
+        await asyncio.sleep(min(monotonic() - begin, _MAX_REST_S))
+
+    async def _attempt(self, job: AlbumJob) -> None:
+        """Solve a claimed album; its lease ends in any case, at the latest by itself."""
+        progress = AlbumProgress()
+        heartbeat = asyncio.create_task(self._renew(job, progress))
+        finished = failed = False
+        try:
+            with self._telemetry.timed(self._telemetry.album_seconds):
+                await self._pin(job, progress)
+            finished = True
+        except _PASSING as error:
+            fields = {"album": job.album.id, "reason": str(error)}
+            logging.getLogger(LOGGER_NAME).info("album waits", extra={"fields": fields})
+            raise errors.StoreUnavailableError from error
+        except Exception:
+            failed = True
+            raise
+        finally:
+            progress.stopped = True
+            heartbeat.cancel()
+            if not finished:
+                # In a task of its own, so that the end of the service does not interrupt it.
+                await asyncio.shield(asyncio.ensure_future(self._release(job, failed=failed)))
+
+    async def _pin(self, job: AlbumJob, progress: AlbumProgress) -> None:
+        album = job.album
+        document = AlbumDocument.model_validate_json(album.options)
+        place = await self._place(album.tenant, document)
+        if job.attempts > _MAX_ATTEMPTS:
+            reason = f"it was begun {_MAX_ATTEMPTS} times and never finished"
+            await self._finish(job, place.revision_id, failure=reason)
+            return
+        context = QueryContext.starting(album.tenant, self._settings.requests.request_deadline_s)
+        query = AlbumQuery(
+            album_id=album.id, document=document, photographs=job.photographs, context=context, progress=progress
+        )
+        try:
+            outcome = await self._localiser.solve_album(place, query)
+        except _FINAL as error:
+            reason = error.reason if isinstance(error, errors.PlanFailedError) else str(error)
+            await self._finish(job, place.revision_id, failure=reason)
+            return
+        await self._finish(job, place.revision_id, pins=outcome.pins, solution=outcome.solution)
+
+    async def _finish(self, job: AlbumJob, place_revision_id: str, **result: Any) -> None:
+        values = {"pins": {}, "solution": None} | result
+        finish = self._store.album_jobs.finish
+        await self._call(job.album.tenant, lambda: finish(job, self._owner, place_revision_id, **values))
+
+    async def _place(self, tenant: str, document: AlbumDocument) -> PlanRecord | VenueRecord:
+        """Return the plan or venue of an album.
+
+        Raises:
+            UnknownFloorPlanError, UnknownVenueError: it was deleted, and the album with it.
+        """
+        if document.venue_id is not None:
+            venue_id = document.venue_id
+            venue = await self._call(tenant, lambda: self._store.venues.get(tenant, venue_id))
+            if venue is None:
+                raise errors.UnknownVenueError(venue_id)
+            return venue
+        assert document.floorplan_id is not None
+        record = await self._plans.find(tenant, document.floorplan_id, self._reads)
+        if record is None:
+            raise errors.UnknownFloorPlanError(document.floorplan_id)
+        return record
+
+    async def _renew(self, job: AlbumJob, progress: AlbumProgress) -> None:
+        """Renew the lease until the task is cancelled; stop the solve if it is lost."""
+        lease_s = self._settings.grids.grid_lease_s
+        jobs, album = self._store.album_jobs, job.album
+        while not progress.stopped:
+            await asyncio.sleep(lease_s / _HEARTBEATS)
+            # During an outage no other replica can take the lease either.
+            with suppress(errors.StoreUnavailableError):
+                renew = partial(jobs.renew, album.id, self._owner, lease_s, min(max(progress.share, 0.0), 1.0))
+                if not await self._call(album.tenant, renew):
+                    progress.stopped = True
+
+    async def _release(self, job: AlbumJob, *, failed: bool) -> None:
+        release = self._store.album_jobs.release
+        with suppress(errors.StoreUnavailableError):
+            await self._call(job.album.tenant, lambda: release(job.album.id, self._owner, failed=failed))
+
+    async def _call(self, tenant: str, work: Callable[[], T]) -> T:
+        return await self._reads.run(tenant, work)

@@ -1,0 +1,210 @@
+"""Albums: entries of their photographs, and one solve for all of them in a plan or in plans of a venue."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.album.corrections import read_correction
+from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry, read_entry
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.encode.features import encodes_spheres
+from lalaloc_core.localise.query import KnownHeading, Query
+from lalaloc_core.photograph import Photograph
+from lalaloc_core.photograph.taken import Taken
+from service.capacity.admission_control import Slots
+from service.capacity.bounded_cache import BoundedCache
+from service.capacity.fair_share import FairSemaphore
+from service.capacity.threads import Threads
+from service.query.album_answers import compose_outcome
+from service.query.ground import Ground
+from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery
+from service.query.query_parts import QueryParts
+from service.query.spots import Spot, read_view
+from service.schemas.albums import AlbumDocument, PhotographFacts
+from service.storage.album_jobs import AlbumPart
+from service.storage.records import PlanRecord, VenueRecord
+
+# Memory of what solves found about single photographs, all albums together.
+_MEMORY_BYTES = 256 * 2**20
+# Photographs that the plans of a large venue are chosen by.
+_CHOOSING = 8
+_UNKNOWN = KnownHeading(None, 0.0, "searched")
+
+
+class _Stopped(Exception):
+    """The caller does not want the solution any more."""
+
+
+class AlbumSearch:
+    """Solver of albums, on a thread of its own: a solve can take longer than queries may wait."""
+
+    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, permits: FairSemaphore) -> None:
+        self._parts = parts
+        self._queries = queries
+        self._threads = threads
+        self._permits = permits
+        # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
+        self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
+
+    async def entry(self, query: AlbumPhotographQuery) -> AlbumEntry:
+        """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
+        content, document, context = query.content, query.document, query.context
+        with context.clock.stage("decode"):
+            if isinstance(content, Photograph):
+                view, taken = content, Taken()
+            else:
+                view, taken = await self._parts.decoder.decode_for_album(
+                    content, document.stated_camera, context.deadline, context.client
+                )
+
+        if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
+            raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
+
+        def encode() -> AlbumEntry:
+            made = photograph_entry(query.sha256, self._parts.encoder.with_features(view), taken)
+            facts = PhotographFacts(
+                taken_at=None if taken.at is None else taken.at.isoformat(),
+                make=taken.make or None,
+                model=taken.model or None,
+                width=taken.width or None,
+                height=taken.height or None,
+                **vars(read_view(Spot(made.view))),
+            )
+            return AlbumEntry(made.to_bytes(self._parts.bundle), facts.model_dump_json())
+
+        with context.clock.stage("encode"):
+            return await self._parts.executor.compute(context, encode)
+
+    async def solve(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
+        """Pin the photographs of an album.
+
+        Raises:
+            PlanFailedError, VenueUnsearchableError: the plan or venue cannot be searched.
+            PlanNotReadyError, VenueNotReadyError: it is not ready.
+            LaLaLocError: see `Localiser.localise`.
+        """
+        context, document = query.context, query.document
+        # Not on the event loop: the entries of 500 photographs have megabytes.
+        read = partial(self._read, query.photographs)
+        photographs = await self._threads.run(context.client, read)
+        async with self._queries.wait_and_hold(context.client, context.deadline):
+            site = await self._parts.grounds.site(where, document)
+            await site.wait(context)
+            chosen: list[Query] = []
+            if isinstance(where, VenueRecord):
+                spots = [Spot(entry.view) for entry in _spread(photographs)]
+                known, heights = [_UNKNOWN] * len(spots), [site.height] * len(spots)
+                chosen = await self._parts.reader.encode(spots, known, heights, context)
+            ground = await site.ground(chosen, context)
+        work = partial(self._solve, query, ground, photographs)
+        return await self._threads.run(context.client, work)
+
+    def _read(self, parts: Sequence[AlbumPart]) -> list[AlbumPhotograph]:
+        return [replace(read_entry(part.entry, self._parts.bundle), id=part.id) for part in parts]
+
+    def _solve(self, query: AlbumQuery, ground: Ground, photographs: Sequence[AlbumPhotograph]) -> AlbumOutcome:
+        places = _album_ground(ground, query.document)
+        dropped = dict[str, str]()
+        stated = list[AlbumPhotograph]()
+        for entry, part in zip(photographs, query.photographs, strict=True):
+            if part.correction is None:
+                stated.append(entry)
+                continue
+            correction = read_correction(json.loads(part.correction))
+            if (fault := _misfit(places, correction.plan_id, correction.room_id)) is not None:
+                dropped[part.id] = fault
+                stated.append(entry)
+            else:
+                stated.append(replace(entry, correction=correction))
+        memory = self._take(query.album_id)
+        turns = _Turns(self._permits, query.context.client)
+
+        def progress(done: int) -> None:
+            query.progress.share = done / max(len(stated), 1)
+            if query.progress.stopped:
+                raise _Stopped
+            # Others compute in between.
+            turns.pass_on()
+
+        with turns:
+            album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress)
+        self._memories.put(query.album_id, memory)
+        before = {part.id: part.pin for part in query.photographs}
+        return compose_outcome(album, ground, before, dropped, places.plan.camera_height_m)
+
+    def _take(self, album_id: str) -> AlbumMemory:
+        memory = self._memories.get(album_id) or AlbumMemory()
+        self._memories.drop(lambda key, _: key == album_id)
+        return memory
+
+    def close(self) -> None:
+        """Wait for the solve in progress."""
+        self._threads.close()
+
+
+class _Turns:
+    """Permit to compute that a thread holds, and passes on to others that wait."""
+
+    def __init__(self, permits: FairSemaphore, client: str) -> None:
+        self._permits, self._client = permits, client
+        self._held = permits.hold(client)
+
+    def __enter__(self) -> _Turns:
+        self._held = self._permits.hold(self._client)
+        self._held.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.__exit__(None, None, None)
+
+    def pass_on(self) -> None:
+        """Give the permit to the next one, and wait for it."""
+        self.__exit__()
+        self.__enter__()
+
+
+def _size_of(memory: AlbumMemory) -> int:
+    return sum(array.nbytes for arrays in memory.evidence.values() for array in arrays.values()) + 100 * len(
+        memory.links
+    )
+
+
+def _spread(photographs: Sequence[AlbumPhotograph]) -> list[AlbumPhotograph]:
+    step = max(len(photographs) // _CHOOSING, 1)
+    return list(photographs[::step][:_CHOOSING])
+
+
+def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
+    """Return the ground for the core; a stated camera height takes the place of the plans' own."""
+
+    def stated(plan: FloorPlan) -> FloorPlan:
+        if document.camera_height_m is None:
+            return plan
+        std_m = plan.camera_height_std_m if document.camera_height_std_m is None else document.camera_height_std_m
+        return replace(
+            plan, camera_height_m=document.camera_height_m, camera_height_std_m=std_m, states_camera_height=True
+        )
+
+    ids = tuple(record.id for record in ground.records)
+    if ground.merged is None:
+        return AlbumGround.of_plan(ids[0], stated(ground.plan), ground.grid)
+    merged = AlbumGround.of_venue(ids, ground.merged)
+    return replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan))
+
+
+def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:
+    """Return why a correction does not fit the plans; None if it does."""
+    if plan_id is None:
+        return None
+    if plan_id not in places.plan_ids:
+        return "its correction was left out: its floor plan is not searched any more"
+    if room_id is not None and places.room_of(plan_id, room_id) is None:
+        return f"its correction was left out: the floor plan has no room '{room_id[:64]}' any more"
+    return None

@@ -1,0 +1,387 @@
+"""Photographs of an album: add, list as JSON, GeoJSON, CSV or SVG, correct, delete."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response, status
+
+from lalaloc_core.draw.plan import HEAT_PLACE
+from lalaloc_core.errors import InvalidCorrectionError, InvalidFeaturesError
+from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
+from service import errors
+from service.albums.album_corrections import correction_document, stored_correction
+from service.albums.album_files import pins_csv, pins_geojson, pins_svg
+from service.http.accept import preferred
+from service.http.conditional import expected_revision, not_modified, revision_etag, tagged_answer
+from service.http.cursors import cursor_text, parse_venue_cursor
+from service.http.fields import parse_document
+from service.http.piecewise import NDJSON, LinesResponse
+from service.http.problems import problem_responses
+from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
+from service.query import AlbumPhotographQuery, Content, QueryContext
+from service.routes.albums import album_of
+from service.routes.batch_lines import BatchLines
+from service.routes.dependencies import After, ApiCall, Call, is_id
+from service.routes.descriptions import (
+    BODY_ERRORS,
+    CONDITIONAL,
+    NOT_MODIFIED,
+    QUERY_ERRORS,
+    READ_ERRORS,
+    STORE_ERRORS,
+    UNLESS_CHANGED,
+    json_body,
+)
+from service.routes.query_request import FEATURES, PHOTO, VARY, read_files
+from service.schemas.albums import (
+    AlbumDocument,
+    AlbumLine,
+    AlbumPhotographAnswer,
+    AlbumPhotographForm,
+    AlbumPhotographList,
+    PhotographChangeDocument,
+    PhotographFacts,
+    PinAnswer,
+)
+from service.schemas.problem_details import Problem
+from service.security import caller_of
+from service.storage.album_rows import AlbumRecord, NewPhotograph, PhotographRecord
+from service.storage.records import PlanRecord, VenuePlace
+from service.uploaded_file import UploadedFile
+
+router = APIRouter(prefix="/albums/{album_id}/photographs", tags=["albums"])
+_CSV, _SVG = "text/csv", "image/svg+xml"
+_MEDIA = (JSON, GEOJSON, _CSV, _SVG)
+_INERT = {"Content-Security-Policy": "default-src 'none'; img-src data:"}
+_HEAT = HEAT_PLACE.encode()
+_VALUES = 100
+_MOST, _PAGE = 500, 100
+_MAX_NAME = 255
+_MISSING = (errors.UnknownAlbumError, errors.UnknownAlbumPhotographError)
+_PHOTOS_SCHEMA: dict[str, Any] = {
+    "type": "array",
+    "items": {"type": "string", "format": "binary"},
+    "description": "Photographs, one part named `photo` each, as for `POST /localise`; limits: "
+    "`max_batch_photographs`, and `max_sequence_bytes` together.",
+}
+_FEATURES_SCHEMA = _PHOTOS_SCHEMA | {
+    "description": "Instead of `photo`: their features, computed on the device (docs/reference/features.md)."
+}
+_BODY = {
+    "required": True,
+    "content": {
+        MULTIPART: {"schema": {"type": "object", "properties": {PHOTO: _PHOTOS_SCHEMA, FEATURES: _FEATURES_SCHEMA}}}
+    },
+}
+
+
+@router.post(
+    "",
+    summary="Add photographs to an album",
+    status_code=200,
+    response_class=LinesResponse,
+    response_model=AlbumLine,
+    openapi_extra={"requestBody": _BODY},
+    responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
+    | problem_responses(
+        *(error for error in QUERY_ERRORS if error not in (errors.PlanFailedError, errors.PlanNotReadyError)),
+        errors.RateLimitedError,
+        errors.UnknownAlbumError,
+        errors.UnknownFloorPlanError,
+        errors.UnknownVenueError,
+        errors.AlbumOutdatedError,
+        errors.TooManyPhotographsError,
+        errors.StorageQuotaError,
+        errors.StoreFullError,
+    ),
+)
+async def add_album_photographs(album_id: str, call: Call) -> Response:
+    """Add photographs, whose pins are then found with all others of the album.
+
+    The answer is a stream of lines of JSON, one per photograph in the order of the request, each sent when the
+    photograph is stored. One that cannot be read gets a line with its problem; the others continue. The same picture
+    is stored once: sent again, as after a lost answer, its line has status 200 instead of 201. Limits are those of
+    `POST /localise/batch`; an album has at most `max_album_photographs`.
+    """
+    call.idempotent(NDJSON)
+    album = await call.read(album_of, call, album_id)
+    album.check_model(call.runtime.bundle.sha256)
+    most = call.settings.photographs.max_batch_photographs
+    repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
+    _, parts, _ = await read_files(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
+    are_features = bool(parts.named(FEATURES))
+    files = parts.named(PHOTO) or parts.named(FEATURES)
+    await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))
+    adding = _Adding(call, album, len(files), are_features=are_features)
+    lines = BatchLines(call, adding.add, adding.line).lines([(file, file) for file in files])
+    return LinesResponse(lines, call.settings.requests.request_deadline_s)
+
+
+class _Adding:
+    """Photographs of one request that are added to an album."""
+
+    def __init__(self, call: ApiCall, album: AlbumRecord, count: int, *, are_features: bool) -> None:
+        self._call = call
+        self._album = album
+        self._document = AlbumDocument.model_validate_json(album.options)
+        self._are_features = are_features
+        # Photographs are read side by side, and stored in the order of the request.
+        self._done = [asyncio.Event() for _ in range(count)]
+
+    async def add(
+        self, index: int, file: UploadedFile, _: Content, context: QueryContext
+    ) -> tuple[PhotographRecord, bool]:
+        """Store a photograph, and return it with True if it is new."""
+        call, album = self._call, self._album
+        content, sha256 = await call.upload(self._read, file)
+        same = await call.read(call.store.albums.same_picture, album.id, sha256)
+        if same is not None:
+            return same, False
+        place = await call.place(self._document.floorplan_id, self._document.venue_id)
+        query = AlbumPhotographQuery(document=self._document, content=content, sha256=sha256, context=context)
+        entry = await call.runtime.localiser.album_entry(place, query)
+        new = NewPhotograph(sha256=sha256, name=_clean(file.name), facts=entry.facts, entry=entry.entry)
+        if index:
+            await self._done[index - 1].wait()
+        storage = call.settings.storage
+        ttl_s, limit = storage.album_ttl_s, storage.max_album_photographs
+        added = await call.upload(
+            lambda: call.store.albums.add_photograph(call.tenant, album.id, new, ttl_s=ttl_s, limit=limit)
+        )
+        call.runtime.albums.wake()
+        return added
+
+    def _read(self, file: UploadedFile) -> tuple[Content, str]:
+        digest = hashlib.sha256()
+        for chunk in file.chunks():
+            digest.update(chunk)
+        if not self._are_features:
+            return file, digest.hexdigest()
+        if len(file) > MAX_BYTES:
+            raise InvalidFeaturesError(f"{FEATURES} has {len(file)} bytes; the limit is {MAX_BYTES}")
+        return read_features(file.read(), self._call.runtime.bundle), digest.hexdigest()
+
+    def line(
+        self,
+        index: int,
+        name: str | None,
+        added: tuple[PhotographRecord, bool] | None,
+        problem: Problem | None,
+        retry_after_s: int | None,
+    ) -> AlbumLine:
+        """Return the line of a photograph, after which the next one can be stored."""
+        self._done[index].set()
+        if added is None:
+            assert problem is not None
+            return AlbumLine(
+                index=index, name=name, status=problem.status, problem=problem, retry_after_s=retry_after_s
+            )
+        record, is_new = added
+        return AlbumLine(index=index, name=name, status=201 if is_new else 200, photograph=_photograph_answer(record))
+
+
+@router.get(
+    "",
+    summary="List the photographs of an album",
+    response_model=AlbumPhotographList,
+    responses={
+        200: {
+            # As for `POST /localise`, files are not listed under `content`.
+            "description": f"The photographs with their pins; with `Accept: {_CSV}` a table, with `Accept: {_SVG}` a "
+            "drawing of a plan with its pins.",
+            "content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}},
+        }
+    }
+    | problem_responses(errors.UnknownAlbumError, errors.UnanchoredPlanError, *READ_ERRORS),
+)
+async def list_album_photographs(
+    album_id: str,
+    call: Call,
+    limit: Annotated[
+        int | None,
+        Query(ge=1, le=_MOST, description=f"Maximum number of photographs. Default: {_PAGE}; {_MOST} in other forms."),
+    ] = None,
+    cursor: After = None,
+    floorplan_id: Annotated[
+        str | None, Query(description="Plan of a venue whose pins are wanted; a drawing needs it.")
+    ] = None,
+) -> Response:
+    """List the photographs of an album with their pins, in the order of uploads.
+
+    With `Accept: text/csv` a table, with `Accept: application/geo+json` a FeatureCollection for plans with an
+    `anchor`, with `Accept: image/svg+xml` a drawing of the plan with a numbered pin and an arrow for each. A page
+    follows at the address of the `Link` header with `rel="next"`.
+    """
+    media = preferred(call.request, _MEDIA)
+    album = await call.read(album_of, call, album_id)
+    after = 0 if cursor is None else int(parse_venue_cursor(cursor).level)
+    count = limit or (_PAGE if media == JSON else _MOST)
+    found = await call.read(lambda: call.store.albums.photographs(album.id, limit=count + 1, after=after))
+    page, more = found[:count], None
+    if len(found) > count:
+        more = cursor_text(VenuePlace(float(page[-1].number), page[-1].id))
+    photographs = [_photograph_answer(record) for record in page]
+    if floorplan_id is not None:
+        photographs = [row for row in photographs if row.pin and row.pin.place and _plan_of(row) == floorplan_id]
+    headers = VARY | ({} if more is None else {"Link": f'<?cursor={more}>; rel="next"'})
+    if media == JSON:
+        answer = AlbumPhotographList(photographs=photographs, next_cursor=more)
+        return Response(answer.model_dump_json(), headers=headers, media_type=JSON)
+    if media == _CSV:
+        name = {"Content-Disposition": 'attachment; filename="album.csv"'}
+        return Response(pins_csv(photographs), headers=headers | name, media_type=_CSV)
+    if media == GEOJSON:
+        features = pins_geojson(photographs)
+        if features is None:
+            raise errors.UnanchoredPlanError(_plan_of(next(row for row in photographs if row.pin)), album.venue_id)
+        return Response(json.dumps(features), headers=headers, media_type=GEOJSON)
+    drawing = await _drawing(call, album, photographs, floorplan_id)
+    return Response(drawing, headers=headers | _INERT, media_type=_SVG)
+
+
+async def _drawing(
+    call: ApiCall, album: AlbumRecord, photographs: Sequence[AlbumPhotographAnswer], floorplan_id: str | None
+) -> bytes:
+    plan_id = album.plan_id or floorplan_id
+    if plan_id is None:
+        raise errors.InvalidRequestError([("floorplan_id", "is missing; a drawing shows one plan of the venue")])
+    shown = [row.pin.place for row in photographs if row.pin is not None and row.pin.place is not None]
+    # That of the pins, if it is still kept.
+    revision = next((place.floorplan_revision for place in shown if place.floorplan_id == plan_id), None)
+    try:
+        plan, _ = await asyncio.to_thread(call.plan_at_revision, plan_id, revision)
+    except errors.UnknownRevisionError:
+        plan, _ = await asyncio.to_thread(call.plan_at_revision, plan_id, None)
+    rooms = await call.rendition(plan, "preview")
+    head, tail = pins_svg(f"{plan.name}: {album.name}", rooms.bounds_m, photographs)
+    return head.encode() + rooms.content.replace(_HEAT, b"") + tail.encode()
+
+
+@router.get(
+    "/{photograph_id}",
+    summary="Get a photograph of an album",
+    response_model=AlbumPhotographAnswer,
+    openapi_extra=CONDITIONAL,
+    responses=NOT_MODIFIED | problem_responses(*_MISSING, *READ_ERRORS),
+)
+def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
+    """Return a photograph with its correction and its pin."""
+    content, etag = _representation(_photograph_of(call, album_of(call, album_id), photograph_id))
+    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
+
+
+@router.patch(
+    "/{photograph_id}",
+    summary="Correct a photograph of an album",
+    response_model=AlbumPhotographAnswer,
+    openapi_extra={"requestBody": json_body(PhotographChangeDocument), "parameters": UNLESS_CHANGED},
+    responses=problem_responses(
+        errors.InvalidRequestError,
+        InvalidCorrectionError,
+        *BODY_ERRORS,
+        *STORE_ERRORS,
+        *_MISSING,
+        errors.AlbumOutdatedError,
+        errors.RevisionMismatchError,
+    ),
+)
+async def correct_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
+    """State where a photograph was taken, confirm its pin, or undo that; the rest is then solved again.
+
+    The answer has the correction at once; pins follow when the album is `solved` again.
+    """
+    content = await call.read_json()
+    document = await call.upload(parse_document, PhotographChangeDocument, content.read(), _VALUES)
+    album = await call.read(album_of, call, album_id)
+    album.check_model(call.runtime.bundle.sha256)
+    current = await call.read(_photograph_of, call, album, photograph_id)
+    expected = expected_revision(call.request, current.id, current.revision_id, what="photograph")
+    correction = None
+    if document.correction is not None:
+        pin, plan = _pin_of(current), None
+        pinned = None if pin is None or pin.place is None else pin.place.floorplan_id
+        plan_id = document.correction.floorplan_id or album.plan_id or pinned
+        if album.plan_id not in (None, plan_id):
+            raise errors.InvalidRequestError([("correction.floorplan_id", "is not the floor plan of the album")])
+        if plan_id is not None and (document.correction.room_id or document.correction.position):
+            place = await call.place(plan_id, None)
+            assert isinstance(place, PlanRecord)
+            plan = place.plan
+        correction = stored_correction(document.correction, plan_id, plan, pin)
+    ttl_s = call.settings.storage.album_ttl_s
+
+    def store() -> Response:
+        correct = call.store.albums.correct
+        record = correct(call.tenant, album.id, current.id, correction, ttl_s=ttl_s, expected=expected)
+        content, etag = _representation(record)
+        path = call.path_of("get_album_photograph", album_id=album.id, photograph_id=record.id)
+        return call.change_answer(content, etag, path, created=False)
+
+    answer = await call.upload(store)
+    call.runtime.albums.wake()
+    return answer
+
+
+@router.delete(
+    "/{photograph_id}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete a photograph of an album",
+    openapi_extra={"parameters": UNLESS_CHANGED},
+    responses=problem_responses(*_MISSING, errors.RevisionMismatchError, *READ_ERRORS),
+)
+def delete_album_photograph(album_id: str, photograph_id: str, call: Call) -> None:
+    """Delete a photograph with its features and its pin; the rest is solved again."""
+    album = album_of(call, album_id)
+    current = _photograph_of(call, album, photograph_id)
+    expected = expected_revision(call.request, current.id, current.revision_id, what="photograph")
+    ttl_s = call.settings.storage.album_ttl_s
+    call.store.albums.delete_photograph(call.tenant, album.id, current.id, ttl_s=ttl_s, expected=expected)
+    call.runtime.albums.wake()
+
+
+def _clean(name: str | None) -> str | None:
+    """Return the name of a file without folders and characters that cannot be shown or stored; None for no name."""
+    shown = "".join(filter(str.isprintable, (name or "").replace("\\", "/").rpartition("/")[2]))
+    return shown[:_MAX_NAME] or None
+
+
+def _photograph_of(call: ApiCall, album: AlbumRecord, photograph_id: str) -> PhotographRecord:
+    if not is_id(photograph_id):
+        raise errors.UnknownAlbumPhotographError(album.id, photograph_id)
+    return call.store.albums.photograph(album.id, photograph_id)
+
+
+def _pin_of(record: PhotographRecord) -> PinAnswer | None:
+    return None if record.pin is None else PinAnswer.model_validate_json(record.pin)
+
+
+def _plan_of(photograph: AlbumPhotographAnswer) -> str:
+    assert photograph.pin is not None
+    assert photograph.pin.place is not None
+    return photograph.pin.place.floorplan_id
+
+
+def _photograph_answer(record: PhotographRecord) -> AlbumPhotographAnswer:
+    correction = None if record.correction is None else correction_document(record.correction)
+    return AlbumPhotographAnswer(
+        id=record.id,
+        number=record.number,
+        revision=record.revision_id,
+        name=record.name,
+        sha256=record.sha256,
+        added_at=record.created_at,
+        view=PhotographFacts.model_validate_json(record.facts),
+        correction=correction,
+        pin=_pin_of(record),
+    )
+
+
+def _representation(record: PhotographRecord) -> tuple[bytes, str]:
+    """Return a photograph as JSON, and its entity tag."""
+    content = _photograph_answer(record).model_dump_json().encode()
+    return content, revision_etag(record.revision_id, content)

@@ -1,0 +1,192 @@
+"""Albums: create, list, read, follow, delete."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+
+from fastapi import APIRouter, Response, status
+from fastapi.responses import StreamingResponse
+
+from lalaloc_core.errors import InvalidPoseError
+from lalaloc_core.localise.encode.features import gives_features
+from service import errors
+from service.http.conditional import not_modified, revision_etag, tagged_answer
+from service.http.events import EventStream
+from service.http.fields import parse_document
+from service.http.problems import problem_responses
+from service.http.uploads import JSON, Parts
+from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
+from service.routes.descriptions import (
+    BODY_ERRORS,
+    CONDITIONAL,
+    IDEMPOTENCY_ERRORS,
+    IDEMPOTENCY_KEY,
+    NOT_MODIFIED,
+    READ_ERRORS,
+    STORE_ERRORS,
+    UNLESS_CHANGED,
+    json_body,
+)
+from service.schemas.albums import AlbumAnswer, AlbumDocument, AlbumList, AlbumSolution, AlbumSummary
+from service.storage.album_rows import AlbumRecord, NewAlbum
+
+router = APIRouter(prefix="/albums", tags=["albums"])
+# Lists, objects and items of an album document.
+_VALUES = 100
+_ALBUM_RESPONSES = problem_responses(errors.UnknownAlbumError, *READ_ERRORS)
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    summary="Create an album",
+    response_model=AlbumAnswer,
+    openapi_extra={"requestBody": json_body(AlbumDocument), "parameters": [IDEMPOTENCY_KEY]},
+    responses=problem_responses(
+        InvalidPoseError,
+        errors.InvalidRequestError,
+        *BODY_ERRORS,
+        *STORE_ERRORS,
+        errors.UnknownFloorPlanError,
+        errors.UnknownVenueError,
+        errors.VenueUnsearchableError,
+        errors.FeaturelessModelError,
+        errors.TooManyAlbumsError,
+        *IDEMPOTENCY_ERRORS,
+    ),
+)
+async def create_album(call: Call) -> Response:
+    """Create an album of photographs that are pinned together to a floor plan, or to the plans of a venue.
+
+    Add photographs at `/albums/{album_id}/photographs`. They are solved in the background, all at once, after each
+    change: shared cameras, ways from place to place, and corrections count for all of them. Photographs themselves are
+    not stored, only their features. An album expires `album_ttl_s` after its last change, and is deleted with its plan
+    or venue. After a new revision of the plan it is solved again.
+    """
+    idempotent, storage = call.idempotent(), call.settings.storage
+    content = await call.read_json()
+    document = await call.upload(parse_document, AlbumDocument, content.read(), _VALUES)
+    # Checked before anything is stored.
+    _ = document.stated_camera
+    if not gives_features(manifest := call.runtime.bundle.manifest):
+        raise errors.FeaturelessModelError(manifest.name)
+    place = await call.place(document.floorplan_id, document.venue_id)
+    await call.runtime.localiser.check(place, document)
+    new = NewAlbum(
+        name=document.name,
+        plan_id=document.floorplan_id,
+        venue_id=document.venue_id,
+        options=document.model_dump_json(exclude_unset=True),
+        model_sha256=call.runtime.bundle.sha256,
+    )
+
+    def store(token: str) -> Response:
+        add = call.store.albums.add
+        record = add(call.tenant, token, new, ttl_s=storage.album_ttl_s, limit=storage.max_albums)
+        content, etag = _representation(record, call)
+        return call.change_answer(content, etag, call.path_of("get_album", album_id=record.id), created=True)
+
+    return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
+
+
+@router.get("", summary="List albums", responses=problem_responses(*READ_ERRORS))
+def list_albums(call: Call, page: Page, name: Name = None) -> AlbumList:
+    """List albums, newest first."""
+    found, more = page.read(partial(call.store.albums.list_albums, call.tenant, name=name))
+    return AlbumList(albums=[_summary(record, call) for record in found], next_cursor=more)
+
+
+@router.get(
+    "/{album_id}",
+    summary="Get an album",
+    response_model=AlbumAnswer,
+    openapi_extra=CONDITIONAL,
+    responses=NOT_MODIFIED | _ALBUM_RESPONSES,
+)
+def get_album(album_id: str, call: Call) -> Response:
+    """Return an album with its state and what its photographs have in common."""
+    content, etag = _representation(album_of(call, album_id), call)
+    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
+
+
+@router.get(
+    "/{album_id}/events",
+    summary="Follow an album",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Server-sent events; their data is an AlbumEvent.",
+            "content": {EventStream.media_type: {"schema": {"type": "string"}}},
+        },
+        **_ALBUM_RESPONSES,
+    },
+)
+async def follow_album(album_id: str, call: Call) -> Response:
+    """Stream server-sent events about the solution of an album.
+
+    `progress` comes at once and after each change, up to four times a second; `solved`, `failed`, `outdated` or
+    `deleted` is the last event. Comments and the end of the stream are as for floor plans.
+    """
+    record = await asyncio.to_thread(album_of, call, album_id)
+    return call.runtime.album_events.event_stream(
+        record.id, partial(call.runtime.access_control.still_authorised, call.request)
+    )
+
+
+@router.delete(
+    "/{album_id}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete an album",
+    openapi_extra={"parameters": UNLESS_CHANGED},
+    responses=problem_responses(errors.UnknownAlbumError, errors.RevisionMismatchError, *READ_ERRORS),
+)
+def delete_album(album_id: str, call: Call) -> None:
+    """Delete an album with its photographs."""
+    current = album_of(call, album_id)
+    call.store.albums.delete(call.tenant, current.id, expected=call.expected_revision(current))
+
+
+def album_of(call: ApiCall, album_id: str) -> AlbumRecord:
+    """Return a stored album. Blocks.
+
+    Raises:
+        UnknownAlbumError: no such album, or it has expired.
+    """
+    if not is_id(album_id):
+        raise errors.UnknownAlbumError(album_id)
+    record = call.store.albums.get(call.tenant, album_id)
+    call.log(plan=record.plan_id, venue=record.venue_id, revision=record.revision_id)
+    return record
+
+
+def _summary(record: AlbumRecord, call: ApiCall) -> AlbumSummary:
+    """Return an album as an item of a list."""
+    return AlbumSummary(
+        id=record.id,
+        revision=record.revision_id,
+        revision_number=record.number,
+        name=record.name,
+        floorplan_id=record.plan_id,
+        venue_id=record.venue_id,
+        state=record.state(call.runtime.bundle.sha256),
+        progress=record.progress,
+        reason=record.failure,
+        photographs=record.photographs,
+        solved_revision_number=record.solved_number,
+        created_at=record.created_at,
+        updated_at=record.updated_at,
+        expires_at=record.expires_at,
+    )
+
+
+def _representation(record: AlbumRecord, call: ApiCall) -> tuple[bytes, str]:
+    """Return an album as JSON, and its entity tag."""
+    answer = AlbumAnswer(
+        **_summary(record, call).model_dump(),
+        place_revision=record.place_revision_id,
+        model_sha256=record.model_sha256,
+        solution=None if record.solution is None else AlbumSolution.model_validate_json(record.solution),
+    )
+    content = answer.model_dump_json().encode()
+    return content, revision_etag(record.revision_id, content)

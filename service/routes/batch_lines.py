@@ -1,0 +1,121 @@
+"""Lines of JSON about many photographs of one request, as many at a time as there are cores that compute."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from typing import Generic, TypeVar
+
+from pydantic import BaseModel
+
+from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from service import errors
+from service.http.problems import problem_document
+from service.query import Content, QueryContext
+from service.routes.dependencies import ApiCall
+from service.schemas.problem_details import Problem
+from service.telemetry import LOGGER_NAME
+from service.uploaded_file import UploadedFile
+
+# Errors that every further photograph of the request would meet.
+_COMMON_ERRORS = (
+    InvalidHintError,
+    errors.AlbumOutdatedError,
+    errors.PlanFailedError,
+    errors.PlanNotReadyError,
+    errors.StoppingError,
+    errors.TooManyPhotographsError,
+    errors.UnknownAlbumError,
+    errors.VenueNotReadyError,
+    errors.VenueUnsearchableError,
+)
+# Pause (s) before a photograph asks again for a slot, while the tenant's other queries have them.
+_BUSY_PAUSE_S = 0.25
+_MAX_NAME = 255
+
+T = TypeVar("T")
+Photographs = Sequence[tuple[UploadedFile, Content]]
+# Number, file name, answer or problem, and seconds until the photograph can be sent again.
+LineOf = Callable[[int, str | None, T | None, Problem | None, int | None], BaseModel]
+
+
+class BatchLines(Generic[T]):
+    """Answers to the photographs of one request, as lines in their order.
+
+    Args:
+        call: the request.
+        answer: answers the photograph of a number; called again while the tenant's other queries have all slots.
+        line: makes the line of a photograph, see `LineOf`.
+    """
+
+    def __init__(
+        self, call: ApiCall, answer: Callable[[int, UploadedFile, Content, QueryContext], Awaitable[T]], line: LineOf[T]
+    ) -> None:
+        self._call = call
+        self._answer_one = answer
+        self._line_of = line
+        self._common_error: Exception | None = None
+
+    async def lines(self, photographs: Photographs) -> AsyncGenerator[str]:
+        """Yield the line of every photograph, in order. While a line is not taken, no further photograph begins."""
+        cores = self._call.settings.cores
+        at_a_time = max(cores.workers + cores.compute_threads, 1)
+        begun = deque[asyncio.Task[str]]()
+        try:
+            for index, (file, photograph) in enumerate(photographs):
+                begun.append(asyncio.create_task(self._charged_line(index, file, photograph)))
+                if len(begun) >= at_a_time:
+                    yield await begun[0]
+                    begun.popleft()
+            while begun:
+                yield await begun[0]
+                begun.popleft()
+        finally:
+            for task in begun:
+                task.cancel()
+            await asyncio.gather(*begun, return_exceptions=True)
+
+    async def _charged_line(self, index: int, file: UploadedFile, photograph: Content) -> str:
+        # A task is not part of the request's own steps.
+        line = self._line(index, file, photograph)
+        return await self._call.runtime.admission.cpu_accounts.charged_steps(self._call.client, line)
+
+    async def _line(self, index: int, file: UploadedFile, photograph: Content) -> str:
+        answer = problem = retry_after_s = None
+        try:
+            answer = await self._answer(index, file, photograph)
+        except Exception as error:
+            if not isinstance(error, LaLaLocError):
+                logging.getLogger(LOGGER_NAME).exception("unexpected error")
+            if isinstance(error, _COMMON_ERRORS):
+                self._common_error = error
+            problem = problem_document(self._call.request, error)
+            retry_after_s = error.retry_after_s if isinstance(error, errors.ServiceError) else None
+        finally:
+            file.close()
+        name = None if file.name is None else file.name[:_MAX_NAME]
+        line = self._line_of(index, name, answer, problem, retry_after_s)
+        # In ASCII: names and details quote the request, which is not always encodable as UTF-8.
+        return json.dumps(line.model_dump(mode="json", exclude_none=problem is not None))
+
+    async def _answer(self, index: int, file: UploadedFile, photograph: Content) -> T:
+        """Answer one photograph; wait for a slot while the tenant's other queries have them all."""
+        settings = self._call.settings
+        limit = settings.photographs.max_photograph_bytes
+        if len(file) > limit:
+            raise errors.UploadTooLargeError("max_photograph_bytes", limit, len(file))
+        context = QueryContext.starting(self._call.client, settings.requests.request_deadline_s)
+        while True:
+            if self._call.runtime.admission.stopping:
+                raise errors.StoppingError()
+            if self._common_error is not None:
+                raise self._common_error
+            try:
+                return await self._answer_one(index, file, photograph, context)
+            except errors.OverloadedError:
+                if context.left_s < _BUSY_PAUSE_S:
+                    raise
+            await asyncio.sleep(_BUSY_PAUSE_S)

@@ -1,0 +1,168 @@
+"""Leases on the solution of albums, and its results.
+
+An album is due when it, its plan or a plan of its venue has changed since it was solved. Any replica can take the lease
+of a due album; the lease of one that died expires, so that another solves the album.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from sqlalchemy import bindparam, func, select, update
+
+from service.storage.album_rows import AlbumRecord, album_record, is_due, select_albums
+from service.storage.database import Database
+from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, TENANTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlbumPart:
+    """Photograph of an album that is solved.
+
+    Attributes:
+        facts: size, time and camera, as JSON.
+        entry: its features.
+        correction: its correction as JSON; None without one.
+        pin: its pin before, as JSON; None before the first solution.
+    """
+
+    id: str
+    number: int
+    sha256: str
+    facts: str
+    entry: bytes
+    correction: str | None
+    pin: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlbumJob:
+    """Album under the lease of an owner.
+
+    Attributes:
+        album: the album.
+        photographs: its photographs, by number.
+        place_change: number of the tenant's last change of a plan.
+        attempts: number of claims since it was last solved or changed, this one included.
+    """
+
+    album: AlbumRecord
+    photographs: list[AlbumPart]
+    place_change: int
+    attempts: int
+
+
+class AlbumJobs:
+    """Leases on albums of all tenants, regardless of caller."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def due(self, model_sha256: str, tenants: Collection[str], limit: int) -> list[tuple[str, str]]:
+        """Return tenant and id of albums that no replica solves, at most one per tenant.
+
+        Args:
+            model_sha256: digest of the running model.
+            tenants: tenants to leave out.
+            limit: maximum number of albums.
+        """
+        columns = ALBUMS.c
+        live = self._database.is_live(columns.lease_until_s, columns.lease_s)
+        first = func.row_number().over(partition_by=columns.tenant, order_by=(columns.updated_at, columns.id))
+        waiting = (
+            select(columns.tenant, columns.id, columns.updated_at, first.label("place"))
+            .where(columns.model_sha256 == model_sha256, columns.expires_at >= datetime.now(UTC), is_due(), ~live)
+            .where(columns.tenant.not_in(list(tenants)))
+            .subquery()
+        )
+        query = select(waiting.c.tenant, waiting.c.id).where(waiting.c.place == 1).order_by(waiting.c.updated_at)
+        with self._database.reading() as connection:
+            return [(row.tenant, row.id) for row in connection.execute(query.limit(limit))]
+
+    def claim(self, album_id: str, owner: str, lease_s: float) -> AlbumJob | None:
+        """Take the lease on a due album; None if another owner holds it, or there is nothing to do."""
+        columns = ALBUMS.c
+        free = ~self._database.is_live(columns.lease_until_s, columns.lease_s)
+        values = {
+            "owner": owner,
+            "lease_until_s": self._database.now_s() + lease_s,
+            "lease_s": lease_s,
+            "progress": 0.0,
+            "attempts": columns.attempts + 1,
+        }
+        statement = update(ALBUMS).where(columns.id == album_id, free, is_due()).values(**values)
+        with self._database.writing() as connection:
+            attempts = connection.scalar(statement.returning(columns.attempts))
+            if attempts is None:
+                return None
+            album = album_record(connection.execute(select_albums().where(columns.id == album_id)).one())
+            changes = connection.scalar(select(TENANTS.c.changes).where(TENANTS.c.tenant == album.tenant))
+            parts = ALBUM_PHOTOGRAPHS.c
+            names = [parts[name] for name in AlbumPart.__dataclass_fields__]
+            rows = connection.execute(select(*names).where(parts.album_id == album_id).order_by(parts.number))
+            photographs = [AlbumPart(**row._mapping) for row in rows]
+        return AlbumJob(album=album, photographs=photographs, place_change=changes or 0, attempts=attempts)
+
+    def renew(self, album_id: str, owner: str, lease_s: float, progress: float) -> bool:
+        """Renew a lease and store the progress; False if the owner lost it, or the album was deleted."""
+        values = {"lease_until_s": self._database.now_s() + lease_s, "lease_s": lease_s, "progress": progress}
+        own = ALBUMS.c.id == album_id, ALBUMS.c.owner == owner
+        with self._database.writing() as connection:
+            return connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount == 1
+
+    def release(self, album_id: str, owner: str, *, failed: bool = False) -> None:
+        """Release a lease without a solution; the attempt does not count unless it `failed`."""
+        columns = ALBUMS.c
+        attempts = columns.attempts if failed else columns.attempts - 1
+        own = columns.id == album_id, columns.owner == owner
+        with self._database.writing() as connection:
+            values = {"owner": "", "lease_until_s": 0.0, "progress": 0.0, "attempts": attempts}
+            connection.execute(update(ALBUMS).where(*own).values(**values))
+
+    def finish(
+        self,
+        job: AlbumJob,
+        owner: str,
+        place_revision_id: str,
+        *,
+        pins: Mapping[str, str],
+        solution: str | None,
+        failure: str | None = None,
+    ) -> bool:
+        """Store the solution of an album, or the reason why there is none, and release the lease.
+
+        Args:
+            job: the album as it was claimed. If it has changed since, it stays due.
+            owner: owner of the lease.
+            place_revision_id: revision of the plan or venue.
+            pins: pin of each photograph as JSON, by id; photographs that were deleted meanwhile are left out.
+            solution: the common part as JSON; None keeps the one before.
+            failure: the reason.
+
+        Returns:
+            False if the owner lost the lease, or the album was deleted.
+        """
+        values = {
+            "solved_number": job.album.number,
+            "place_revision_id": place_revision_id,
+            "place_change": job.place_change,
+            "failure": failure,
+            "owner": "",
+            "lease_until_s": 0.0,
+            "progress": 0.0,
+            "attempts": 0,
+        }
+        if solution is not None:
+            values["solution"] = solution
+        own = ALBUMS.c.id == job.album.id, ALBUMS.c.owner == owner
+        columns = ALBUM_PHOTOGRAPHS.c
+        pinned = update(ALBUM_PHOTOGRAPHS).where(columns.id == bindparam("photograph_id"))
+        with self._database.writing(grows_by=sum(map(len, pins.values()))) as connection:
+            if connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount != 1:
+                return False
+            if pins:
+                rows = [{"photograph_id": key, "new_pin": pin} for key, pin in pins.items()]
+                connection.execute(pinned.values(pin=bindparam("new_pin")), rows)
+        return True

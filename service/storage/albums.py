@@ -1,0 +1,288 @@
+"""Albums: photographs of a plan or venue that are solved together, each with its correction and its pin.
+
+An album expires some time after its last change. Photographs themselves are not stored, only their features.
+"""
+
+from __future__ import annotations
+
+import uuid
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import Connection, delete, func, select, update
+
+from service.errors import (
+    RevisionMismatchError,
+    TooManyAlbumsError,
+    TooManyPhotographsError,
+    UnknownFloorPlanError,
+    UnknownVenueError,
+)
+from service.storage.album_rows import (
+    AlbumRecord,
+    NewAlbum,
+    NewPhotograph,
+    PhotographRecord,
+    album_bytes,
+    album_record,
+    change_album,
+    delete_albums,
+    find_album,
+    find_photograph,
+    lock_album,
+    select_albums,
+    select_photographs,
+)
+from service.storage.database import Database
+from service.storage.records import Cursor
+from service.storage.statements import newest_first
+from service.storage.stored_bytes import StorageQuota, StoredBytes, deleted_bytes
+from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, FLOORPLANS, VENUES
+
+# Albums deleted per transaction of `purge`.
+_PURGED_AT_ONCE = 100
+
+
+class Albums:
+    """Albums of all tenants, each visible to its own tenant."""
+
+    def __init__(self, database: Database, quota: StorageQuota) -> None:
+        self._database = database
+        self._quota = quota
+
+    def add(self, tenant: str, album_id: str, new: NewAlbum, *, ttl_s: float, limit: int) -> AlbumRecord:
+        """Store an album; return the one that exists under this id, if the request is repeated.
+
+        Raises:
+            TooManyAlbumsError: the tenant has `limit` albums.
+            UnknownFloorPlanError, UnknownVenueError: the plan or venue was deleted.
+            StorageQuotaError: the tenant would store too many bytes.
+        """
+        now, size, own = datetime.now(UTC), album_bytes(new), ALBUMS.c.tenant == tenant
+        with self._database.writing(grows_by=size) as connection:
+            _lock_place(connection, tenant, new)
+            if connection.scalar(select(ALBUMS.c.id).where(own, ALBUMS.c.id == album_id)) is not None:
+                return find_album(connection, tenant, album_id, now)
+            freed = delete_albums(connection, own, ALBUMS.c.expires_at < now)
+            values = vars(new) | {
+                "id": album_id,
+                "tenant": tenant,
+                "folded_name": new.name.casefold(),
+                "revision_id": uuid.uuid4().hex,
+                "number": 1,
+                "created_at": now,
+                "updated_at": now,
+                "expires_at": now + timedelta(seconds=ttl_s),
+                "photographs": 0,
+                "solved_number": 0,
+                "place_change": 0,
+                "owner": "",
+                "lease_until_s": 0.0,
+                "progress": 0.0,
+                "attempts": 0,
+                "stored_bytes": size,
+            }
+            connection.execute(ALBUMS.insert().values(values))
+            # Counted after it: `settle` locks the tenant, so that the number is exact.
+            self._quota.settle(connection, tenant, StoredBytes(albums=size - freed))
+            if (connection.scalar(select(func.count()).select_from(ALBUMS).where(own)) or 0) > limit:
+                raise TooManyAlbumsError(limit)
+            return find_album(connection, tenant, album_id, now)
+
+    def get(self, tenant: str, album_id: str) -> AlbumRecord:
+        """Return an album.
+
+        Raises:
+            UnknownAlbumError: no such album, or it has expired.
+        """
+        with self._database.reading() as connection:
+            return find_album(connection, tenant, album_id, datetime.now(UTC))
+
+    def list_albums(
+        self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
+    ) -> list[AlbumRecord]:
+        """Return albums, newest first; arguments as for `Venues.list_venues`."""
+        query = select_albums().where(ALBUMS.c.tenant == tenant, ALBUMS.c.expires_at >= datetime.now(UTC))
+        with self._database.reading() as connection:
+            rows = connection.execute(newest_first(query, ALBUMS, limit=limit, after=after, name=name))
+            return [album_record(row) for row in rows]
+
+    def by_ids(self, album_ids: set[str]) -> list[AlbumRecord]:
+        """Return the albums that exist among some ids, regardless of tenant. Callers check access first."""
+        query = select_albums().where(ALBUMS.c.id.in_(album_ids), ALBUMS.c.expires_at >= datetime.now(UTC))
+        with self._database.reading() as connection:
+            return [album_record(row) for row in connection.execute(query)]
+
+    def delete(self, tenant: str, album_id: str, *, expected: str | None = None) -> None:
+        """Delete an album with its photographs.
+
+        Raises:
+            UnknownAlbumError: no such album, or it has expired.
+            RevisionMismatchError: it has another revision than `expected`.
+        """
+
+        def work(connection: Connection) -> None:
+            lock_album(connection, tenant, album_id, datetime.now(UTC), expected)
+            freed = delete_albums(connection, ALBUMS.c.id == album_id)
+            self._quota.settle(connection, tenant, StoredBytes(albums=-freed))
+
+        self._database.freeing(work)
+
+    def purge(self) -> int:
+        """Delete expired albums, and return their number."""
+        expired = select(ALBUMS.c.tenant, ALBUMS.c.id).where(ALBUMS.c.expires_at < datetime.now(UTC))
+        count = 0
+        while True:
+            with self._database.reading() as connection:
+                rows = connection.execute(expired.order_by(ALBUMS.c.tenant, ALBUMS.c.id).limit(_PURGED_AT_ONCE)).all()
+            for tenant in sorted({row.tenant for row in rows}):
+                own = ALBUMS.c.id.in_([row.id for row in rows if row.tenant == tenant])
+                self._database.freeing(lambda connection, tenant=tenant, own=own: self._drop(connection, tenant, own))
+            count += len(rows)
+            if len(rows) < _PURGED_AT_ONCE:
+                return count
+
+    def _drop(self, connection: Connection, tenant: str, own: object) -> None:
+        # Not those whose life was prolonged meanwhile.
+        freed = delete_albums(connection, own, ALBUMS.c.expires_at < datetime.now(UTC))  # type: ignore[arg-type]
+        self._quota.settle(connection, tenant, StoredBytes(albums=-freed))
+
+    def photographs(self, album_id: str, *, limit: int, after: int = 0) -> list[PhotographRecord]:
+        """Return photographs by number, regardless of tenant. Callers check access first.
+
+        Args:
+            album_id: id of the album.
+            limit: maximum number of photographs.
+            after: number of the last photograph of the previous page.
+        """
+        own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.number > after
+        with self._database.reading() as connection:
+            rows = connection.execute(select_photographs(*own).limit(limit))
+            return [PhotographRecord(**row._mapping) for row in rows]
+
+    def photograph(self, album_id: str, photograph_id: str) -> PhotographRecord:
+        """Return a photograph, regardless of tenant. Callers check access first.
+
+        Raises:
+            UnknownAlbumPhotographError: the album has no such photograph.
+        """
+        with self._database.reading() as connection:
+            return find_photograph(connection, album_id, photograph_id)
+
+    def same_picture(self, album_id: str, sha256: str) -> PhotographRecord | None:
+        """Return the photograph with a digest, regardless of tenant; None without one."""
+        own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.sha256 == sha256
+        with self._database.reading() as connection:
+            row = connection.execute(select_photographs(*own)).one_or_none()
+        return None if row is None else PhotographRecord(**row._mapping)
+
+    def add_photograph(
+        self, tenant: str, album_id: str, new: NewPhotograph, *, ttl_s: float, limit: int
+    ) -> tuple[PhotographRecord, bool]:
+        """Add a photograph to an album, unless it has the same picture already.
+
+        Args:
+            tenant: owner of the album.
+            album_id: id of the album.
+            new: the photograph.
+            ttl_s: lifetime (s) of the album after this change.
+            limit: maximum number of photographs.
+
+        Returns:
+            the photograph, and True if it was added.
+
+        Raises:
+            UnknownAlbumError: no such album, or it has expired.
+            TooManyPhotographsError: the album has `limit` photographs.
+            StorageQuotaError: the tenant would store too many bytes.
+        """
+        now, columns = datetime.now(UTC), ALBUM_PHOTOGRAPHS.c
+        with self._database.writing(grows_by=new.stored_bytes) as connection:
+            album = lock_album(connection, tenant, album_id, now)
+            own = columns.album_id == album_id
+            row = connection.execute(select_photographs(own, columns.sha256 == new.sha256)).one_or_none()
+            if row is not None:
+                return PhotographRecord(**row._mapping), False
+            if album.photographs >= limit:
+                raise TooManyPhotographsError(album_id, limit)
+            last = connection.scalar(select(func.max(columns.number)).where(own)) or 0
+            values = vars(new) | {
+                "id": uuid.uuid4().hex,
+                "album_id": album_id,
+                "number": last + 1,
+                "revision_id": uuid.uuid4().hex,
+                "created_at": now,
+                "stored_bytes": new.stored_bytes,
+            }
+            connection.execute(ALBUM_PHOTOGRAPHS.insert().values(values))
+            change_album(connection, album, 1, now, now + timedelta(seconds=ttl_s))
+            self._quota.settle(connection, tenant, StoredBytes(albums=new.stored_bytes))
+            return find_photograph(connection, album_id, values["id"]), True
+
+    def correct(
+        self,
+        tenant: str,
+        album_id: str,
+        photograph_id: str,
+        correction: str | None,
+        *,
+        ttl_s: float,
+        expected: str | None = None,
+    ) -> PhotographRecord:
+        """Store the correction of a photograph as JSON; None undoes it.
+
+        Raises:
+            UnknownAlbumError, UnknownAlbumPhotographError: no such album or photograph.
+            RevisionMismatchError: the photograph has another revision than `expected`.
+        """
+        now = datetime.now(UTC)
+        with self._database.writing() as connection:
+            album = lock_album(connection, tenant, album_id, now)
+            found = find_photograph(connection, album_id, photograph_id)
+            _check_revision(found, expected)
+            if found.correction == correction:
+                return found
+            values = {"correction": correction, "revision_id": uuid.uuid4().hex}
+            own = ALBUM_PHOTOGRAPHS.c.id == photograph_id
+            connection.execute(update(ALBUM_PHOTOGRAPHS).where(own).values(**values))
+            change_album(connection, album, 0, now, now + timedelta(seconds=ttl_s))
+            return find_photograph(connection, album_id, photograph_id)
+
+    def delete_photograph(
+        self, tenant: str, album_id: str, photograph_id: str, *, ttl_s: float, expected: str | None = None
+    ) -> None:
+        """Delete a photograph; the rest is solved again.
+
+        Raises:
+            UnknownAlbumError, UnknownAlbumPhotographError, RevisionMismatchError: as `correct`.
+        """
+
+        def work(connection: Connection) -> None:
+            now = datetime.now(UTC)
+            album = lock_album(connection, tenant, album_id, now)
+            _check_revision(find_photograph(connection, album_id, photograph_id), expected)
+            own = ALBUM_PHOTOGRAPHS.c.id == photograph_id
+            freed = deleted_bytes(connection, delete(ALBUM_PHOTOGRAPHS).where(own))
+            change_album(connection, album, -1, now, now + timedelta(seconds=ttl_s))
+            self._quota.settle(connection, tenant, StoredBytes(albums=-freed))
+
+        self._database.freeing(work)
+
+
+def _check_revision(found: PhotographRecord, expected: str | None) -> None:
+    if expected not in (None, found.revision_id):
+        raise RevisionMismatchError(found.id, expected, found.revision_id, what="photograph")
+
+
+def _lock_place(connection: Connection, tenant: str, new: NewAlbum) -> None:
+    """Lock the plan or venue of a new album against deletion until the transaction ends.
+
+    Raises:
+        UnknownFloorPlanError, UnknownVenueError: it was deleted.
+    """
+    table, place_id, error = (FLOORPLANS, new.plan_id, UnknownFloorPlanError)
+    if place_id is None:
+        table, place_id, error = (VENUES, new.venue_id, UnknownVenueError)
+    assert place_id is not None
+    query = select(table.c.id).where(table.c.id == place_id, table.c.tenant == tenant)
+    if connection.scalar(query.with_for_update(read=True)) is None:
+        raise error(place_id)

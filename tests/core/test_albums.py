@@ -1,0 +1,252 @@
+"""Albums: entries of photographs, corrections, and the solve for all, with the shipped model."""
+
+import math
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.album.corrections import Correction, read_correction
+from lalaloc_core.localise.album.entry import MAX_ENTRY_BYTES, AlbumPhotograph, photograph_entry, read_entry
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.pins import Pin, PinPose, moved_pins
+from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
+from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.photograph import open_photograph
+from lalaloc_core.photograph.taken import Taken
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
+ROOMS = ("kitchen", "study", "bedroom", "living-room", "living-room")
+
+
+@pytest.fixture(scope="module")
+def bundle() -> Bundle:
+    return Bundle.open(default_bundle())
+
+
+@pytest.fixture(scope="module")
+def encoder(bundle: Bundle) -> PhotographEncoder:
+    return PhotographEncoder(bundle, threads=1)
+
+
+@pytest.fixture(scope="module")
+def ground(encoder: PhotographEncoder) -> AlbumGround:
+    plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_text())
+    grid = build_grid(plan, encoder, step_m=0.5, camera_height_m=plan.camera_height_m, latents=False)
+    return AlbumGround.of_plan("flat", plan, grid)
+
+
+@pytest.fixture(scope="module")
+def photographs(encoder: PhotographEncoder) -> list[AlbumPhotograph]:
+    manifest, found = encoder.manifest, []
+    for number, name in enumerate(NAMES):
+        content = (EXAMPLES / name).read_bytes()
+        view = open_photograph(
+            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=True
+        )
+        taken = Taken(at=datetime(2026, 5, 1, 12, number), make="M", model="P", width=1280, height=960)
+        found.append(photograph_entry(name, encoder.with_features(view), taken))
+    return found
+
+
+def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[AlbumPhotograph]) -> None:
+    for photograph in photographs:
+        content = photograph.to_bytes(bundle)
+        read = read_entry(content, bundle)
+        assert len(content) <= MAX_ENTRY_BYTES
+        assert (read.id, read.taken) == (photograph.id, photograph.taken)
+        np.testing.assert_array_equal(read.colours, photograph.colours)
+        np.testing.assert_array_equal(read.descriptors.bits, photograph.descriptors.bits)
+        assert read.view.features is not None
+        assert photograph.view.features is not None
+        np.testing.assert_allclose(
+            read.view.features.outputs["log_profile"], photograph.view.features.outputs["log_profile"], rtol=1e-6
+        )
+    assert len(photographs[-1].descriptors) > 50
+    assert not photographs[0].view.features or not photographs[0].view.features.outputs["ring"].any()
+
+
+def test_damaged_entries_are_refused(bundle: Bundle, photographs: list[AlbumPhotograph]) -> None:
+    content = photographs[-1].to_bytes(bundle)
+    rng = np.random.default_rng(0)
+    damaged = [b"", b"LLAP", content[:100], content[:-7], content[:6] + b"\xff" * 4 + content[10:], b"x" * 30_000]
+    for _ in range(60):
+        changed = bytearray(content[: len(content) // 2])
+        changed[int(rng.integers(len(changed)))] ^= int(rng.integers(1, 256))
+        damaged.append(bytes(changed))
+    for hostile in damaged:
+        with pytest.raises((InvalidEntryError, InvalidFeaturesError, InvalidInputError)):
+            read_entry(hostile, bundle)
+
+
+def test_all_photographs_are_pinned_to_their_rooms(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    seen: list[int] = []
+    album = solve_album(ground, encoder, photographs, progress=seen.append)
+    assert seen == [1, 2, 3, 4, 5]
+    assert [pin.photograph_id for pin in album.pins] == list(NAMES)
+    assert [pin.pose.room_id for pin in album.pins if pin.pose] == list(ROOMS)
+    for pin in album.pins:
+        assert 0.0 <= pin.within_1m <= pin.confidence <= 1.0
+        assert pin.suggestions[0].pose == pin.pose
+        assert len(pin.suggestions) <= 5
+        assert sum(row.probability for row in pin.rooms) <= 1.0 + 1e-9
+    assert sum(album.counts.values()) == len(photographs)
+    assert album.camera_height_m is not None
+    assert 1.0 < album.camera_height_m < 2.0
+    assert album.cameras[0].photographs == 1
+
+
+def test_solve_does_not_depend_on_the_order_of_arrival(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    pins = solve_album(ground, encoder, photographs).pins
+    assert solve_album(ground, encoder, photographs[::-1]).pins == pins[::-1]
+
+
+def test_memory_gives_the_same_pins_after_storage(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    memory = AlbumMemory()
+    album = solve_album(ground, encoder, photographs, memory=memory)
+    stored = AlbumMemory.read(memory.to_bytes())
+    seen: list[int] = []
+    again = solve_album(ground, encoder, photographs, memory=stored, progress=seen.append)
+    assert seen == []
+    assert again.pins == album.pins
+    with pytest.raises(InvalidEntryError):
+        AlbumMemory.read(memory.to_bytes()[:200])
+
+
+def test_memory_of_another_plan_is_not_used(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    memory = AlbumMemory()
+    solve_album(ground, encoder, photographs[:1], memory=memory)
+    document = ground.plans[0].to_dict() | {"name": "changed"}
+    changed = AlbumGround.of_plan("flat", FloorPlan.from_dict(document), ground.grid)
+    seen: list[int] = []
+    solve_album(changed, encoder, photographs[:1], memory=memory, progress=seen.append)
+    assert seen == [1]
+
+
+def _corrected(photograph: AlbumPhotograph, **stated: object) -> AlbumPhotograph:
+    return replace(photograph, correction=read_correction(stated))
+
+
+def test_corrections_are_certain(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    corrected = [
+        _corrected(photographs[0], kind="room", plan_id="flat", room_id="bedroom"),
+        _corrected(photographs[1], kind="position", plan_id="flat", x_m=7.0, y_m=2.0, heading_deg=90.0),
+        _corrected(photographs[2], kind="elsewhere"),
+        photographs[3],
+    ]
+    first, second, third, fourth = solve_album(ground, encoder, corrected).pins
+    assert first.state == second.state == "corrected"
+    assert first.pose is not None
+    assert first.pose.room_id == "bedroom"
+    assert second.pose is not None
+    assert (second.pose.x_m, second.pose.y_m, second.pose.room_id) == (7.0, 2.0, "kitchen")
+    assert second.pose.heading_deg == pytest.approx(90.0)
+    assert (third.state, third.pose) == ("set_aside", None)
+    assert third.reason
+    assert fourth.state in ("sure", "uncertain")
+
+
+def test_correction_of_an_unknown_room_is_refused(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    unknown = _corrected(photographs[0], kind="room", plan_id="flat", room_id="ballroom")
+    with pytest.raises(InvalidCorrectionError, match="room 'ballroom' of plan 'flat', which does not exist"):
+        solve_album(ground, encoder, [unknown])
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"kind": "room", "plan_id": "p"}, "needs room_id"),
+        ({"kind": "elsewhere", "x_m": 1.0}, "x_m does not go with"),
+        ({"kind": "position", "plan_id": "p", "x_m": 1.0, "y_m": 2e9}, "between -100000 and 100000"),
+        ({"kind": "moved"}, "kind"),
+        ({"kind": "elsewhere", "more": 1}, "no key 'more'"),
+        ([], "must be a mapping"),
+    ],
+)
+def test_impossible_corrections_are_refused(document: object, message: str) -> None:
+    with pytest.raises(InvalidCorrectionError, match=message):
+        read_correction(document)
+
+
+def test_correction_survives_storage() -> None:
+    correction = Correction(kind="confirmed", plan_id="p", x_m=1.0, y_m=2.0, heading_deg=3.0)
+    assert read_correction(correction.to_document()) == correction
+
+
+def test_an_id_is_added_once(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    with pytest.raises(InvalidInputError, match="same id"):
+        solve_album(ground, encoder, [photographs[0], photographs[0]])
+    assert solve_album(ground, encoder, []).pins == ()
+
+
+def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
+    """Sum over all assignments."""
+    count, rooms = evidence.alone.shape
+    total = np.zeros((count, rooms))
+    for code in range(rooms**count):
+        room = np.array([code // rooms**number % rooms for number in range(count)])
+        log = evidence.alone[np.arange(count), room].sum()
+        if evidence.walk is not None:
+            log += evidence.walk[room[:-1], room[1:]].sum()
+        log += 0.5 * (evidence.pairs * (room[:, None] == room)).sum()
+        expected = evidence.expected
+        off = np.bincount(room, minlength=rooms) - np.nan_to_num(expected)
+        off = np.where(np.isnan(expected), 0.0, off)
+        log -= (evidence.tightness * np.square(off) / (2.0 * (np.nan_to_num(expected) + 1.0))).sum()
+        total[np.arange(count), room] += math.exp(log)
+    return total / total.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("has_order", [True, False])
+def test_assignment_agrees_with_the_sum_over_all(has_order: bool) -> None:
+    rng = np.random.default_rng(3)
+    pairs = rng.normal(0.0, 1.5, (6, 6))
+    pairs = np.triu(pairs, 1) + np.triu(pairs, 1).T
+    walk = np.log(rng.dirichlet(np.ones(3), 3)) if has_order else None
+    evidence = RoomEvidence(
+        alone=rng.normal(0.0, 1.0, (6, 3)), walk=walk, pairs=pairs, expected=np.array([3.0, 3.0, np.nan])
+    )
+    mean = np.mean([assign_rooms(evidence, seed) for seed in range(6)], axis=0)
+    np.testing.assert_allclose(mean, _exhaustive(evidence), atol=0.05)
+
+
+def _pin(id: str, pose: PinPose | None) -> Pin:
+    return Pin(photograph_id=id, state="sure", pose=pose, confidence=1.0, within_1m=1.0)
+
+
+def test_moved_pins_are_those_that_moved_far_or_changed_their_room() -> None:
+    pose = PinPose(plan_id="p", room_id="a", room="A", x_m=0.0, y_m=0.0, heading=None)
+    before = [_pin(id, pose) for id in ("near", "far", "room", "gone", "plan")]
+    after = [
+        _pin("near", replace(pose, x_m=0.4)),
+        _pin("far", replace(pose, x_m=0.6)),
+        _pin("room", replace(pose, room_id="b")),
+        _pin("gone", None),
+        _pin("plan", replace(pose, plan_id="q")),
+        _pin("new", pose),
+    ]
+    moved = {each.photograph_id: (each.distance_m, each.new_room) for each in moved_pins(before, after)}
+    assert moved == {"far": (0.6, False), "room": (0.0, True), "gone": (None, True), "plan": (None, True)}

@@ -1,0 +1,183 @@
+"""`lalaloc pin`: a folder of photographs and a plan, with the shipped model; and copies with their place."""
+
+import csv
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pypdfium2
+import pytest
+from PIL import ExifTags, Image
+
+from lalaloc_core.cli import main
+from lalaloc_core.photograph.placed_copy import Place, placed_copy
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+PLACE = Place(room="Küche", level="Ground & first", latitude=-33.8568, longitude=151.2153, direction_deg=271.24)
+
+
+@pytest.fixture(scope="module")
+def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("pin")
+    folder, out = root / "visit", root / "out"
+    folder.mkdir()
+    for name in ("kitchen", "study", "phone"):
+        shutil.copy(EXAMPLES / f"{name}.jpg", folder)
+    shutil.copy(EXAMPLES / "study.jpg", folder / "study copy.jpg")
+    (folder / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
+    (folder / "notes.txt").write_text("hello")
+    plan = json.loads((EXAMPLES / "flat.json").read_text()) | {"north_deg": 30.0}
+    plan["anchor"] = {"latitude": 48.2, "longitude": 16.37}
+    (root / "flat.json").write_text(json.dumps(plan))
+    assert main(["pin", str(root / "flat.json"), str(folder), "--out", str(out)]) == 0
+    return folder, out
+
+
+def _document(out: Path) -> Any:
+    return json.loads((out / "pins.json").read_text())
+
+
+def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
+    document = _document(pinned[1])
+    rooms = {entry["photograph"]: entry["room"] for entry in document["photographs"]}
+    assert rooms == {
+        "broken.jpg": None,
+        "kitchen.jpg": "kitchen",
+        "phone.jpg": "living room",
+        "study copy.jpg": "study",
+        "study.jpg": "study",
+    }
+    notes = " ".join(document["notes"])
+    assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
+    assert "copies of other files, which have the same pin: 1" in notes
+    assert "files that are no pictures, which are left out: 1" in notes
+    assert document["counts"]["set_aside"] == 1
+
+
+def test_tables_and_drawings_have_every_pin(pinned: tuple[Path, Path]) -> None:
+    _, out = pinned
+    rows = list(csv.DictReader(io.StringIO((out / "pins.csv").read_text())))
+    assert [row["state"] == "set_aside" for row in rows] == [True, False, False, False, False]
+    collection = json.loads((out / "pins.geojson").read_text())
+    assert len(collection["features"]) == 4
+    longitude, latitude = collection["features"][0]["geometry"]["coordinates"]
+    assert abs(latitude - 48.2) < 1e-3
+    assert abs(longitude - 16.37) < 1e-3
+    assert (out / "plan.svg").read_text().count('class="pin ') == 4
+    # The plan, three rooms, and what was set aside.
+    assert len(pypdfium2.PdfDocument(out / "report.pdf")) == 5
+
+
+def test_originals_stay_and_copies_have_the_same_pixels(pinned: tuple[Path, Path]) -> None:
+    folder, out = pinned
+    for name in ("kitchen.jpg", "phone.jpg"):
+        assert (folder / name).read_bytes() == (EXAMPLES / name).read_bytes()
+        with Image.open(out / "photographs" / name) as copy, Image.open(folder / name) as original:
+            np.testing.assert_array_equal(np.asarray(copy), np.asarray(original))
+            gps = copy.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        assert gps[ExifTags.GPS.GPSLatitudeRef] == "N"
+        assert ExifTags.GPS.GPSImgDirection in gps
+
+
+def test_a_new_revision_lists_what_moved(
+    pinned: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = pinned
+    plan = json.loads((EXAMPLES / "flat.json").read_text())
+    for room in plan["rooms"]:
+        room["polygon"] = [[x + 2.0, y] for x, y in room["polygon"]]
+    for opening in plan["openings"]:
+        opening["line"] = [[x + 2.0, y] for x, y in opening["line"]]
+    plan.pop("fixtures", None)
+    (tmp_path / "moved.json").write_text(json.dumps(plan))
+    command = ["pin", str(tmp_path / "moved.json"), str(folder), "--out", str(tmp_path / "out"), "--no-copies"]
+    assert main([*command, "--previous", str(out / "pins.json")]) == 0
+    assert "'kitchen.jpg' moved by 2.0 m in 'kitchen'" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "photographs").exists()
+    assert not (tmp_path / "out" / "pins.geojson").exists()
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({}, "has no photographs"),
+        ({"a.txt": b"x"}, "has no photographs"),
+        ({"a.jpg": b"x"}, "none of 1 photographs can be read; the first: the photograph is not a readable JPEG"),
+        ({f"{number}.jpg": b"x" for number in range(501)}, "has 501 photographs; the limit is 500"),
+    ],
+)
+def test_folder_without_usable_photographs_is_refused(
+    files: dict[str, bytes], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "visit"
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    assert main(["pin", str(EXAMPLES / "flat.json"), str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("plan", ["missing.json", "visit"])
+def test_missing_plan_is_named(plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "visit").mkdir()
+    (tmp_path / "visit" / "a.jpg").write_bytes(b"x")
+    command = ["pin", str(tmp_path / plan), str(tmp_path / "visit"), "--out", str(tmp_path / "out")]
+    assert main(command) == 2
+    assert f"{plan}' cannot be read" in capsys.readouterr().err
+
+
+def _picture(kind: str, **options: Any) -> bytes:
+    rng = np.random.default_rng(0)
+    content = io.BytesIO()
+    Image.fromarray(rng.integers(0, 256, (96, 128, 3), np.uint8)).save(content, kind, **options)
+    return content.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_copy_states_the_place_and_keeps_everything_else(kind: str) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "Maker"
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.DateTimeOriginal: "2026:05:01 12:00:00"}
+    content = _picture(kind, exif=exif.tobytes())
+    first = placed_copy(content, PLACE)
+    assert first.sidecar is None
+    # Twice, as for a copy of a copy: nothing is written double.
+    again = placed_copy(first.content, PLACE).content
+    with Image.open(io.BytesIO(again)) as copy, Image.open(io.BytesIO(content)) as original:
+        np.testing.assert_array_equal(np.asarray(copy), np.asarray(original))
+        found, xmp = copy.getexif(), copy.getxmp()["xmpmeta"]["RDF"]["Description"]
+    gps = found.get_ifd(ExifTags.IFD.GPSInfo)
+    assert found[ExifTags.Base.Make] == "Maker"
+    assert found.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] == "2026:05:01 12:00:00"
+    degrees, minutes, seconds = map(float, gps[ExifTags.GPS.GPSLatitude])
+    assert degrees + minutes / 60.0 + seconds / 3600.0 == pytest.approx(33.8568, abs=1e-7)
+    assert (gps[ExifTags.GPS.GPSLatitudeRef], gps[ExifTags.GPS.GPSLongitudeRef]) == ("S", "E")
+    assert float(gps[ExifTags.GPS.GPSImgDirection]) == pytest.approx(271.24)
+    assert xmp["subject"]["Bag"]["li"] == ["Küche", "Ground & first"]
+    assert xmp["hierarchicalSubject"]["Bag"]["li"] == "Ground & first|Küche"
+    assert xmp["GPSImgDirection"] == "27124/100"
+    assert xmp["GPSLatitude"].endswith("S")
+
+
+def test_other_formats_get_a_file_beside_them() -> None:
+    content = _picture("WEBP")
+    copy = placed_copy(content, PLACE)
+    assert copy.content == content
+    assert copy.sidecar is not None
+    assert "Küche" in copy.sidecar.decode()
+
+
+def test_keywords_of_the_file_stay() -> None:
+    packet = (
+        b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        b'<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/"><dc:subject><rdf:Bag><rdf:li>site</rdf:li>'
+        b"</rdf:Bag></dc:subject></rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+    copy = placed_copy(_picture("JPEG", xmp=packet), PLACE).content
+    with Image.open(io.BytesIO(copy)) as picture:
+        words = picture.getxmp()["xmpmeta"]["RDF"]["Description"]["subject"]["Bag"]["li"]
+    assert words == ["site", "Küche", "Ground & first"]

@@ -1,0 +1,573 @@
+"""Albums: photographs that are added once, solved together, corrected, and taken away."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from PIL import Image
+from sqlalchemy import update
+
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.encode.features import FeatureEncoder
+from lalaloc_core.localise.encode.photograph_encoder import sphere_size
+from lalaloc_core.photograph import open_photograph
+from service.query import album_search
+from service.storage.store import Store
+from service.storage.tables import ALBUMS
+from tests.core.taken import EXAMPLES
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.test_security import bearer, make_key
+
+HOME = json.loads((EXAMPLES / "flat.json").read_text())
+ANCHORED = {**HOME, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0}
+NAMES = ("living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg")
+
+
+@pytest.fixture(scope="module")
+def start_app(start_app: StartApp) -> StartApp:
+    """Start the app with the shipped model, as the tiny one gives no features."""
+    return partial(start_app, bundle=default_bundle(), request_deadline_s=90.0, sweep_s=0.2)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[bytes]:
+    """Return spheres of four rooms, with times, a position and an owner in their metadata."""
+    found = []
+    for number, name in enumerate(NAMES):
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110], exif[0x013B] = "Maker", "Model X", "Erika Mustermann"
+        exif.get_ifd(0x8769)[0x9003] = f"2026:05:01 10:0{number}:00"
+        exif.get_ifd(0x8825)[2] = (48.0, 8.0, 14.0)
+        buffer = io.BytesIO()
+        Image.open(EXAMPLES / name).save(buffer, "JPEG", quality=95, exif=exif)
+        found.append(buffer.getvalue())
+    return found
+
+
+@pytest.fixture(scope="module")
+def plan_id(client: httpx.Client) -> str:
+    return upload(client, ANCHORED)
+
+
+@pytest.fixture(scope="module")
+def solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> str:
+    """Return the id of an album with the pictures; tests that change it undo that."""
+    album_id = create(client, plan_id)
+    assert [line["status"] for line in add(client, album_id, pictures[:3])] == [201, 201, 201]
+    wait_until_solved(client, album_id)
+    return album_id
+
+
+def create(client: httpx.Client, plan_id: str, **fields: Any) -> str:
+    """Create an album; return its id."""
+    answer = client.post("/albums", json={"floorplan_id": plan_id} | fields)
+    assert answer.status_code == 201, answer.text
+    assert answer.headers["location"] == f"/albums/{answer.json()['id']}"
+    return answer.json()["id"]
+
+
+def send(client: httpx.Client, album_id: str, files: list[bytes], part: str = "photo") -> httpx.Response:
+    parts = [(part, (f"{number}.jpg", content, "image/jpeg")) for number, content in enumerate(files)]
+    return client.post(f"/albums/{album_id}/photographs", files=parts)
+
+
+def add(client: httpx.Client, album_id: str, files: list[bytes], part: str = "photo") -> list[dict[str, Any]]:
+    """Add photographs; return the lines of the answer."""
+    response = send(client, album_id, files, part)
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/x-ndjson"
+    return [json.loads(line) for line in response.text.splitlines()]
+
+
+def photographs(client: httpx.Client, album_id: str, **params: Any) -> list[dict[str, Any]]:
+    return client.get(f"/albums/{album_id}/photographs", params=params).json()["photographs"]
+
+
+def wait_until_solved(client: httpx.Client, album_id: str) -> dict[str, Any]:
+    """Wait until the pins are those of the latest change; return the album."""
+    wait_for(lambda: client.get(f"/albums/{album_id}").json()["state"] != "solving")
+    album = client.get(f"/albums/{album_id}").json()
+    assert album["state"] == "solved", album
+    assert album["solved_revision_number"] == album["revision_number"]
+    return album
+
+
+def correct(client: httpx.Client, album_id: str, photograph_id: str, correction: Any, **headers: str) -> httpx.Response:
+    path = f"/albums/{album_id}/photographs/{photograph_id}"
+    return client.patch(path, json={"correction": correction}, headers=headers)
+
+
+def test_photographs_get_pins_together(client: httpx.Client, solved: str, plan_id: str) -> None:
+    album = client.get(f"/albums/{solved}").json()
+    assert (album["floorplan_id"], album["venue_id"], album["photographs"]) == (plan_id, None, 3)
+    assert album["place_revision"] == client.get(f"/floorplans/{plan_id}").json()["revision"]
+    counts = album["solution"]["pins"]
+    assert sum(counts[state] for state in ("sure", "uncertain", "set_aside", "corrected")) == 3
+    found = photographs(client, solved)
+    assert [row["number"] for row in found] == [1, 2, 3]
+    rooms = {room["name"] for room in HOME["rooms"]}
+    for number, row in enumerate(found):
+        assert row["view"]["taken_at"] == f"2026-05-01T10:0{number}:00"
+        assert row["view"]["make"] == "Maker"
+        assert 0.0 <= row["pin"]["confidence"] <= 1.0
+        assert 1 <= len(row["pin"]["suggestions"]) <= 5
+        assert {place["room"] for place in row["pin"]["suggestions"]} <= rooms
+
+
+def test_same_picture_is_added_once(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    album_id = create(client, plan_id)
+    first = add(client, album_id, pictures[:2])
+    again = add(client, album_id, [pictures[1], pictures[0], pictures[2], pictures[2]])
+    assert [line["status"] for line in again] == [200, 200, 201, 200]
+    assert [line["photograph"]["id"] for line in again[:2]] == [row["photograph"]["id"] for row in first[::-1]]
+    assert client.get(f"/albums/{album_id}").json()["photographs"] == 3
+
+
+def test_unreadable_files_do_not_stop_the_others(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    lines = add(client, create(client, plan_id), [b"no picture", pictures[0], b""])
+    assert [line["status"] for line in lines] == [422, 201, 422]
+    assert lines[0]["problem"]["type"] == "urn:lalaloc:problem:invalid-panorama"
+    assert (lines[0]["name"], lines[1]["photograph"]["name"]) == ("0.jpg", "1.jpg")
+
+
+def test_pages_of_photographs_have_each_once(client: httpx.Client, solved: str) -> None:
+    path, names, cursor = f"/albums/{solved}/photographs", [], None
+    while True:
+        page = client.get(path, params={"limit": 2} | ({} if cursor is None else {"cursor": cursor}))
+        names += [row["number"] for row in page.json()["photographs"]]
+        cursor = page.json()["next_cursor"]
+        assert ("link" in page.headers) == (cursor is not None)
+        if cursor is None:
+            break
+    assert names == [1, 2, 3]
+    assert_problem(client.get(path, params={"cursor": "x"}), 422, "invalid-request")
+    assert_problem(client.get(path, params={"limit": 501}), 422, "invalid-request")
+
+
+def test_pins_as_geojson_csv_and_svg(client: httpx.Client, solved: str, plan_id: str) -> None:
+    path = f"/albums/{solved}/photographs"
+    found = photographs(client, solved)
+    geojson = client.get(path, headers={"Accept": "application/geo+json"})
+    assert geojson.headers["content-type"] == "application/geo+json"
+    features = geojson.json()["features"]
+    assert [feature["id"] for feature in features] == [row["id"] for row in found]
+    longitude, latitude, _ = features[0]["geometry"]["coordinates"]
+    assert (longitude, latitude) == pytest.approx((11.0, 48.0), abs=0.01)
+    table = client.get(path, headers={"Accept": "text/csv"})
+    assert table.headers["content-type"] == "text/csv; charset=utf-8"
+    rows = list(csv.DictReader(io.StringIO(table.text)))
+    assert [row["room"] for row in rows] == [row["pin"]["place"]["room"] for row in found]
+    assert float(rows[0]["x_m"]) == found[0]["pin"]["place"]["position"]["x_m"]
+    drawing = client.get(path, headers={"Accept": "image/svg+xml"})
+    assert drawing.headers["content-type"] == "image/svg+xml"
+    assert drawing.text.count('<g class="pin">') == 3
+    assert "kitchen" in drawing.text
+    assert "script" not in drawing.text
+    bare = create(client, upload(client, FLAT))
+    assert client.get(f"/albums/{bare}/photographs", headers={"Accept": "text/csv"}).text.count("\n") == 1
+
+
+def test_pins_of_a_plan_without_an_anchor_have_no_geojson(client: httpx.Client, pictures: list[bytes]) -> None:
+    album_id = create(client, upload(client, HOME))
+    add(client, album_id, pictures[:1])
+    wait_until_solved(client, album_id)
+    response = client.get(f"/albums/{album_id}/photographs", headers={"Accept": "application/geo+json"})
+    assert_problem(response, 409, "floorplan-unanchored")
+
+
+def test_file_names_are_no_formulas(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    album_id = create(client, plan_id)
+    files = [("photo", ('=cmd|"x".jpg', pictures[0], "image/jpeg"))]
+    assert client.post(f"/albums/{album_id}/photographs", files=files).status_code == 200
+    table = client.get(f"/albums/{album_id}/photographs", headers={"Accept": "text/csv"}).text
+    assert next(csv.DictReader(io.StringIO(table)))["name"].startswith("'=cmd")
+
+
+@pytest.mark.parametrize(
+    ("correction", "room"),
+    [
+        ({"room_id": "kitchen"}, "kitchen"),
+        ({"position": {"x_m": 2.0, "y_m": 2.0}, "heading_deg": 90}, "living room"),
+        ({"position": {"x_m": 7.0, "y_m": 2.0}}, "kitchen"),
+        ({"elsewhere": True}, None),
+        ({"confirmed": True}, ...),
+    ],
+)
+def test_correction_is_certain_and_can_be_undone(
+    client: httpx.Client, solved: str, plan_id: str, correction: dict[str, Any], room: Any
+) -> None:
+    before = photographs(client, solved)[1]
+    if "room_id" in correction:
+        rooms = client.get(f"/floorplans/{plan_id}").json()["plan"]["rooms"]
+        correction = {"room_id": next(row["id"] for row in rooms if row["name"] == room)}
+    answer = correct(client, solved, before["id"], correction)
+    assert answer.status_code == 200, answer.text
+    given = {name: value for name, value in answer.json()["correction"].items() if value is not None}
+    assert correction.items() <= given.items()
+    assert answer.json()["revision"] != before["revision"]
+    wait_until_solved(client, solved)
+    after = client.get(f"/albums/{solved}/photographs/{before['id']}").json()
+    if room is None:
+        assert after["pin"]["place"] is None
+    else:
+        expected = before["pin"]["place"]["room"] if room is ... else room
+        assert (after["pin"]["state"], after["pin"]["place"]["room"]) == ("corrected", expected)
+        assert after["pin"]["confidence"] == 1.0
+    if "position" in correction:
+        assert after["pin"]["place"]["position"] == correction["position"]
+    assert correct(client, solved, before["id"], None).json()["correction"] is None
+    wait_until_solved(client, solved)
+    assert client.get(f"/albums/{solved}/photographs/{before['id']}").json()["pin"]["state"] != "corrected"
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({}, "correction"),
+        ({"correction": {}}, "give one of room_id, position, elsewhere, confirmed"),
+        ({"correction": {"room_id": "r", "elsewhere": True}}, "give one of"),
+        ({"correction": {"elsewhere": False}}, "elsewhere"),
+        ({"correction": {"room_id": "attic"}}, "has no room of this id"),
+        ({"correction": {"room_id": "kitchen", "heading_deg": 1}}, "heading_deg goes with position"),
+        ({"correction": {"position": {"x_m": 100, "y_m": 0}}}, "lies in no room"),
+        ({"correction": {"position": {"x_m": 1}}}, "y_m"),
+        ({"correction": {"position": {"x_m": 1, "y_m": 1}, "heading_deg": 400}}, "heading_deg"),
+        (
+            {"correction": {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": "f" * 32}},
+            "not the floor plan of the album",
+        ),
+        ({"correction": None, "pin": 1}, "pin"),
+    ],
+)
+def test_invalid_correction_is_refused(
+    client: httpx.Client, solved: str, document: dict[str, Any], message: str
+) -> None:
+    row = photographs(client, solved)[0]
+    response = client.patch(f"/albums/{solved}/photographs/{row['id']}", json=document)
+    assert message in json.dumps(assert_problem(response, 422, "invalid-request"))
+    assert photographs(client, solved)[0]["revision"] == row["revision"]
+
+
+def test_changes_respect_preconditions(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    album_id = create(client, plan_id)
+    (line,) = add(client, album_id, pictures[:1])
+    wait_until_solved(client, album_id)
+    path = f"/albums/{album_id}/photographs/{line['photograph']['id']}"
+    etag = client.get(path).headers["etag"]
+    assert client.get(path, headers={"If-None-Match": etag}).status_code == 304
+    changed = correct(client, album_id, line["photograph"]["id"], {"elsewhere": True}, **{"If-Match": etag})
+    assert (changed.status_code, changed.headers["content-location"]) == (200, path)
+    stale = correct(client, album_id, line["photograph"]["id"], None, **{"If-Match": etag})
+    assert "photograph" in assert_problem(stale, 412, "revision-mismatch")["detail"]
+    assert_problem(client.delete(path, headers={"If-Match": etag}), 412, "revision-mismatch")
+    album = client.get(f"/albums/{album_id}")
+    assert client.get(f"/albums/{album_id}", headers={"If-None-Match": album.headers["etag"]}).status_code == 304
+    assert_problem(client.delete(f"/albums/{album_id}", headers={"If-Match": '"0"'}), 412, "revision-mismatch")
+    assert client.delete(path, headers={"If-Match": changed.headers["etag"]}).status_code == 204
+    assert_problem(client.get(path), 404, "unknown-photograph")
+    assert client.get(f"/albums/{album_id}").json()["state"] == "empty"
+    now = client.get(f"/albums/{album_id}").headers["etag"]
+    assert client.delete(f"/albums/{album_id}", headers={"If-Match": now}).status_code == 204
+    assert_problem(client.get(f"/albums/{album_id}"), 404, "unknown-album")
+
+
+def test_unknown_albums_and_places_are_refused(client: httpx.Client, solved: str, pictures: list[bytes]) -> None:
+    for album_id in ("f" * 32, "x"):
+        assert_problem(client.get(f"/albums/{album_id}"), 404, "unknown-album")
+        assert_problem(client.delete(f"/albums/{album_id}"), 404, "unknown-album")
+        assert_problem(send(client, album_id, pictures[:1]), 404, "unknown-album")
+        assert_problem(client.get(f"/albums/{album_id}/events"), 404, "unknown-album")
+        assert_problem(correct(client, album_id, "f" * 32, None), 404, "unknown-album")
+    assert_problem(correct(client, solved, "f" * 32, None), 404, "unknown-photograph")
+    assert_problem(client.post("/albums", json={"floorplan_id": "f" * 32}), 404, "unknown-floorplan")
+    assert_problem(client.post("/albums", json={"venue_id": "f" * 32}), 404, "unknown-venue")
+    assert_problem(client.post("/albums", json={}), 422, "invalid-request")
+    problem = assert_problem(client.post("/albums", json={"floorplan_id": "f" * 32, "hfov": 1}), 422, "invalid-request")
+    assert "hfov" in json.dumps(problem)
+    files = [("photo", ("p.jpg", pictures[0]))]
+    response = client.post(f"/albums/{solved}/photographs", data={"hfov_deg": "60"}, files=files)
+    assert_problem(response, 422, "invalid-request")
+
+
+def test_repeated_creation_makes_one_album(client: httpx.Client, plan_id: str) -> None:
+    headers, document = {"Idempotency-Key": "album-1"}, {"floorplan_id": plan_id, "name": "Twice"}
+    first, second = (client.post("/albums", json=document, headers=headers) for _ in range(2))
+    assert first.json() == second.json()
+    assert second.headers["idempotency-replayed"] == "true"
+    names = [album["name"] for album in client.get("/albums", params={"name": "twIC"}).json()["albums"]]
+    assert names == ["Twice"]
+    reused = client.post("/albums", json=document | {"name": "Other"}, headers=headers)
+    assert_problem(reused, 422, "idempotency-key-reused")
+
+
+def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[bytes]) -> None:
+    with start_app(tmp_path, max_albums=2, max_album_photographs=2) as client:
+        plan_id = upload(client)
+        first = create(client, plan_id)
+        create(client, plan_id)
+        problem = assert_problem(client.post("/albums", json={"floorplan_id": plan_id}), 507, "too-many-albums")
+        assert "LALALOC_MAX_ALBUMS" in problem["detail"]
+        lines = add(client, first, pictures)
+        assert [line["status"] for line in lines] == [201, 201, 507, 507]
+        full = next(line for line in lines if line["status"] == 507)
+        assert full["problem"]["type"] == "urn:lalaloc:problem:too-many-photographs"
+        assert "LALALOC_MAX_ALBUM_PHOTOGRAPHS" in full["problem"]["detail"]
+        assert (client.get("/limits").json()["max_albums"], client.get("/limits").json()["max_album_photographs"]) == (
+            2,
+            2,
+        )
+
+
+def test_features_take_the_place_of_photographs(
+    client: httpx.Client, plan_id: str, pictures: list[bytes], features_of: Callable[[bytes], bytes]
+) -> None:
+    album_id = create(client, plan_id)
+    (line,) = add(client, album_id, [features_of(pictures[0])], "features")
+    assert (line["status"], line["photograph"]["view"]["width"]) == (201, None)
+    wait_until_solved(client, album_id)
+    assert photographs(client, album_id)[0]["pin"]["place"] is not None
+    (damaged,) = add(client, album_id, [b"LLFT"], "features")
+    assert damaged["problem"]["type"] == "urn:lalaloc:problem:invalid-features"
+
+
+@pytest.fixture(scope="module")
+def features_of() -> Callable[[bytes], bytes]:
+    """Return the encoder of a device."""
+    bundle = Bundle.open(default_bundle())
+    encoder, size = FeatureEncoder(bundle, threads=1), sphere_size(bundle.manifest)
+    return lambda content: encoder.features(open_photograph(content, sphere_size=size))
+
+
+def test_stored_album_has_no_picture_position_or_owner(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+) -> None:
+    with start_app(tmp_path) as client:
+        album_id = create(client, upload(client, HOME))
+        add(client, album_id, pictures[:1])
+        wait_until_solved(client, album_id)
+        assert "Mustermann" not in json.dumps(photographs(client, album_id))
+        store = Store(database_of(tmp_path))
+        store.album_jobs.release(album_id, "")
+        with store._database.writing() as connection:
+            connection.execute(update(ALBUMS).values(solved_number=0))
+        job = store.album_jobs.claim(album_id, "test", 10.0)
+        assert job is not None
+        (part,) = job.photographs
+        assert len(part.entry) <= 20_000
+        for secret in (b"Mustermann", b"\xff\xd8\xff", b"GPS"):
+            assert secret not in part.entry
+        store.close()
+
+
+def test_model_without_features_has_no_albums(tiny_bundle: Path, start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, bundle=tiny_bundle) as client:
+        response = client.post("/albums", json={"floorplan_id": upload(client)})
+        assert_problem(response, 501, "model-without-features")
+
+
+def test_albums_of_another_tenant_do_not_exist(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+) -> None:
+    with start_app(tmp_path, api_keys=True) as client:
+        store = Store(database_of(tmp_path))
+        own, other = bearer(make_key(store, tenant="one")), bearer(make_key(store, tenant="two"))
+        reader = bearer(make_key(store, tenant="one", scopes=("read",)))
+        client.headers.update(own)
+        album_id = create(client, upload(client, HOME))
+        (line,) = add(client, album_id, pictures[:1])
+        path = f"/albums/{album_id}/photographs/{line['photograph']['id']}"
+        for method, address in (
+            ("GET", f"/albums/{album_id}"),
+            ("DELETE", f"/albums/{album_id}"),
+            ("GET", f"/albums/{album_id}/events"),
+            ("GET", f"/albums/{album_id}/photographs"),
+            ("GET", path),
+            ("DELETE", path),
+        ):
+            assert_problem(client.request(method, address, headers=other), 404, "unknown-album")
+            assert_problem(client.request(method, address, headers=reader), 403, "insufficient-scope")
+        assert client.get("/albums", headers=other).json()["albums"] == []
+        used = client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"]
+        assert used > 0
+        assert client.get("/usage", headers=other).json()["stored_bytes"]["by_kind"]["albums"] == 0
+        store.quota.recount()
+        assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == used
+        assert client.delete(f"/albums/{album_id}").status_code == 204
+        assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == 0
+        actions = [entry.action for entry in store.audit_log.page(limit=50)]
+        assert "DELETE /albums/{album_id}" in actions
+        store.close()
+
+
+def test_album_goes_with_its_plan_and_expires(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+) -> None:
+    with start_app(tmp_path, album_ttl_s=1.0) as client:
+        store = Store(database_of(tmp_path))
+        plan_id = upload(client)
+        expiring = create(client, plan_id)
+        add(client, expiring, pictures[:1])
+        wait_for(lambda: client.get(f"/albums/{expiring}").status_code == 404)
+        assert client.get("/albums").json()["albums"] == []
+        assert store.albums.purge() == 1
+        with_plan = create(client, plan_id)
+        assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+        assert_problem(client.get(f"/albums/{with_plan}"), 404, "unknown-album")
+        assert store.quota.account("default").used.albums == 0
+        store.close()
+
+
+def test_events_follow_an_album_until_it_is_solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    album_id = create(client, plan_id)
+    add(client, album_id, pictures[:2])
+    with client.stream("GET", f"/albums/{album_id}/events") as response:
+        assert response.headers["content-type"].startswith("text/event-stream")
+        text = "".join(response.iter_text())
+    assert "event: solved" in text
+    last = json.loads([line for line in text.splitlines() if line.startswith("data: ")][-1][6:])
+    assert (last["status"], last["photographs"]) == ("solved", 2)
+
+
+def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    upper = upload(client, {**HOME, "name": "Upper"})
+    plans = [{"floorplan_id": plan_id, "level": 0}, {"floorplan_id": upper, "level": 1}]
+    venue = client.post("/venues", json={"plans": plans}).json()
+    answer = client.post("/albums", json={"venue_id": venue["id"]})
+    assert answer.status_code == 201, answer.text
+    album_id = answer.json()["id"]
+    (line,) = add(client, album_id, pictures[:1])
+    wait_until_solved(client, album_id)
+    (row,) = photographs(client, album_id)
+    place = row["pin"]["place"]
+    assert place["level"] == {plan_id: 0.0, upper: 1.0}[place["floorplan_id"]]
+    moved = correct(
+        client, album_id, line["photograph"]["id"], {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
+    )
+    assert moved.status_code == 200, moved.text
+    wait_until_solved(client, album_id)
+    (row,) = photographs(client, album_id, floorplan_id=upper)
+    assert (row["pin"]["place"]["level"], row["pin"]["place"]["room"]) == (1.0, "living room")
+    drawing = {"Accept": "image/svg+xml"}
+    path = f"/albums/{album_id}/photographs"
+    assert_problem(client.get(path, headers=drawing), 422, "invalid-request")
+    assert client.get(path, headers=drawing, params={"floorplan_id": upper}).text.count('class="pin"') == 1
+    assert client.delete(f"/venues/{venue['id']}").status_code == 204
+    assert_problem(client.get(f"/albums/{album_id}"), 404, "unknown-album")
+
+
+def test_pins_move_with_a_new_revision_of_the_plan(client: httpx.Client, pictures: list[bytes]) -> None:
+    plan_id = upload(client, HOME)
+    album_id = create(client, plan_id)
+    add(client, album_id, pictures[:2])
+    before = wait_until_solved(client, album_id)
+    old = {row["id"]: row["pin"]["place"] for row in photographs(client, album_id)}
+    rooms = [{**room, "polygon": [[x + 5, y] for x, y in room["polygon"]]} for room in HOME["rooms"]]
+    doors = [{**opening, "line": [[x + 5, y] for x, y in opening["line"]]} for opening in HOME["openings"]]
+    answer = client.put(f"/floorplans/{plan_id}", json={**HOME, "rooms": rooms, "openings": doors})
+    assert answer.status_code == 200
+    wait_for(lambda: client.get(f"/albums/{album_id}").json()["place_revision"] != before["place_revision"])
+    album = wait_until_solved(client, album_id)
+    assert album["revision"] == before["revision"]
+    assert album["solution"]["pins"]["moved"] == 2
+    for row in photographs(client, album_id):
+        moved = row["pin"]["moved"]
+        assert moved["before"] == old[row["id"]]
+        assert moved["distance_m"] > 0.5
+
+
+def test_correction_of_a_room_that_is_gone_is_left_out(client: httpx.Client, pictures: list[bytes]) -> None:
+    plan_id = upload(client, HOME)
+    album_id = create(client, plan_id)
+    (line,) = add(client, album_id, pictures[:1])
+    kitchen = client.get(f"/floorplans/{plan_id}").json()["plan"]["rooms"][0]["id"]
+    assert correct(client, album_id, line["photograph"]["id"], {"room_id": kitchen}).status_code == 200
+    before = wait_until_solved(client, album_id)
+    rooms = [{**HOME["rooms"][1], "id": "only"}]
+    assert client.put(f"/floorplans/{plan_id}", json={**HOME, "rooms": rooms, "openings": []}).status_code == 200
+    wait_for(lambda: client.get(f"/albums/{album_id}").json()["place_revision"] != before["place_revision"])
+    wait_until_solved(client, album_id)
+    (row,) = photographs(client, album_id)
+    assert row["pin"]["state"] != "corrected"
+    assert "its correction was left out" in row["pin"]["warnings"][-1]
+
+
+def test_album_of_another_model_can_only_be_read(
+    client: httpx.Client, database_of: DatabaseOf, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
+) -> None:
+    with start_app(tmp_path) as own:
+        album_id = create(own, upload(own, HOME))
+        (line,) = add(own, album_id, pictures[:1])
+        wait_until_solved(own, album_id)
+        store = Store(database_of(tmp_path))
+        with store._database.writing() as connection:
+            connection.execute(update(ALBUMS).values(model_sha256="0" * 64))
+        assert own.get(f"/albums/{album_id}").json()["state"] == "outdated"
+        assert photographs(own, album_id)[0]["pin"]["place"] is not None
+        problem = assert_problem(send(own, album_id, pictures[1:2]), 409, "album-outdated")
+        assert "create a new album" in problem["detail"]
+        assert_problem(correct(own, album_id, line["photograph"]["id"], None), 409, "album-outdated")
+        assert own.delete(f"/albums/{album_id}").status_code == 204
+        store.close()
+
+
+@pytest.mark.one_replica
+def test_expired_lease_is_taken_over(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    solve = album_search.solve_album
+
+    def slow(*args: Any, **options: Any) -> Any:
+        begun.set()
+        assert go_on.wait(60.0)
+        return solve(*args, **options)
+
+    monkeypatch.setattr(album_search, "solve_album", slow)
+    with start_app(tmp_path) as client:
+        album_id = create(client, upload(client, HOME))
+        add(client, album_id, pictures[:1])
+        assert begun.wait(60.0)
+        store = Store(database_of(tmp_path))
+        # Held by the app: another replica gets nothing, nor does it store what it found.
+        assert store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
+        assert store.album_jobs.claim(album_id, "other", 10.0) is None
+        with store._database.writing() as connection:
+            connection.execute(update(ALBUMS).values(lease_until_s=0.0))
+        job = store.album_jobs.claim(album_id, "other", 10.0)
+        assert job is not None
+        assert job.attempts == 2
+        go_on.set()
+        # The app lost the lease, so its result is dropped until the other one releases it.
+        pins = {part.id: '{"state": "set_aside"}' for part in job.photographs}
+        assert not store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
+        store.album_jobs.release(album_id, "other")
+        wait_until_solved(client, album_id)
+        store.close()
+
+
+def test_album_that_cannot_be_solved_states_why(
+    start_app: StartApp, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise InvalidInputError("the album is impossible")
+
+    with start_app(tmp_path) as client:
+        album_id = create(client, upload(client, HOME))
+        with monkeypatch.context() as patch:
+            patch.setattr(album_search, "solve_album", refuse)
+            add(client, album_id, pictures[:1])
+            wait_for(lambda: client.get(f"/albums/{album_id}").json()["state"] == "failed")
+            assert client.get(f"/albums/{album_id}").json()["reason"] == "the album is impossible"
+        add(client, album_id, pictures[1:2])
+        wait_until_solved(client, album_id)
+        assert client.get(f"/albums/{album_id}").json()["reason"] is None
