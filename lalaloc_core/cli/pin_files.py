@@ -7,6 +7,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,6 @@ from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.localise.album.pins import Album, Pin, PinPose, moved_pins
 
 if TYPE_CHECKING:
-    from lalaloc_core.cli.pinning import PinnedFile
     from lalaloc_core.draw.pin_report import ReportRow
     from lalaloc_core.floorplan import FloorPlan
 
@@ -38,6 +38,24 @@ _COLUMNS = (
     "reason",
 )
 COPIES = "photographs"
+
+
+@dataclass(frozen=True, eq=False)
+class PinnedFile:
+    """A file of the folder.
+
+    Attributes:
+        number: number in the report, from 1.
+        path: the file.
+        id: id of its photograph; the same for copies of one file. None if it cannot be read, for `reason`.
+        taken: when it was taken, as text; empty if unknown.
+    """
+
+    number: int
+    path: Path
+    id: str | None
+    reason: str = ""
+    taken: str = ""
 
 
 def pins_document(

@@ -6,12 +6,12 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, content_of, stated_camera
 from lalaloc_core.cli.options import add_options
+from lalaloc_core.cli.pin_files import PinnedFile, moved_lines, pins_document, read_previous, write_pin_files
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
@@ -25,24 +25,6 @@ if TYPE_CHECKING:
 # Files that can be photographs; others are counted and left out.
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
 _HEAD = ("no", "photograph", "room", "x m", "y m", "heading °", "confidence", "state")
-
-
-@dataclass(frozen=True, eq=False)
-class PinnedFile:
-    """A file of the folder.
-
-    Attributes:
-        number: number in the report, from 1.
-        path: the file.
-        id: id of its photograph; the same for copies of one file. None if it cannot be read, for `reason`.
-        taken: when it was taken, as text; empty if unknown.
-    """
-
-    number: int
-    path: Path
-    id: str | None
-    reason: str = ""
-    taken: str = ""
 
 
 def add_commands(commands: Any) -> None:
@@ -70,8 +52,6 @@ def add_commands(commands: Any) -> None:
 
 
 def _pin(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.cli.pin_files import moved_lines, pins_document, read_previous, write_pin_files
-
     paths, notes = _photographs_in(arguments.folder, arguments.out, arguments.plan)
     previous = None if arguments.previous is None else read_previous(arguments.previous)
     stated = stated_camera(arguments)
