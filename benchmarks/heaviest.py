@@ -342,6 +342,26 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
         caller.send("DELETE", path)
 
 
+def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
+    answer = caller.send("POST", "/albums", _body({"floorplan_id": stored.plan_id}))
+    if answer.status != 201:
+        return
+    album = f"/albums/{answer.json()['id']}"
+    for first in range(0, size, _PANORAMAS):
+        # Bytes after the picture make it another one.
+        files = (("photo", _panorama() + str(first + number).encode()) for number in range(_PANORAMAS))
+        caller.send("POST", f"{album}/photographs", *form((), tuple(files)))
+    caller.send("GET", f"{album}/events")
+    caller.send("GET", album)
+    page = caller.send("GET", f"{album}/photographs")
+    if page.status == 200 and (photographs := page.json()["photographs"]):
+        path = f"{album}/photographs/{photographs[0]['id']}"
+        caller.send("PATCH", path, _body({"correction": {"elsewhere": True}}))
+        caller.send("GET", path)
+        caller.send("DELETE", path)
+    caller.send("DELETE", album)
+
+
 def _tiny_chunks(caller: Caller, _stored: Stored, size: int) -> None:
     """Send a body in chunks of one byte."""
     head = f"POST /localise HTTP/1.1\r\nTransfer-Encoding: chunked\r\nContent-Type: {_EMPTY_FORM}"
@@ -390,6 +410,9 @@ def _read(
 
 _PLAN, _VENUE = "/floorplans/{floorplan_id}", "/venues/{venue_id}"
 _SESSION, _KEY = "/sessions/{session_id}", "/admin/keys/{key_id}"
+_ALBUM = "/albums/{album_id}"
+_PINNED = f"{_ALBUM}/photographs/{{photograph_id}}"
+_ALBUMS = ("POST /albums", f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/events", f"GET {_ALBUM}", f"DELETE {_ALBUM}")
 _SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
 _EMPTY_FORM = "multipart/form-data; boundary=b"
@@ -460,6 +483,14 @@ LOADS = (
         plan=ROOMS_PLAN,
     ),
     Load(_SESSIONS, "two photographs, {homes} homes", partial(_follow_session, venue=True)),
+    _read("/albums", "pages of 500", 500, limit=None),
+    Load(
+        (*_ALBUMS, f"GET {_ALBUM}/photographs", f"GET {_PINNED}", f"PATCH {_PINNED}", f"DELETE {_PINNED}"),
+        f"album of 500 spheres, {ROOMS_PLAN}",
+        _pin_album,
+        500,
+        plan=ROOMS_PLAN,
+    ),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
     Load(_SESSIONS[:1], "WebSocket: empty pings", _frames(b"\x89\x80\0\0\0\0"), 100_000, refusals=_SWITCHED),

@@ -231,20 +231,21 @@ def open_photograph(
         named = () if layout is None else (layout.text,)
         lens = replace(lens, warnings=(*named, *file.warnings, *metadata.warnings, *lens.warnings))
         if lens.is_sphere:
-            _refuse_drawing(sphere())
+            _refuse_drawing(sphere(), stated)
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
-    _refuse_drawing(picture)
+    _refuse_drawing(picture, stated)
     return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
 
 
-def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Refuse a plan or a page of text.
+def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"], stated: StatedCamera) -> None:
+    """Refuse a plan or a page of text, unless the caller states the camera: overexposed walls can be as white as paper.
 
     Raises:
         InvalidPhotographError: the picture is ink on white paper.
     """
-    if is_drawing(picture):
+    is_stated = stated.projection != AUTO or stated.hfov_deg is not None or stated.intrinsics is not None
+    if not is_stated and is_drawing(picture):
         raise InvalidPhotographError(
             "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
             "photograph taken in one of its rooms"

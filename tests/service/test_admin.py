@@ -197,7 +197,10 @@ def test_invalid_lifetime_is_a_usage_error(options: list[str]) -> None:
 def test_migration_lets_readers_read_metrics(store: Store) -> None:
     keys = [id_of(make_key(store, scopes=scopes)) for scopes in (("read", "write"), ("localise",), ("read",))]
     with store._database.writing() as connection:
-        # The migration 0012 came later.
+        # The migrations 0012 and 0013 came later.
+        for table in ("album_photographs", "albums"):
+            connection.exec_driver_sql(f"DROP TABLE {table}")
+        connection.exec_driver_sql("ALTER TABLE tenants DROP COLUMN albums_bytes")
         connection.exec_driver_sql("DROP INDEX floorplans_by_change")
         for table, column in (("floorplans", "changed"), ("tenants", "changes"), ("tenants", "counted_bytes")):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")

@@ -211,8 +211,8 @@ def test_documented_settings_exist() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in GUIDES.glob("*.md"))
     named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", text))
     known = {name.upper() for name in SETTING_NAMES}
-    # Variables of the compose files and of Caddy.
-    assert named - known == {"DATABASE_PASSWORD", "HOST", "MEMORY", "PUBLISH", "UPSTREAM"}
+    # Variables of the compose files, of Caddy, and of `lalaloc mcp`.
+    assert named - known == {"API_KEY", "DATABASE_PASSWORD", "HOST", "MEMORY", "PUBLISH", "UPSTREAM"}
 
 
 def own_database(postgres: PostgresServer) -> str:

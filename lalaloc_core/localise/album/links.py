@@ -30,7 +30,7 @@ _MATCHES, _MATCH_ODDS, _TURN_ODDS = (0.0, 6.0, 14.0, 18.0, 24.0, 32.0), (-0.3, -
 _FOUND, _ALIKE, _UNLIKE = 0.65, 0.4, 0.25
 _COLOUR_ODDS = (-2.0, 3.0)
 # Each photograph of a room has pairs with all others, which are no independent signs.
-_WEIGHT = 0.5
+_WEIGHT = 0.25
 # Matches of a pair, and turn (radians; NaN if none was found).
 Found = tuple[int, float]
 

@@ -121,16 +121,14 @@ def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], room
 def _room_types(searched: SearchedPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
     """Return the log likelihood of every room's type.
 
-    The encoder's own prediction counts as in the matching cost; recognised objects by the probability of the surest,
-    as they say nothing about pictures in which none is recognised.
+    As in the matching cost, recognised objects replace the encoder's own prediction.
     """
-    total = np.zeros(len(ROOM_TYPES))
-    if query.room_type is not None:
-        total -= weights.room_type * weights.temperature * room_type_losses(query.room_type, _CONFIG.floor)
     if query.objects is not None:
-        surest = max((seen.probability for seen in query.objects.objects), default=0.0)
-        total -= surest * room_type_losses(query.objects.room_type, _CONFIG.floor)
-    return total[searched.types]
+        return -room_type_losses(query.objects.room_type, _CONFIG.floor)[searched.types]
+    if query.room_type is None:
+        return np.zeros(len(searched.types))
+    losses = room_type_losses(query.room_type, _CONFIG.floor)
+    return -weights.room_type * weights.temperature * losses[searched.types]
 
 
 def _ceilings(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r j"]:
