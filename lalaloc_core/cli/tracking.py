@@ -14,7 +14,7 @@ from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stat
 from lalaloc_core.cli.options import add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, print_json, print_table
-from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
@@ -34,6 +34,14 @@ class _Found:
     time_s: float
     view: dict[str, Any]
     tracked: Tracked
+
+
+@dataclass(frozen=True)
+class _Refused:
+    """A photograph that cannot be used, and why."""
+
+    path: Path
+    error: str
 
 
 def add_commands(commands: Any) -> None:
@@ -86,7 +94,10 @@ def _track(arguments: argparse.Namespace) -> None:
         trajectory = read_trajectory(_text(arguments.odometry), arguments.odometry_frame)
         for warning in trajectory.warnings:
             print(f"warning: {arguments.odometry}: {warning}", file=sys.stderr)
-    found = _followed(arguments, plan, photographs, trajectory, stated)
+    answers = _followed(arguments, plan, photographs, trajectory, stated)
+    found = [answer for answer in answers if isinstance(answer, _Found)]
+    if not found:
+        raise InvalidPhotographError(f"none of {len(answers)} photographs can be used; see the errors above")
     if arguments.trajectory is not None:
         poses = [(answer, answer.tracked.pose) for answer in found]
         lines = [
@@ -95,15 +106,19 @@ def _track(arguments: argparse.Namespace) -> None:
         write_text(arguments.trajectory, "\n".join(lines) + "\n")
     if arguments.out is not None:
         write_picture(_picture(plan, [answer.tracked for answer in found]), arguments.out)
-    documents = [_document(answer, plan) for answer in found]
+    documents = [_document(answer, plan) for answer in answers]
     if arguments.json:
         print_json(documents, JSON_DECIMALS)
     else:
         rows = [
             (answer.path.name, pose["mode"], *pose_cells(pose), f"{100.0 * pose['probability']:.1f} %")
-            for answer, pose in zip(found, documents, strict=True)
+            for answer, pose in zip(answers, documents, strict=True)
+            if "error" not in pose
         ]
         print_table(_HEAD, rows)
+    if len(found) < len(answers):
+        failed = len(answers) - len(found)
+        raise InvalidPhotographError(f"{failed} of {len(answers)} photographs were left out; see the errors above")
 
 
 def _photographs(folder: Path) -> list[tuple[float, Path]]:
@@ -135,8 +150,11 @@ def _followed(
     photographs: list[tuple[float, Path]],
     trajectory: Trajectory | None,
     stated: StatedCamera,
-) -> list[_Found]:
-    """Return the answer of each photograph, with a progress bar on a terminal."""
+) -> list[_Found | _Refused]:
+    """Return the answer of each photograph, with a progress bar on a terminal.
+
+    Odometry leads from the last photograph that can be used to the next one.
+    """
     from tqdm import tqdm
 
     from lalaloc_core.evaluate.methods.lalaloc import LocalModel
@@ -155,12 +173,17 @@ def _followed(
         arguments.mount,
     )
     state, before_s = None, None
-    found: list[_Found] = []
+    found: list[_Found | _Refused] = []
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
-        content = content_of(path)
-        with named(path):
-            view = model.open(content, stated)
-            query = model.encoder.query(view, None, height)
+        try:
+            content = content_of(path)
+            with named(path):
+                view = model.open(content, stated)
+                query = model.encoder.query(view, None, height)
+        except InvalidPhotographError as error:
+            print(f"error: {error}", file=sys.stderr)
+            found.append(_Refused(path, str(error)))
+            continue
         state = state or TrackState.first(len(query.roll))
         motion = None
         if trajectory is not None and before_s is not None:
@@ -190,8 +213,10 @@ def _picture(plan: FloorPlan, found: list[Tracked]) -> str:
     return draw_path(plan, DrawnPath(position_m, is_sure, math.degrees(found[-1].pose.heading)))
 
 
-def _document(answer: _Found, plan: FloorPlan) -> dict[str, Any]:
+def _document(answer: _Found | _Refused, plan: FloorPlan) -> dict[str, Any]:
     """Return an answer as JSON, with the field names of the API."""
+    if isinstance(answer, _Refused):
+        return {"photograph": str(answer.path), "error": answer.error}
     pose = answer.tracked.pose
     return {
         "photograph": str(answer.path),

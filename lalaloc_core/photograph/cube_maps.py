@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from itertools import permutations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
 
-# Faces of a cube map, as (row, column, half turns) each.
+# Faces of a cube map: (row, column, quarter turns counter-clockwise that set it upright) each.
+Faces = tuple[tuple[int, int, int], ...]
 FRONT, RIGHT, BACK, LEFT, UP, DOWN = range(6)
 # Layouts in rows and columns.
 _CROSSES = ((3, 4), (4, 3))
@@ -24,14 +27,29 @@ _MAX_SPREAD, _MAX_DIFFERENCE = 5.0, 10.0
 # and from which they do not; least shares of continued edges and of broken borders.
 _CONTINUED, _BROKEN = 2.5, 4.0
 _MIN_CONTINUED, _MIN_BROKEN = 0.8, 0.25
+# Arrangements: largest ratio that counts, largest mean of the cube's twelve edges, and least quotient of the next best
+# arrangement of walls, floor and ceiling and the best one.
+_WORST, _MAX_MEAN, _MIN_MARGIN = 6.0, 2.5, 1.25
+# The rows of equi-angular cube maps as video sites store them: left, front, right; below, back, above, turned.
+_TURNED_ROWS: Faces = ((0, 1, 0), (0, 2, 0), (1, 1, 1), (0, 0, 0), (1, 2, 3), (1, 0, 3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CubeMap:
-    """A cube map: the name of its layout, and its faces in the order of `FRONT`… if the layout tells them."""
+    """A cube map.
+
+    Attributes:
+        name: its layout.
+        faces: its faces in the order of `FRONT`…, if layout or edges tell them.
+    """
 
     name: str
-    faces: tuple[tuple[int, int, int], ...] | None = None
+    faces: Faces | None = None
+
+    @property
+    def equiangular(self) -> bool:
+        """True if pixels are at equal angles, not at equal distances on the cube: only such maps have turned rows."""
+        return self.faces == _TURNED_ROWS
 
 
 def find_cube(pixels: UInt8[np.ndarray, "h w 3"]) -> CubeMap | None:
@@ -45,7 +63,9 @@ def find_cube(pixels: UInt8[np.ndarray, "h w 3"]) -> CubeMap | None:
         if faces is not None:
             return CubeMap(name=f"a cross of {columns} x {rows} faces", faces=faces)
         if (rows, columns) in _GRIDS and _is_cube(cells):
-            return CubeMap(name=f"{columns} x {rows} faces")
+            faces = arrange_faces(cells)
+            kind = "equi-angular, " if faces == _TURNED_ROWS else ""
+            return CubeMap(name=f"{kind}{columns} x {rows} faces", faces=faces)
     return None
 
 
@@ -59,9 +79,11 @@ def cut_cells(
 
 
 def to_sphere(
-    pixels: UInt8[np.ndarray, "h w 3"], faces: tuple[tuple[int, int, int], ...], height: int, width: int
+    pixels: UInt8[np.ndarray, "h w 3"], cube: CubeMap, height: int, width: int
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Return the sphere of a cross of faces; its centre is that of the front face."""
+    """Return the sphere of a cube map whose faces are known; its centre is that of the front face."""
+    faces = cube.faces
+    assert faces is not None
     rows, columns = 1 + max(face[0] for face in faces), 1 + max(face[1] for face in faces)
     side = max(pixels.shape[1] // columns, 1)
     cells = cut_cells(pixels, rows, columns, side)
@@ -75,8 +97,11 @@ def to_sphere(
     sphere = np.zeros((height, width, 3), np.uint8)
     for face, (row, column, turns) in enumerate(faces):
         ahead, right, down = axes[face]
-        shown = np.rot90(cells[row, column], 2 * turns)
-        place = [(axis / np.maximum(ahead, 0.1) + 1.0) * 0.5 * side - 0.5 for axis in (right, down)]
+        shown = np.rot90(cells[row, column], turns)
+        on_face = [axis / np.maximum(ahead, 0.1) for axis in (right, down)]
+        if cube.equiangular:
+            on_face = [np.arctan(shift) * (4.0 / np.pi) for shift in on_face]
+        place = [(shift + 1.0) * 0.5 * side - 0.5 for shift in on_face]
         taken = cv2.remap(
             np.ascontiguousarray(shown),
             place[0].astype(np.float32),
@@ -88,7 +113,7 @@ def to_sphere(
     return sphere
 
 
-def _faces_of_cross(cells: UInt8[np.ndarray, "r c s s 3"]) -> tuple[tuple[int, int, int], ...] | None:
+def _faces_of_cross(cells: UInt8[np.ndarray, "r c s s 3"]) -> Faces | None:
     """Return the faces of a cross: a band of four faces, with one above and one below it, and empty cells."""
     rows, columns = cells.shape[:2]
     values = cells.reshape(rows, columns, -1, 3).astype(np.float32)
@@ -104,7 +129,7 @@ def _faces_of_cross(cells: UInt8[np.ndarray, "r c s s 3"]) -> tuple[tuple[int, i
         return (*band, (0, front, 0), (2, front, 0))
     if is_empty[:, 1].any() or is_empty[1].any():
         return None
-    return (1, 1, 0), (1, 2, 0), (3, 1, 1), (1, 0, 0), (0, 1, 0), (2, 1, 0)
+    return (1, 1, 0), (1, 2, 0), (3, 1, 2), (1, 0, 0), (0, 1, 0), (2, 1, 0)
 
 
 def _is_cube(cells: UInt8[np.ndarray, "r c s s 3"]) -> bool:
@@ -123,7 +148,87 @@ def _is_cube(cells: UInt8[np.ndarray, "r c s s 3"]) -> bool:
     return bool(broken >= _MIN_BROKEN and continued >= _MIN_CONTINUED)
 
 
-def _edges(faces: Float[np.ndarray, "6 s s 3"]) -> tuple[Float[np.ndarray, "24 s 3"], Float[np.ndarray, "24"]]:
+def arrange_faces(cells: UInt8[np.ndarray, "r c s s 3"]) -> Faces | None:
+    """Return the faces of a cube map of six cells by the edges that continue each other; None if they leave a doubt.
+
+    Walls are upright in their cells, except in `_TURNED_ROWS`. The front is the wall below which the ceiling's cell is
+    upright; another front would turn the sphere only.
+    """
+    columns = cells.shape[1]
+    cell, turn = _arrangements(columns)
+    lines = [
+        np.rot90(face, turns) for face in cells.reshape(-1, *cells.shape[2:]).astype(np.float32) for turns in range(4)
+    ]
+    edges, steps = _edges(np.stack(lines))
+    ratios = np.stack([_differences_along(edges, other) for other in (edges, edges[:, ::-1])])
+    ratios /= np.minimum(steps[:, None], steps[None, :]) + 1.0
+    # Edges are numbered by cell, turns, and side of the turned cell.
+    face_a, side_a, face_b, side_b, is_reversed = np.array(_cube_edges()).T
+    first, second = (
+        (4 * cell[:, face] + turn[:, face]) * 4 + side for face, side in ((face_a, side_a), (face_b, side_b))
+    )
+    means = np.minimum(ratios[is_reversed, first, second], _WORST).mean(axis=1)
+    # Among equal floors, an upright one.
+    best = int(np.argmin(means + 1e-3 * (turn[:, DOWN] > 0)))
+    rivals = means[~_have_walls_of(cell, cell[best])]
+    if means[best] > _MAX_MEAN or float(rivals.min()) < _MIN_MARGIN * means[best]:
+        return None
+    return tuple((int(c) // columns, int(c) % columns, int(t)) for c, t in zip(cell[best], turn[best], strict=True))
+
+
+@cache
+def _arrangements(columns: int) -> tuple[Int[np.ndarray, "n 6"], Int[np.ndarray, "n 6"]]:
+    """Return cell and quarter turns of each face, of all arrangements that are tried."""
+    every: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
+        ((*walls, *poles), (0, 0, 0, 0, 0, below))
+        for poles in permutations(range(6), 2)
+        for walls in permutations(sorted({*range(6)} - {*poles}))
+        for below in range(4)
+    ]
+    if columns == 3:
+        cells = tuple(3 * row + column for row, column, _ in _TURNED_ROWS)
+        every.append((cells, tuple(turns for *_, turns in _TURNED_ROWS)))
+    return np.array([cell for cell, _ in every]), np.array([turn for _, turn in every])
+
+
+def _have_walls_of(cell: Int[np.ndarray, "n 6"], best: Int[np.ndarray, "6"]) -> Bool[np.ndarray, "n"]:
+    """Return which arrangements have the same ceiling and floor, and the same walls in order from any front."""
+    turned = [np.roll(best[:4], step) for step in range(4)]
+    return (cell[:, 4:] == best[4:]).all(axis=1) & np.any(
+        [(cell[:, :4] == walls).all(axis=1) for walls in turned], axis=0
+    )
+
+
+@cache
+def _cube_edges() -> list[tuple[int, int, int, int, int]]:
+    """Return the twelve edges of a cube as face and side of both faces, and 1 if their pixels run in opposite ways."""
+    x, y, z = np.eye(3, dtype=int)
+    axes = {
+        FRONT: (y, x, -z),
+        RIGHT: (x, -y, -z),
+        BACK: (-y, -x, -z),
+        LEFT: (-x, y, -z),
+        UP: (z, x, y),
+        DOWN: (-z, x, -y),
+    }
+    ends: dict[tuple[int, int], tuple[tuple[int, ...], ...]] = {}
+    for face, (ahead, right, down) in axes.items():
+        corners = [(-1, -1, -1, 1), (1, -1, 1, 1), (-1, -1, 1, -1), (-1, 1, 1, 1)]
+        for side, (right_0, down_0, right_1, down_1) in enumerate(corners):
+            ends[face, side] = tuple(
+                tuple((ahead + across * right + below * down).tolist())
+                for across, below in ((right_0, down_0), (right_1, down_1))
+            )
+    keys = list(ends)
+    return [
+        (*a, *b, int(ends[a] != ends[b]))
+        for index, a in enumerate(keys)
+        for b in keys[index + 1 :]
+        if set(ends[a]) == set(ends[b])
+    ]
+
+
+def _edges(faces: Float[np.ndarray, "n s s 3"]) -> tuple[Float[np.ndarray, "4*n s 3"], Float[np.ndarray, "4*n"]]:
     """Return left, right, top and bottom edge of each face, and their mean difference from the line beside."""
     lines = [
         (face, beside)
@@ -141,4 +246,10 @@ def _edges(faces: Float[np.ndarray, "6 s s 3"]) -> tuple[Float[np.ndarray, "24 s
 
 def _differences(edges: Float[np.ndarray, "n s 3"]) -> Float[np.ndarray, "n n"]:
     """Return the mean difference of each edge from each other one, in the direction that fits better."""
-    return np.minimum(*(np.abs(edges[:, None] - other[None]).mean(axis=(2, 3)) for other in (edges, edges[:, ::-1])))
+    return np.minimum(*(_differences_along(edges, other) for other in (edges, edges[:, ::-1])))
+
+
+def _differences_along(
+    edges: Float[np.ndarray, "n s 3"], others: Float[np.ndarray, "m s 3"]
+) -> Float[np.ndarray, "n m"]:
+    return np.stack([np.abs(edge - others).mean(axis=(1, 2)) for edge in edges])

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.photograph.cube_maps import find_cube
+from lalaloc_core.photograph.cube_maps import CubeMap, find_cube
 from lalaloc_core.photograph.projection import COARSEST, is_sphere
 
 # Longest side (pixels) of pictures that are judged: a multiple of the cells of cube maps in both directions.
@@ -39,19 +39,19 @@ class Layout:
         box: part of the picture with the sphere, as shares (left, top, right, bottom); None if it is not converted.
         is_stored: `box` is one of the stored picture, before its Exif orientation is applied.
         is_half: the box shows 180° of the sphere.
-        faces: faces of a cube map, as `cube_maps.to_sphere` takes them.
+        cube: the cube map, if its faces are known.
     """
 
     text: str
     box: tuple[float, float, float, float] | None = None
     is_stored: bool = False
     is_half: bool = False
-    faces: tuple[tuple[int, int, int], ...] | None = None
+    cube: CubeMap | None = None
 
     @property
     def is_usable(self) -> bool:
         """True if the sphere can be taken out of the picture without loss."""
-        return self.box is not None or self.faces is not None
+        return self.box is not None or self.cube is not None
 
 
 def find_layout(pixels: UInt8[np.ndarray, "h w 3"], *, orientation: int) -> Layout | None:
@@ -89,7 +89,8 @@ def _find_upright(pixels: UInt8[np.ndarray, "h w 3"]) -> Layout | None:
         return None
     if cube.faces is None:
         return Layout(text=f"the photograph is a cube map, {cube.name}: convert it to equirectangular")
-    return Layout(text=f"the photograph is a cube map, {cube.name}: it was converted", faces=cube.faces)
+    text = f"the photograph is a cube map, {cube.name}: it was converted, with the front face in its centre"
+    return Layout(text=text, cube=cube)
 
 
 def _has_ratio(pixels: np.ndarray, ratio: float) -> bool:

@@ -126,7 +126,8 @@ def find_lens(
     if stated.hfov_deg is not None and not is_full:
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
     if projection == "equirectangular":
-        return Lens(projection=projection, projection_source=source, hfov_source=source)
+        unused = () if stated.intrinsics is None else ("intrinsics are not used: the photograph is a sphere",)
+        return Lens(projection=projection, projection_source=source, hfov_source=source, warnings=unused)
     if projection == "cylindrical" and sphere.cylinder is not None and (sphere.cylinder < TWO_PI or closes()):
         return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano")
     if projection == "cylindrical":

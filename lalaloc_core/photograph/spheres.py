@@ -93,8 +93,8 @@ def convert_layout(
         finest = (math.ceil(shown[0] / (box[2] - box[0])), math.ceil(shown[1] / (box[3] - box[1])))
         size = tuple(map(min, zip(file.upright_size, finest, strict=True)))
         picture = scaled(file, (size[0], size[1]))
-        if layout.faces is not None:
-            canvas = Image.fromarray(to_sphere(np.asarray(picture), layout.faces, shown[1], shown[0]))
+        if layout.cube is not None:
+            canvas = Image.fromarray(to_sphere(np.asarray(picture), layout.cube, shown[1], shown[0]))
         else:
             pixels = tuple(share * side for share, side in zip(box, size + size, strict=True))
             canvas = picture.resize(shown, Image.Resampling.BOX, box=(pixels[0], pixels[1], pixels[2], pixels[3]))

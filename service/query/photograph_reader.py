@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.stated_pose import known_heading
@@ -41,9 +43,11 @@ class PhotographReader:
             InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
         """
         with context.clock.stage("decode"):
-            return [
-                await self._decoder.decode(content, stated, context.deadline, context.client) for content in contents
-            ]
+            photographs: list[Photograph] = []
+            for index, content in enumerate(contents):
+                with _named(index, contents):
+                    photographs.append(await self._decoder.decode(content, stated, context.deadline, context.client))
+            return photographs
 
     async def decode_turn(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
@@ -58,7 +62,10 @@ class PhotographReader:
         """
         decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)
         with context.clock.stage("decode"):
-            photographs = [await decode(content, stated, overview=True) for content in contents]
+            photographs: list[Photograph] = []
+            for index, content in enumerate(contents):
+                with _named(index, contents):
+                    photographs.append(await decode(content, stated, overview=True))
             if any(photograph.overview is None for photograph in photographs):
                 return photographs, None
             views = turn_views(photographs)
@@ -112,3 +119,14 @@ class PhotographReader:
         return self._encoder.query(
             spot.photograph, known.heading, height, heading_tolerance=known.tolerance, others=spot.others
         )
+
+
+@contextmanager
+def _named(index: int, contents: Sequence[Content]) -> Iterator[None]:
+    """Name the photograph in the message of a refusal, if there are several."""
+    try:
+        yield
+    except InvalidPhotographError as error:
+        if len(contents) == 1:
+            raise
+        raise type(error)(f"photo[{index}]: {error}") from error

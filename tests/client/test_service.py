@@ -16,7 +16,10 @@ import pytest
 from PIL import Image
 
 from lalaloc_client import ConflictError, InvalidError, Localisation, NotFoundError
+from lalaloc_core.bundle import default_bundle
 from tests.client.conftest import MakeClient
+from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
+from tests.core.taken import EXAMPLES
 from tests.service.conftest import FLAT, StartApp
 
 
@@ -274,3 +277,27 @@ def test_batch_yields_an_answer_per_photograph(service: Any, panorama: bytes, tm
     assert caught.value.type == "urn:lalaloc:problem:invalid-panorama"
     with pytest.raises(NotFoundError):
         list(service.localise_batch("f" * 32, [panorama]))
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Return an app with the shipped model."""
+    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), request_deadline_s=90.0) as started:
+        yield started
+
+
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if not fault.fields], ids=fault_id)
+def test_faulty_photograph_gives_its_warning_or_a_named_error(
+    shipped: httpx.Client, make_client: MakeClient, fault: Fault
+) -> None:
+    with make_client(str(shipped.base_url), timeout_s=100.0) as client:
+        plan = client.upload_floorplan(EXAMPLES / "flat.json")
+        if fault.is_usable:
+            answer = client.localise(plan.id, FOLDER / fault.name)
+            fault.check(dataclasses.asdict(answer))
+            assert fault.said is None or any(fault.said in text for text in answer.warnings)
+            return
+        with pytest.raises(InvalidError) as caught:
+            client.localise(plan.id, FOLDER / fault.name)
+        assert caught.value.type == "urn:lalaloc:problem:invalid-panorama"
+        fault.check_refusal(str(caught.value))

@@ -15,6 +15,7 @@ from PIL import Image
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from lalaloc_core.photograph.cube_maps import arrange_faces, find_cube
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
 
@@ -44,6 +45,13 @@ def faces(panorama: np.ndarray) -> list[np.ndarray]:
     return [*band, take(panorama, camera, pitch_deg=90.0), take(panorama, camera, pitch_deg=-90.0)]
 
 
+def equiangular(face: np.ndarray) -> np.ndarray:
+    """Return a face with pixels at equal angles."""
+    place = (np.arange(256) + 0.5) / 256 * 2.0 - 1.0
+    on_face = ((np.tan(place * 0.25 * np.pi) + 1.0) * 128 - 0.5).astype(np.float32)
+    return cv2.remap(face, *np.meshgrid(on_face, on_face), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
 def barred(panorama: np.ndarray, above: int, beside: int, grey: int = 0) -> np.ndarray:
     return np.pad(panorama, ((above, above), (beside, beside), (0, 0)), constant_values=grey)
 
@@ -57,7 +65,15 @@ def usable(panorama: np.ndarray) -> dict[str, np.ndarray]:
     square, other_square = (cv2.resize(eye, (512, 512)) for eye in (panorama, other_eye))
     rows = [[empty, up, empty, empty], [left, front, right, back], [empty, down, empty, empty]]
     column = [[white, up, white], [left, front, right], [white, down, white], [white, np.rot90(back, 2), white]]
+    of_video = [equiangular(face) for face in (front, right, back, left, up, down)]
+    turned = [np.rot90(of_video[5]), np.rot90(of_video[2], -1), np.rot90(of_video[4])]
     return {
+        "cube map, 3 x 2 faces": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
+        "cube map, equi-angular, 3 x 2": np.vstack([np.hstack([of_video[i] for i in (3, 0, 1)]), np.hstack(turned)]),
+        "cube map, 2 x 3": np.vstack([np.hstack([right, left]), np.hstack([up, down]), np.hstack([front, back])]),
+        "cube map, 6 x 1": np.hstack([right, left, up, down, front, back]),
+        "cube map, 6 x 1 faces": np.hstack([up, front, right, back, left, down]),
+        "cube map, 1 x 6": np.vstack([front, right, back, left, up, down]),
         "cross of 4 x 3": np.vstack([np.hstack(row) for row in rows]),
         "cross of 3 x 4": np.vstack([np.hstack(row) for row in column]),
         "one eye above the other": np.vstack([panorama, other_eye]),
@@ -79,13 +95,11 @@ def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
     """Return pictures that are refused, by a word of the refusal."""
     front, right, back, left, up, down = faces(panorama)
     two = [circle(panorama, heading_deg) for heading_deg in (0.0, 180.0)]
-    below = [np.rot90(down), np.rot90(back, -1), np.rot90(up)]
     return {
-        "cube map, 3 x 2": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
-        "cube map, 3 x 2 faces": np.vstack([np.hstack([left, front, right]), np.hstack(below)]),
-        "cube map, 2 x 3": np.vstack([np.hstack([right, left]), np.hstack([up, down]), np.hstack([front, back])]),
-        "cube map, 6 x 1": np.hstack([right, left, up, down, front, back]),
-        "cube map, 1 x 6": np.vstack([right, left, up, down, front, back]),
+        "cube map, 3 x 2": np.vstack(
+            [np.hstack([left, np.rot90(front), right]), np.hstack([down, back[::-1, ::-1], up])]
+        ),
+        "cube map, 6 x 1": np.hstack([np.rot90(right), left, up, down, np.rot90(front, -1), back]),
         "dual fisheye": np.hstack(two),
         "dual fisheye picture": np.vstack(two),
         "circle of a fisheye": two[0],
@@ -104,6 +118,16 @@ def test_sphere_is_taken_out_of_its_layout(name: str) -> None:
         assert words in view.warnings[0]
         assert view.sphere is not None
         assert np.abs(view.sphere.astype(int) - whole).mean() < 6.0, words
+
+
+def test_pictures_of_six_unrelated_faces_are_no_cube_maps() -> None:
+    rooms = [faces(small(name))[:2] for name in NAMES[:3]]
+    assert find_cube(np.vstack([np.hstack([room[row] for room in rooms]) for row in (0, 1)])) is None
+
+
+def test_doubtful_faces_are_not_arranged() -> None:
+    same = np.repeat(faces(small("kitchen"))[0][None], 6, axis=0).reshape(2, 3, 256, 256, 3)
+    assert arrange_faces(same) is None
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import httpx
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.photograph.file_segments import END
+from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 from tests.service.test_photographs import PHONE, ask, shown
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
-# Words of the libraries that decode, and of their objects.
-LIBRARY_WORDS = ("PIL", "illow", "libheif", "BytesIO", "0x7f", "bomb", "MAX_TEXT", "Traceback", "plugin", "not a TIFF")
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +31,86 @@ def client(
 @pytest.fixture(scope="module")
 def flat(client: httpx.Client) -> str:
     return upload(client, FLAT)
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    deadlines = {"request_deadline_s": 90.0, "lpo_deadline_s": 60.0}
+    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), workers=1, **deadlines) as started:
+        wait_for(lambda: started.get("/readyz").json()["lpo_pool"]["ready"] > 0, 120.0)
+        yield started
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    return upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
+
+
+def data_of(fault: Fault, plan_id: str) -> dict[str, str]:
+    return {"floorplan_id": plan_id, **fault.fields}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
+def test_file_is_localised_right_or_refused_by_name(shipped: httpx.Client, home: str, fault: Fault) -> None:
+    response = shipped.post("/localise", data=data_of(fault, home), files={"photo": (fault.name, fault.content)})
+    if fault.is_usable:
+        assert response.status_code == 200, response.text
+        fault.check(response.json())
+    else:
+        fault.check_refusal(assert_problem(response, 422, "invalid-panorama")["detail"])
+
+
+def test_contradicted_statement_is_named_at_a_low_confidence(shipped: httpx.Client, home: str) -> None:
+    response = shipped.post(
+        "/localise", data=data_of(CONTRADICTED, home), files={"photo": ("photo", CONTRADICTED.content)}
+    )
+    CONTRADICTED.check_warnings(response.json())
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
+def test_fault_in_a_batch_leaves_other_photographs_their_answers(
+    shipped: httpx.Client, home: str, fault: Fault
+) -> None:
+    response = shipped.post("/localise/batch", data=data_of(fault, home), files=two_files(fault))
+    first, second = map(json.loads, response.text.splitlines())
+    assert "answer" in second
+    if fault.is_usable:
+        fault.check(first["answer"])
+    else:
+        fault.check_refusal(first["problem"]["detail"])
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
+def test_fault_in_a_sequence_is_named_with_its_photograph(shipped: httpx.Client, home: str, fault: Fault) -> None:
+    fields = {name: value for name, value in data_of(fault, home).items() if name in ("floorplan_id", "intrinsics")}
+    response = shipped.post("/localise/sequence", data=fields, files=two_files(fault))
+    if not fault.is_usable:
+        detail = assert_problem(response, 422, "invalid-panorama")["detail"]
+        fault.check_refusal(detail)
+        assert "photo[0]" in detail
+        return
+    answer = response.json()
+    # A single view twice is no evidence beyond itself.
+    assert fault.fields or {pose["room"] for pose in answer["poses"]} == {fault.room}
+    assert fault.said is None or any(text.startswith("photo[0]") and fault.said in text for text in answer["warnings"])
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
+def test_fault_in_a_session_is_named_with_its_pose(shipped: httpx.Client, home: str, fault: Fault) -> None:
+    session = shipped.post("/sessions", json={"floorplan_id": home}).json()["id"]
+    response = shipped.post(
+        f"/sessions/{session}/photographs", data=dict(fault.fields), files={"photo": (fault.name, fault.content)}
+    )
+    if fault.is_usable:
+        fault.check(response.json()["pose"])
+    else:
+        fault.check_refusal(assert_problem(response, 422, "invalid-panorama")["detail"])
+
+
+def two_files(fault: Fault) -> list[tuple[str, tuple[str, bytes]]]:
+    """Return a file and a sphere; the file twice if its fields are not those of a sphere."""
+    other = KITCHEN if "intrinsics" not in fault.fields else fault.content
+    return [("photo", (fault.name, fault.content)), ("photo", ("other.jpg", other))]
 
 
 def test_damaged_photograph_is_used_with_a_warning_at_the_top(client: httpx.Client, flat: str) -> None:
