@@ -55,6 +55,7 @@ def test_azimuths_that_are_not_seen_stay_unknown_and_walls_stay_predicted_withou
     query = with_truth(one, noise=None, openings=True, rng=np.random.default_rng(0))
     assert query.profile is one.query.profile
     assert query.openings is not None
+    assert one.query.profile is not None
     unseen = ~one.query.profile.seen[0]
     np.testing.assert_allclose(np.exp(query.openings.log_probability[0][unseen]), [[0.7, 0.1, 0.1, 0.1]] * unseen.sum())
     assert query.ceiling is not None

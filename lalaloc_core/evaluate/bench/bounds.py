@@ -112,14 +112,13 @@ def with_truth(asked: Asked, *, noise: float | None, openings: bool, rng: np.ran
     columns = query.profile.log_m.shape[1]
     layouts = layouts_of_pose(query, plan, pose)
     shifts = np.round((query.roll - query.roll[0]) / TWO_PI * columns).astype(int)
+    seen = query.profile.seen[0]
     if noise is not None:
-        seen = query.profile.seen[0]
         log_m = layouts.log_profile[0] + rng.normal(0.0, noise, columns)
         scale = np.where(seen, np.log(noise), np.inf)
         query = replace(query, profile=PredictedProfile(log_m[None], scale[None]).moved(shifts))
     if openings and query.openings is not None and layouts.kind is not None:
         classes = len(query.openings.prior)
-        seen = query.profile.seen[0]
         true = np.where(np.arange(classes) == layouts.kind[0][:, None], _SURE, (1.0 - _SURE) / (classes - 1))
         # Azimuths that are not seen keep the frequencies, which cost nothing.
         share = np.where(seen[:, None], true, query.openings.prior)
