@@ -174,6 +174,7 @@ def open_photograph(
     patch_size: PatchSize | None = None,
     limits: PhotographLimits | None = None,
     overview: bool = False,
+    refuse_drawings: bool = True,
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
 
@@ -184,6 +185,7 @@ def open_photograph(
         patch_size: size of the patches of other photographs.
         limits: limits of the file.
         overview: find what tells the angle to other photographs from its spot, too (`turned.py`).
+        refuse_drawings: refuse a plan or a page of text; an overexposed white wall can be taken for one.
 
     Raises:
         InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the
@@ -231,21 +233,22 @@ def open_photograph(
         named = () if layout is None else (layout.text,)
         lens = replace(lens, warnings=(*named, *file.warnings, *metadata.warnings, *lens.warnings))
         if lens.is_sphere:
-            _refuse_drawing(sphere(), stated)
+            if refuse_drawings:
+                _refuse_drawing(sphere())
             return _photograph_of_sphere(sphere(), lens, stated, metadata)
         picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
-    _refuse_drawing(picture, stated)
+    if refuse_drawings:
+        _refuse_drawing(picture)
     return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
 
 
-def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"], stated: StatedCamera) -> None:
-    """Refuse a plan or a page of text, unless the caller states the camera: overexposed walls can be as white as paper.
+def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Refuse a plan or a page of text.
 
     Raises:
         InvalidPhotographError: the picture is ink on white paper.
     """
-    is_stated = stated.projection != AUTO or stated.hfov_deg is not None or stated.intrinsics is not None
-    if not is_stated and is_drawing(picture):
+    if is_drawing(picture):
         raise InvalidPhotographError(
             "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
             "photograph taken in one of its rooms"

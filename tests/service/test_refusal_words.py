@@ -66,6 +66,7 @@ def ids(client: httpx.Client) -> dict[str, str]:
     session = client.post("/sessions", json={"floorplan_id": plan_id}).json()["id"]
     venue_id = client.post("/venues", json={"name": "12 Mill Lane"}).json()["id"]
     names = {"file": "manifest.json", "answer_id": "a", "key_id": "k", "tenant": "t"}
+    names |= {"album_id": "a", "photograph_id": "p"}
     return {"floorplan_id": plan_id, "venue_id": venue_id, "session_id": session, **names}
 
 

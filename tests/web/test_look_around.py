@@ -97,7 +97,7 @@ def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
     page.get_by_role("button", name="Show on the plan").press("Enter")
     expect(page.locator("#look-dialog")).to_be_hidden()
     expect(page.locator("#answer")).to_be_visible()
-    assert page.evaluate("document.querySelector('#look-dialog video').srcObject") is None
+    page.wait_for_function("document.querySelector('#look-dialog video').srcObject === null")
 
 
 def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:

@@ -148,7 +148,14 @@ class ViewPhotograph(WithoutDepth):
             pitch_deg=math.degrees(self.pitch) if tilted else None,
             roll_deg=math.degrees(self.roll) if tilted else None,
         )
-        return open_photograph(encode_jpeg(self._pixels()), sphere_size=_SPHERE_SIZE, stated=stated, patch_size=size)
+        return open_photograph(
+            encode_jpeg(self._pixels()),
+            sphere_size=_SPHERE_SIZE,
+            stated=stated,
+            patch_size=size,
+            # Disturbed renderings of white walls are as pale as paper.
+            refuse_drawings=False,
+        )
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return the whole sphere at the given size, turned to the view."""
