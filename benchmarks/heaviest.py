@@ -486,10 +486,9 @@ LOADS = (
     _read("/albums", "pages of 500", 500, limit=None),
     Load(
         (*_ALBUMS, f"GET {_ALBUM}/photographs", f"GET {_PINNED}", f"PATCH {_PINNED}", f"DELETE {_PINNED}"),
-        f"album of 500 spheres, {ROOMS_PLAN}",
+        f"album of 500 spheres, {VERTICES_PLAN}",
         _pin_album,
         500,
-        plan=ROOMS_PLAN,
     ),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),

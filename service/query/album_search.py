@@ -128,13 +128,15 @@ class AlbumSearch:
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
+
+        def pause() -> None:
             if query.progress.stopped:
                 raise _Stopped
             # Others compute in between.
             turns.pass_on()
 
         with turns:
-            album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress)
+            album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
         self._memories.put(query.album_id, memory)
         before = {part.id: part.pin for part in query.photographs}
         return compose_outcome(album, ground, before, dropped, places.plan.camera_height_m)

@@ -17,7 +17,7 @@ from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.pins import Pin, PinPose, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
-from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.album.solve import MAX_ROOMS, solve_album
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
@@ -250,3 +250,15 @@ def test_moved_pins_are_those_that_moved_far_or_changed_their_room() -> None:
     ]
     moved = {each.photograph_id: (each.distance_m, each.new_room) for each in moved_pins(before, after)}
     assert moved == {"far": (0.6, False), "room": (0.0, True), "gone": (None, True), "plan": (None, True)}
+
+
+def test_places_that_are_too_large_are_refused(encoder: PhotographEncoder, photographs: list[AlbumPhotograph]) -> None:
+    squares = [
+        {"polygon": [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]}
+        for x, y in (divmod(number, 40) for number in range(MAX_ROOMS + 1))
+    ]
+    plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": squares})
+    grid = build_grid(plan, encoder, step_m=1.0, camera_height_m=1.5, latents=False)
+    ground = AlbumGround.of_plan("large", plan, grid)
+    with pytest.raises(InvalidInputError, match=r"1001 rooms and .* at most 1000 rooms"):
+        solve_album(ground, encoder, photographs)

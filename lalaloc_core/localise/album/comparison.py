@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,10 +75,11 @@ class Comparison:
             factor=weights.temperature / width,
         )
 
-    def log_likelihood(self, ground: BinnedGround) -> Float[np.ndarray, "n k j"]:
-        """Return the log likelihood of walls and openings of every pose under every hypothesis and height error."""
-        parts = [self._part(ground.part(slice(first, first + _CHUNK))) for first in range(0, len(ground), _CHUNK)]
-        return np.concatenate(parts)
+    def log_likelihoods(self, ground: BinnedGround) -> Iterator[tuple[slice, Float[np.ndarray, "m k j"]]]:
+        """Yield the log likelihood of walls and openings under every hypothesis and height error, by some poses."""
+        for first in range(0, len(ground), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            yield part, self._part(ground.part(part))
 
     def _part(self, ground: BinnedGround) -> Float[np.ndarray, "n k j"]:
         width = ground.columns

@@ -36,19 +36,21 @@ Found = tuple[int, float]
 
 
 def find_links(
-    photographs: Sequence[AlbumPhotograph], memory: AlbumMemory, wanted: Callable[[], bool] = lambda: True
+    photographs: Sequence[AlbumPhotograph], memory: AlbumMemory, pause: Callable[[], object]
 ) -> dict[tuple[int, int], Found]:
-    """Return matches and turns of pairs of photographs, in their order; known pairs are taken from the memory."""
+    """Return matches and turns of pairs of photographs, in their order; known pairs are taken from the memory.
+
+    `pause` is called before each pair that is compared.
+    """
     found: dict[tuple[int, int], Found] = {}
     signs: dict[int, np.ndarray] = {}
     rays: dict[int, np.ndarray] = {}
     for first, second in _pairs(photographs):
-        if not wanted():
-            break
         ids = photographs[first].id, photographs[second].id
         flipped = ids[0] > ids[1]
         key = (ids[1], ids[0]) if flipped else ids
         if key not in memory.links:
+            pause()
             for number in (first, second):
                 if number not in signs:
                     signs[number] = _signs(photographs[number].descriptors)

@@ -11,6 +11,7 @@ to another room, and swap two rooms: these moves leave the pairs alone, between 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +43,10 @@ class RoomEvidence:
     tightness: float = 1.0
 
 
-def assign_rooms(evidence: RoomEvidence, seed: int = 0) -> Float[np.ndarray, "n r"]:
-    """Return the probability of every room for every photograph."""
+def assign_rooms(
+    evidence: RoomEvidence, seed: int = 0, pause: Callable[[], object] = lambda: None
+) -> Float[np.ndarray, "n r"]:
+    """Return the probability of every room for every photograph; `pause` is called before each sweep."""
     count = len(evidence.alone)
     if count == 0:
         return np.zeros(evidence.alone.shape)
@@ -51,9 +54,11 @@ def assign_rooms(evidence: RoomEvidence, seed: int = 0) -> Float[np.ndarray, "n 
     share = min(1.0, _MAX_UPDATES / ((_COOLING + _COUNTED) * count))
     cooling, counted = (max(round(share * sweeps), _FEWEST) for sweeps in (_COOLING, _COUNTED))
     for heat in np.geomspace(_HOTTEST, 1.0, cooling):
+        pause()
         chains.sweep(float(heat))
     total = np.zeros(evidence.alone.shape)
     for _ in range(counted):
+        pause()
         total += chains.sweep(1.0)
     return total / total.sum(axis=1, keepdims=True)
 

@@ -76,12 +76,14 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
     weights = encoder.manifest.evidence_for(view=not view.is_sphere)
     query = encoder.query(view, None, CameraHeight(USUAL_HEIGHT_M, 0.0))
     compared = Comparison.of(searched.plan, query, searched.reach_m, weights, OFFSETS)
-    log = compared.log_likelihood(searched.binned)
     usual = (0.5 * np.square(OFFSETS / USUAL_LOG_SD)).astype(np.float32)
-    log -= usual
-    log -= _ceilings(searched.plan, query, weights)[searched.poses.room_index, None, :].astype(np.float32)
-    heights = np.array([_log_sum(log[:, :, number]) for number in range(len(OFFSETS))], np.float32)
-    best = log.max(axis=2)
+    ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
+    best = np.empty((len(searched.poses), len(query.roll)), np.float32)
+    heights = np.full(len(OFFSETS), -np.inf)
+    for part, log in compared.log_likelihoods(searched.binned):
+        log -= ceilings[searched.poses.room_index[part], None, :]
+        heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
+        best[part] = log.max(axis=2)
     kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {
@@ -91,7 +93,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         "hypothesis": hypothesis.astype(np.uint8),
         "log_likelihood": best.ravel()[kept].astype(np.float32),
         "room_types": _room_types(searched, query, weights).astype(np.float32),
-        "heights": heights,
+        "heights": heights.astype(np.float32),
         "chance": np.array(_by_chance(encoder, compared, usual), np.float32),
     }
 
@@ -102,7 +104,7 @@ def _by_chance(encoder: PhotographEncoder, compared: Comparison, usual: Float[np
     if cohort is None:
         return -math.inf
     layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))
-    return float((compared.log_likelihood(BinnedGround.of(layouts)) - usual).max())
+    return max(float((log - usual).max()) for _, log in compared.log_likelihoods(BinnedGround.of(layouts)))
 
 
 def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:

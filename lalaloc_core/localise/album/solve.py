@@ -31,6 +31,8 @@ from lalaloc_core.localise.album.walks import expected_photographs, walk_of
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 MAX_PHOTOGRAPHS = 500
+# The comparison with poses takes memory by their number, the walk from room to room time by the cube of theirs.
+MAX_POSES, MAX_ROOMS = 65_536, 1000
 # Pins whose room is right with at least this probability are sure.
 SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
@@ -51,6 +53,7 @@ def solve_album(
     memory: AlbumMemory | None = None,
     by_time: bool = True,
     progress: Callable[[int], object] = lambda _: None,
+    pause: Callable[[], object] = lambda: None,
 ) -> Album:
     """Pin the photographs of an album.
 
@@ -61,13 +64,20 @@ def solve_album(
         memory: what earlier solves found, filled in place; None for nothing.
         by_time: use the times at which the photographs were taken.
         progress: called with the number of photographs that were compared with the plan.
+        pause: called often, after at most a photograph's comparison; what it raises ends the solve.
 
     Raises:
-        InvalidInputError: there are too many photographs, or two with one id.
+        InvalidInputError: there are too many photographs, or two with one id, or the place is too large.
         InvalidCorrectionError: a correction names a plan or a room that the ground does not have.
     """
     if len(photographs) > MAX_PHOTOGRAPHS:
         raise InvalidInputError(f"the album has {len(photographs)} photographs; the limit is {MAX_PHOTOGRAPHS}")
+    poses, rooms = len(ground.grid.poses), len(ground.plan.rooms)
+    if poses > MAX_POSES or rooms > MAX_ROOMS:
+        raise InvalidInputError(
+            f"the place has {rooms} rooms and {poses} grid poses; albums search at most {MAX_ROOMS} rooms and "
+            f"{MAX_POSES} poses, about 16,000 m²: upload the parts as plans of their own"
+        )
     ids = {photograph.id for photograph in photographs}
     if len(ids) < len(photographs):
         raise InvalidInputError("two photographs of the album have the same id; every photograph is added once")
@@ -80,10 +90,10 @@ def solve_album(
     ordered = sorted(photographs, key=lambda each: (each.taken.at or datetime.max, each.id))
     timed = sum(each.taken.at is not None for each in ordered)
     has_order = by_time and timed >= _TIMED * len(ordered)
-    _compare(ground, encoder, ordered, memory, progress)
-    links = find_links(ordered, memory)
+    _compare(ground, encoder, ordered, memory, progress, pause)
+    links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
-    share = _room_shares(ground, ordered, memory, states, links, constraints, has_order=has_order)
+    share = _room_shares(ground, ordered, memory, states, links, constraints, has_order=has_order, pause=pause)
     pins = {
         each.id: _pin(ground, each, state, row, constraints.get(each.id))
         for each, state, row in zip(ordered, states, share, strict=True)
@@ -124,6 +134,7 @@ def _compare(
     photographs: Sequence[AlbumPhotograph],
     memory: AlbumMemory,
     progress: Callable[[int], object],
+    pause: Callable[[], object],
 ) -> None:
     """Fill the memory with the evidence of photographs that it does not know."""
     new = [each for each in photographs if each.id not in memory.evidence]
@@ -132,6 +143,7 @@ def _compare(
         for each in new:
             memory.evidence[each.id] = single_evidence(searched, encoder, each.view)
             progress(len(memory.evidence))
+            pause()
 
 
 def _states(
@@ -162,6 +174,7 @@ def _room_shares(
     constraints: dict[str, Constraint],
     *,
     has_order: bool,
+    pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
     rooms = len(ground.plan.rooms)
@@ -182,7 +195,7 @@ def _room_shares(
         expected=expected_photographs(ground, len(photographs)),
         tightness=_TIGHTNESS,
     )
-    return assign_rooms(evidence)
+    return assign_rooms(evidence, pause=pause)
 
 
 def _pin(
