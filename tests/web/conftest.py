@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +57,17 @@ class Visit:
         self.page.get_by_role("button", name="Find the place").click()
         expect(self.page.locator("#answer")).to_be_visible()
         return self.page
+
+
+def wait_until(page: Page, condition: str, argument: object = None) -> None:
+    """Wait until a function of the page returns true.
+
+    Playwright's own wait evaluates text in the page, which its content security policy forbids after the first try.
+    """
+    deadline = time.monotonic() + _TIMEOUT_MS / 1000.0
+    while not page.evaluate(condition, argument):
+        assert time.monotonic() < deadline, f"never true: {condition}"
+        page.wait_for_timeout(50.0)
 
 
 def choose_plan(page: Page, name: str) -> None:

@@ -12,7 +12,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.service.conftest import FLAT, upload
-from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit
+from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit, wait_until
 
 
 def _marker(page: Page) -> tuple[float, float]:
@@ -129,10 +129,11 @@ def test_dragged_marker_moves_the_layout(desktop: Visit) -> None:
 
 def _expect_marker(page: Page, x_m: float, y_m: float) -> None:
     """Wait until the marker is at a place."""
-    page.wait_for_function(
+    wait_until(
+        page,
         """([x, y]) => { const found = document.querySelector('#marker').getAttribute('transform').match(/-?[\\d.]+/g);
         return Math.hypot(found[0] - x, -found[1] - y) < 1e-3; }""",
-        arg=[x_m, y_m],
+        [x_m, y_m],
     )
 
 

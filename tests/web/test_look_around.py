@@ -18,7 +18,7 @@ from lalaloc_core.photograph.cameras import Perspective
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import jpeg, sphere, take
 from tests.service.conftest import StartApp, upload
-from tests.web.conftest import _ARGUMENTS, _BROWSERS, EXAMPLES, PHONE, Visit, visit
+from tests.web.conftest import _ARGUMENTS, _BROWSERS, EXAMPLES, PHONE, Visit, visit, wait_until
 
 FLAT = json.loads((EXAMPLES / "flat.json").read_text())
 STEP_DEG = 3.0
@@ -89,15 +89,16 @@ def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
     _no_violations(page)
     expect(page.get_by_role("button", name="Show on the plan")).to_be_visible(timeout=60_000)
     # The room's lines move over the live picture.
-    page.wait_for_function(
+    wait_until(
+        page,
         """() => { const canvas = document.querySelector('#look-dialog canvas.lines');
         const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-        return data.filter((value, index) => index % 4 === 3 && value > 0).length > 300; }"""
+        return data.filter((value, index) => index % 4 === 3 && value > 0).length > 300; }""",
     )
     page.get_by_role("button", name="Show on the plan").press("Enter")
     expect(page.locator("#look-dialog")).to_be_hidden()
     expect(page.locator("#answer")).to_be_visible()
-    page.wait_for_function("document.querySelector('#look-dialog video').srcObject === null")
+    wait_until(page, "document.querySelector('#look-dialog video').srcObject === null")
 
 
 def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
@@ -135,7 +136,7 @@ def test_camera_stops_with_the_dialog_by_keyboard_alone(phone: Visit) -> None:
     expect(page.locator("#look-dialog .primary")).not_to_have_text(before)
     page.keyboard.press("Escape")
     expect(page.locator("#look-dialog")).to_be_hidden()
-    page.wait_for_function("track => track.readyState === 'ended'", arg=track)
+    wait_until(page, "track => track.readyState === 'ended'", track)
     expect(page.locator("#look-around")).to_be_focused()
 
 
