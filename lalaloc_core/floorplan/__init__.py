@@ -6,6 +6,7 @@ Begin with `plan.py`. `reading.py` reads rooms and openings from a document, `op
 """
 
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document
+from lalaloc_core.floorplan.fixtures import FixturePlaces
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import FIXTURE_KINDS
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -30,6 +30,18 @@ class Fixture:
 
     kind: str
     outline_m: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class FixturePlaces:
+    """Places of f fixtures: centre and width (m), and the number of the room, -1 outside all."""
+
+    centre_m: Float[np.ndarray, "f 2"]
+    width_m: Float[np.ndarray, "f"]
+    room_index: Int[np.ndarray, "f"]
+
+    def __len__(self) -> int:
+        return len(self.width_m)
 
 
 def read_fixtures(raw: Any, limits: PlanLimits) -> tuple[Fixture, ...]:

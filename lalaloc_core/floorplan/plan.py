@@ -19,7 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.fixtures import Fixture, read_fixtures
+from lalaloc_core.floorplan.fixtures import Fixture, FixturePlaces, read_fixtures
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
@@ -262,6 +262,19 @@ class FloorPlan:
     def ceiling_heights_m(self) -> Float[np.ndarray, "rooms"]:
         """Ceiling height of every room."""
         return frozen(np.array([room.ceiling_height_m for room in self.rooms]))
+
+    @cached_property
+    def fixtures_by_kind(self) -> Mapping[str, FixturePlaces]:
+        """Places of the fixtures of each kind that the plan draws."""
+        outlines: dict[str, list[np.ndarray]] = {}
+        for fixture in self.fixtures:
+            outlines.setdefault(fixture.kind, []).append(fixture.outline_m)
+        places = {}
+        for kind, outlines_m in outlines.items():
+            low_m, high_m = (np.stack([edge(outline, axis=0) for outline in outlines_m]) for edge in (np.min, np.max))
+            centre_m, width_m = (low_m + high_m) / 2.0, np.hypot(*(high_m - low_m).T)
+            places[kind] = FixturePlaces(centre_m, width_m, self.room_index_at(centre_m))
+        return places
 
     @cached_property
     def _room_tree(self) -> shapely.STRtree:

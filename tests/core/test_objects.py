@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,12 +18,14 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
-from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, PredictedRoomType, Query, SeenObject, SeenObjects
 from lalaloc_core.localise.search.pipeline import localise
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
+from tests.core.questions import perfect_query
 from tests.core.taken import jpeg, sphere, take
 
 FIELD_DEG = 80.0
@@ -146,3 +149,77 @@ def test_manifest_states_objects_and_types() -> None:
     assert len(objects["names"]) == len(objects["shares"])
     kitchen = objects["shares"][objects["names"].index("stove")]
     assert ROOM_TYPES[int(np.argmax(kitchen))] == "kitchen"
+
+
+def furnished(*fixtures: tuple[str, float, float]) -> FloorPlan:
+    """Return a plan of four equal rooms without types, 5 m apart, with fixtures of 0.6 m (kind, x, y)."""
+    document = plan("unknown", "unknown", "unknown", "unknown").to_dict()
+    for kind, x, y in fixtures:
+        outline = [[x, y], [x + 0.6, y], [x + 0.6, y + 0.6], [x, y + 0.6]]
+        document.setdefault("fixtures", []).append({"kind": kind, "outline": outline})
+    return FloorPlan.from_dict(document)
+
+
+def test_room_that_draws_the_seen_bed_wins_among_equal_rooms() -> None:
+    asked = query((view("hotel_room", BED_DEG), 0.0))
+    for kind, expected in (("bed", 2), ("stove", None)):
+        drawn = furnished((kind, 11.7, 2.2))
+        grid = build_grid(drawn, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+        found = localise(drawn, grid, encoder(), asked, refine="none")
+        by_room = np.bincount(grid.poses.room_index, found.posterior.pose)
+        if expected is None:
+            # Kinds that the photograph does not show, and kinds that the plan draws nowhere, tell nothing.
+            np.testing.assert_allclose(by_room, 0.25, atol=1e-3)
+        else:
+            assert found.candidates[0].room_index == expected
+            assert by_room[expected] > 1.2 * by_room[0]
+
+
+def seen_from_the_middle(drawn: FloorPlan, *objects: SeenObject) -> Query:
+    """Return the query of a camera in the middle of the first room, which sees objects."""
+    found = perfect_query(encoder(), drawn, (2.0, 1.5), hypotheses=4)
+    unknown = PredictedRoomType(np.full(len(ROOM_TYPES), -math.log(len(ROOM_TYPES))), np.full(len(ROOM_TYPES), 1 / 16))
+    return replace(found, objects=SeenObjects(unknown, objects))
+
+
+def test_stove_ahead_and_the_stove_that_is_drawn_tell_the_heading() -> None:
+    # East of the middle: the camera looks along +x, or the stove is 90 degrees to its right.
+    drawn = furnished(("stove", 3.4, 1.2))
+    grid = build_grid(drawn, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    for azimuth_deg, expected_deg in ((0.0, 90.0), (90.0, 0.0)):
+        asked = seen_from_the_middle(drawn, SeenObject("stove", 0.9, math.radians(azimuth_deg)))
+        cost = PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5], [7.0, 1.5]]), np.array([0, 1]))
+        assert cost is not None
+        best = int(cost.of_poses(np.array([0]))[0].argmin())
+        assert math.degrees(asked.roll[best]) == pytest.approx(expected_deg)
+        # In a room without the stove all headings cost the same.
+        (lowest,) = cost.of_pairs(np.array([0]), np.array([best]))
+        elsewhere = cost.of_pairs(np.array([1, 1]), np.array([0, best]))
+        assert elsewhere[0] == elsewhere[1] > lowest + 0.5
+        assert lowest >= 0.0
+        found = localise(drawn, grid, encoder(), asked, refine="none")
+        assert found.candidates[0].room_index == 0
+        assert found.candidates[0].place_cost < elsewhere[0] / encoder().manifest.evidence.temperature
+
+
+def test_fixtures_of_merged_plans_stay_in_their_plans() -> None:
+    plans = [furnished(("stove", 3.4, 1.2)), furnished(("bed", 0.2, 0.2), ("stove", 8.4, 1.2))]
+    grids = [build_grid(each, encoder(), step_m=1.0, camera_height_m=1.5, latents=False) for each in plans]
+    merged = MergedPlans.of(plans, grids, 1.5).plan
+    assert sorted(merged.fixtures_by_kind) == ["bed", "stove"]
+    np.testing.assert_array_equal(merged.fixtures_by_kind["stove"].room_index, [0, 5])
+
+
+def test_rooms_and_plans_full_of_fixtures_tell_nothing() -> None:
+    def cost(*fixtures: tuple[str, float, float]) -> np.ndarray:
+        drawn = furnished(*fixtures)
+        asked = seen_from_the_middle(drawn, SeenObject("washbasin", 0.9, 0.0))
+        found = PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5], [7.0, 1.5]]), np.array([0, 1]))
+        return np.zeros((2, 4)) if found is None else found.of_poses(np.arange(2))
+
+    washroom = [("basin", 0.2 + 0.2 * k, 2.0) for k in range(13)]
+    basins = cost(*washroom)
+    # The washroom tells the room and no direction.
+    assert np.ptp(basins[0]) == 0.0
+    assert basins[0, 0] < basins[1, 0]
+    assert not cost(*(washroom * 39)).any()

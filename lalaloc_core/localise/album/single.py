@@ -16,9 +16,9 @@ from lalaloc_core.localise.album.binned_ground import BinnedGround
 from lalaloc_core.localise.album.comparison import Comparison
 from lalaloc_core.localise.album.memory import Arrays
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.match import MatchingConfig, PoseGrid, layouts_at
+from lalaloc_core.localise.match import MatchingConfig, PlaceCost, PoseGrid, layouts_at
 from lalaloc_core.localise.match.cost_terms import ceiling_costs, room_type_losses
-from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Query
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 
@@ -84,6 +84,9 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         log -= ceilings[searched.poses.room_index[part], None, :]
         heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
         best[part] = log.max(axis=2)
+    fixtures = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
+    if fixtures is not None:
+        best -= fixtures.of_poses(np.arange(len(best)))
     kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {

@@ -1,7 +1,7 @@
 """Posterior probability of every pose of the grid under every hypothesis of the heading.
 
 A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
-queries. The prior is uniform over floor area and over the searched headings. Costs include the cost of hints.
+queries. The prior is uniform over floor area and over the searched headings. Costs include those of hints and fixtures.
 
 Candidates are the modes of the posterior. A grid pose is up to half a step away from the minimum of its mode.
 Refinement moves a candidate to the minimum; the decrease of its cost is its *gain*. `weighted_places` applies this to
@@ -48,7 +48,7 @@ class GridCosts:
 
     Attributes:
         offset: (m,) the height offset δ that gives it.
-        hint_cost: (m,) cost of the hints at the pose; None without hints.
+        place_cost: (m,) cost of hints and fixtures at the pose; None without them.
         compared: number of pairs that were compared in full, which come first; candidates are among these. The cost of
             the other pairs, which share the probability, is estimated.
     """
@@ -58,7 +58,7 @@ class GridCosts:
     hypothesis: Int[np.ndarray, "m"]
     cost: Float[np.ndarray, "m"]
     offset: Float[np.ndarray, "m"]
-    hint_cost: Float[np.ndarray, "m"] | None
+    place_cost: Float[np.ndarray, "m"] | None
     compared: int
 
     @classmethod
@@ -67,7 +67,7 @@ class GridCosts:
         poses: PoseSet,
         cost: Float[np.ndarray, "k n"],
         offset: Float[np.ndarray, "k n"],
-        hint_cost: Float[np.ndarray, "n"] | None = None,
+        place_cost: Float[np.ndarray, "m"] | None = None,
     ) -> GridCosts:
         """Return the costs of all poses under all hypotheses, compared in full."""
         hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
@@ -77,14 +77,14 @@ class GridCosts:
             hypothesis=hypothesis,
             cost=cost.ravel(),
             offset=offset.ravel(),
-            hint_cost=None if hint_cost is None else hint_cost[pose],
+            place_cost=place_cost,
             compared=cost.size,
         )
 
     @cached_property
     def total(self) -> Float[np.ndarray, "m"]:
-        """Cost that pairs are ranked by: the matching cost plus that of hints."""
-        return self.cost if self.hint_cost is None else self.cost + self.hint_cost
+        """Cost that pairs are ranked by: the matching cost plus that of the place."""
+        return self.cost if self.place_cost is None else self.cost + self.place_cost
 
 
 @dataclass(frozen=True, eq=False)

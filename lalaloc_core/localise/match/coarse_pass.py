@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.localise.match.binned_layouts import OPENING_ROWS, BinnedLayouts
 from lalaloc_core.localise.match.matching_cost import MatchingCost
+from lalaloc_core.localise.match.place_cost import PlaceCost
 
 # Poses compared at a time by rising bounds, in plans of more than the last number: few at first, as these limit the
 # number of poses; and for the bounds themselves.
@@ -84,7 +85,7 @@ def likeliest(
     binned: BinnedLayouts,
     matching_cost: MatchingCost,
     room_index: Int[np.ndarray, "n"],
-    hint_cost: Float[np.ndarray, "n"] | None = None,
+    place_cost: PlaceCost | None = None,
     *,
     at_most: int,
     at_least: int,
@@ -93,15 +94,15 @@ def likeliest(
     """Return the coarse costs, rising, and the pairs (pose times number of hypotheses, plus hypothesis) of the best.
 
     There are at least `at_least` pairs if so many exist; those beyond cost at most `window` more than the best. The
-    result equals the best of all `coarse_costs`; some pairs beyond these and `at_most` can follow. `hint_cost` is added
-    to the costs of every pose; infinite excludes it.
+    result equals the best of all `coarse_costs`; some pairs beyond these and `at_most` can follow. `place_cost` is
+    added to the costs of all pairs; infinite excludes a pair.
     """
     table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
     shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
     bound = room_costs.min(axis=0)[room_index]
     if len(binned) > _LAST_CHUNK:
         bound = bound + _bounds(binned, table.reshape(len(table), *shape[1:]))
-    bound = bound if hint_cost is None else bound + hint_cost
+    bound = bound if place_cost is None else bound + place_cost.lowest
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers sort fastest.
     order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
@@ -111,7 +112,7 @@ def likeliest(
     while first < len(order) and least_after[first] <= min(best.bound, max(lowest + window, least.bound)):
         pose = order[first : first + count]
         cost = _at_best_offset(binned.rows[pose] @ table, room_costs[:, room_index[pose]], shape)
-        cost = cost if hint_cost is None else cost + hint_cost[pose, None]
+        cost = cost if place_cost is None else cost + place_cost.of_poses(pose)
         best.offer(pose, cost)
         least.offer(pose, cost)
         lowest = min(lowest, float(cost.min()))

@@ -104,7 +104,7 @@ def grid_candidate(
     *,
     cost: float,
     height_offset: float = 0.0,
-    hint_cost: float = 0.0,
+    place_cost: float = 0.0,
 ) -> Candidate:
     """Return a grid pose under a hypothesis of a query, by their numbers, as a candidate."""
     return Candidate(
@@ -116,5 +116,5 @@ def grid_candidate(
         cost=cost,
         latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
         height_offset=height_offset,
-        hint_cost=hint_cost,
+        place_cost=place_cost,
     )

@@ -76,7 +76,7 @@ class Candidate:
         cost: matching cost; the latent distance if the model predicts no wall profile.
         latent_distance: distance of the layout's latent to the query's; NaN until computed, as it is for answers.
         height_offset: log of true over stated camera height that fits best.
-        hint_cost: cost of the hints at the place, in units of the cost; see `localise.query.hints`.
+        place_cost: cost of hints and fixtures at the pose, in units of the cost; see `localise.match.place_cost`.
         terms: terms of the matching cost by name; empty if poses are compared by latents.
         information: (p, p) curvature of the cost by x, y (m) and, if it was searched, the heading (radians), from pose
             refinement. Its inverse is the covariance up to a factor.
@@ -90,7 +90,7 @@ class Candidate:
     cost: float
     latent_distance: float
     height_offset: float = 0.0
-    hint_cost: float = 0.0
+    place_cost: float = 0.0
     terms: dict[str, float] = field(default_factory=dict, compare=False)
     information: Float[np.ndarray, "p p"] | None = field(default=None, compare=False)
 
@@ -101,5 +101,5 @@ class Candidate:
 
     @property
     def total_cost(self) -> float:
-        """Cost that candidates are ranked by: the matching cost plus that of hints."""
-        return self.cost + self.hint_cost
+        """Cost that candidates are ranked by: the matching cost plus that of the place."""
+        return self.cost + self.place_cost

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, layouts_at
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
 from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
 from lalaloc_core.render.sampling import PoseSet
@@ -88,7 +88,9 @@ def refined_candidates(
     rooms = np.array([start.room_index for start in starts])
     excluded = ~np.isfinite(hints.penalty(plan, result.position_m, rooms))
     result = _put_back(starts, result, excluded)
-    hint_cost = hints.penalty(plan, result.position_m, rooms) / weights.temperature
+    hypotheses = np.array([start.hypothesis for start in starts])
+    places = PlaceCost.of(plan, query, hints, weights.temperature, result.position_m, rooms)
+    place_cost = np.zeros(len(starts)) if places is None else places.of_pairs(np.arange(len(starts)), hypotheses)
     offsets = result.height_offset
     offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
     distance = result.latent_distance
@@ -96,7 +98,6 @@ def refined_candidates(
         distance = np.array([start.latent_distance for start in starts])
     cost, terms = result.cost, [{} for _ in starts]
     if matching.compares_profiles(query):
-        hypotheses = np.array([start.hypothesis for start in starts])
         columns = encoder.manifest.profile_columns
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
         matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
@@ -114,7 +115,7 @@ def refined_candidates(
             cost=float(cost[k]),
             latent_distance=float(distance[k]),
             height_offset=float(offsets[k]),
-            hint_cost=float(hint_cost[k]),
+            place_cost=float(place_cost[k]),
             terms=terms[k],
             information=None if excluded[k] else result.information[k],
         )

@@ -12,11 +12,10 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, grid_candidate, likeliest
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, PoseGrid, grid_candidate, likeliest
 from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query
-from lalaloc_core.render.sampling import PoseSet
 
 # Limits of the number of pairs of a pose and a hypothesis that are compared in full.
 _MIN_COMPARED, _MAX_COMPARED = 1024, 4096
@@ -48,14 +47,16 @@ def grid_costs(
         InvalidHintError: strict hints exclude every pose of the grid.
         InvalidInputError: latents are compared, and the grid has none.
     """
-    hint_cost = _hint_cost(plan, grid, weights, hints)
+    place_cost = _place_cost(plan, grid, query, weights, hints)
     if not config.compares_profiles(query):
         distance = latent_distances(grid.known_latents, query.latents)
-        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), hint_cost)
+        hypothesis, pose = np.indices(distance.shape).reshape(2, -1)
+        places = None if place_cost is None else place_cost.of_pairs(pose, hypothesis)
+        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), places)
     matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
-    relaxed = _hint_cost(plan, grid, weights, hints.relaxed) if hints.strict else None
+    relaxed = _place_cost(plan, grid, query, weights, hints.relaxed) if hints.strict else None
     temperature = weights.temperature
-    pair, compared, coarse, estimate = _choose(plan, grid, matching_cost, temperature, hint_cost, relaxed)
+    pair, compared, coarse, estimate = _choose(plan, grid, matching_cost, temperature, place_cost, relaxed)
     pose, hypothesis = np.divmod(pair, len(query.roll))
     cost, offset = matching_cost.pairs(grid.layouts(plan), pose[:compared], hypothesis[:compared])
     if config.latent_weight:
@@ -69,7 +70,7 @@ def grid_costs(
         hypothesis=hypothesis,
         cost=np.append(cost, estimate),
         offset=np.append(offset, np.zeros(len(estimate))),
-        hint_cost=None if hint_cost is None else hint_cost[pose],
+        place_cost=None if place_cost is None else place_cost.of_pairs(pose, hypothesis),
         compared=compared,
     )
 
@@ -79,12 +80,12 @@ def _choose(
     grid: PoseGrid,
     matching_cost: MatchingCost,
     temperature: float,
-    hint_cost: Float[np.ndarray, "n"] | None,
-    relaxed: Float[np.ndarray, "n"] | None,
+    place_cost: PlaceCost | None,
+    relaxed: PlaceCost | None,
 ) -> tuple[Int[np.ndarray, "m"], int, Float[np.ndarray, "c"], Float[np.ndarray, "e"]]:
     """Choose the pairs to compare in full and to estimate.
 
-    `hint_cost` is the cost of the hints at every pose, and `relaxed` the same if strict hints were not; the best pairs
+    `place_cost` is that of hints and fixtures, and `relaxed` the same if strict hints were not; the best pairs
     by that are compared as well.
 
     Returns:
@@ -97,10 +98,10 @@ def _choose(
     window = _MARGIN + NEGLIGIBLE / temperature
     binned = grid.binned(plan, VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS)
     compare = partial(likeliest, binned, matching_cost, grid.poses.room_index, at_least=_MIN_COMPARED)
-    total, pair = compare(hint_cost, at_most=_ESTIMATED, window=window)
+    total, pair = compare(place_cost, at_most=_ESTIMATED, window=window)
     probable = int(np.searchsorted(total, total[0] + window))
     compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
-    cost = total if hint_cost is None else total - hint_cost[pair // matching_cost.hypotheses]
+    cost = total if place_cost is None else total - place_cost.of_pairs(*np.divmod(pair, matching_cost.hypotheses))
     first, others = pair[:compared], pair[compared:probable]
     if relaxed is not None:
         excluded = compare(relaxed, at_most=_MIN_COMPARED)[1]
@@ -120,27 +121,22 @@ def _coarse_error(cost: Float[np.ndarray, "c"], coarse: Float[np.ndarray, "c"], 
 
 def missed_hints(plan: FloorPlan, costs: GridCosts, weights: MatchingWeights, hints: Hints) -> tuple[HintName, ...]:
     """Return the hints that would not hold at the best place if they were not strict."""
-    relaxed = _penalties(plan, costs.poses, weights, hints.relaxed)[costs.pose]
+    penalty = hints.relaxed.penalty(plan, costs.poses.position_m, costs.poses.room_index) / weights.temperature
+    relaxed = penalty[costs.pose]
     pose = costs.pose[int((costs.cost + relaxed)[: costs.compared].argmin())]
     return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
 
 
-def _penalties(plan: FloorPlan, poses: PoseSet, weights: MatchingWeights, hints: Hints) -> Float[np.ndarray, "n"]:
-    """Return the cost of the hints at poses."""
-    return hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
-
-
-def _hint_cost(
-    plan: FloorPlan, grid: PoseGrid, weights: MatchingWeights, hints: Hints
-) -> Float[np.ndarray, "n"] | None:
-    if hints.are_none:
-        return None
-    cost = _penalties(plan, grid.poses, weights, hints)
-    if np.isfinite(cost).any():
+def _place_cost(
+    plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, hints: Hints
+) -> PlaceCost | None:
+    poses = grid.poses
+    cost = PlaceCost.of(plan, query, hints, weights.temperature, poses.position_m, poses.room_index)
+    if cost is None or np.isfinite(cost.hint).any():
         return cost
     raise InvalidHintError(
         "strict",
-        f"none of the {len(cost)} grid poses, {grid.step_m:g} m apart, meets all hints: widen the hints or omit strict",
+        f"none of the {len(poses)} grid poses, {grid.step_m:g} m apart, meets all hints: widen them or omit strict",
     )
 
 
@@ -185,7 +181,7 @@ def retrieve(
             int(costs.hypothesis[index]),
             cost=float(costs.cost[index]),
             height_offset=float(costs.offset[index]),
-            hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[index]),
+            place_cost=0.0 if costs.place_cost is None else float(costs.place_cost[index]),
         )
         for index in pair[kept].tolist()
     ]

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, layouts_at
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
 from lalaloc_core.render.sampling import PoseSet
@@ -81,10 +81,11 @@ def resample(
         matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
         layout_cost, offsets = matching_cost.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = layout_cost[0] + matching.latent_weight * cost, offsets[0]
-    hint_cost = np.zeros(len(poses))
-    if not hints.are_none:
-        hint_cost = hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
-    index = int((cost + hint_cost).argmin())
+    place_cost = np.zeros(len(poses))
+    places = PlaceCost.of(plan, query, hints, weights.temperature, poses.position_m, poses.room_index)
+    if places is not None:
+        place_cost = places.of_pairs(np.arange(len(poses)), np.array([candidate.hypothesis]))
+    index = int((cost + place_cost).argmin())
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:
         # The latent of one pose is cheap, and is reported with the answer.
@@ -100,5 +101,5 @@ def resample(
         cost=float(cost[index]),
         latent_distance=float(latent_distances(latents, target)[0, 0]),
         height_offset=float(offset[index]),
-        hint_cost=float(hint_cost[index]),
+        place_cost=float(place_cost[index]),
     )

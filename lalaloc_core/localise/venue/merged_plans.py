@@ -67,6 +67,11 @@ class MergedPlans:
                 kind: min(plan.opening_trust.get(kind, 0.0) for plan in plans) for kind in OPENING_CLASSES[1:]
             },
             opening_faces=_faces(plans),
+            fixtures=tuple(
+                replace(fixture, outline_m=fixture.outline_m + shift)
+                for plan, shift in zip(plans, shift_m, strict=True)
+                for fixture in plan.fixtures
+            ),
         )
         grid = _grid(plans, grids, shift_m, camera_height_m)
         return cls(tuple(plans), plan, grid, shift_m, np.array([len(grid.poses) for grid in grids]))

@@ -1,0 +1,170 @@
+"""Cost of a pose that does not come from what the network reads of the room: hints, and fixtures that the plan draws.
+
+**Fixtures.** An object of the kind of a fixture, present with the probability p and seen at the azimuth α, agrees with
+a pose from which the plan shows such a fixture there, at the azimuth φ:
+
+    f(pose) = 1 - p + p ((1 - m) g(pose) + m),    g = mean over the fixtures of the room of F N(α - φ; σ)
+
+The classifier shares the probability q among all objects of the photograph, so p = q / (q + 0.15), which is not fitted.
+The fixture is not drawn, or stands in another room, with the probability m. N is the normal distribution with the deviation σ,
+of the object's azimuth and the fixture's width, and F the usual field of view, within which an object of unknown place
+would be anywhere. In rooms without such a fixture g is 0; rooms with many tell no direction, g is 1. Kinds that the
+plan draws nowhere are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.floorplan import FixturePlaces, FloorPlan
+from lalaloc_core.localise.query import Hints, Query, SeenObject
+
+# Names of recognised objects that are fixtures; the others tell the type of the room alone.
+_FIXTURES = {
+    "stove": "stove",
+    "refrigerator": "fridge",
+    "bathtub": "bath",
+    "tub": "bath",
+    "toilet seat": "toilet",
+    "washbasin": "basin",
+    "shower curtain": "shower",
+    "washing machine": "washer",
+    "four-poster bed": "bed",
+    "quilt": "bed",
+    "couch": "sofa",
+    "banister": "stairs",
+}
+# m, and the q at which an object is as likely present as not.
+_ELSEWHERE, _EVEN = 0.5, 0.15
+# F and the deviation of an object's azimuth (radians), and the largest deviation by a fixture's width.
+_FIELD, _AZIMUTH_SD, _MAX_SD = math.radians(70.0), math.radians(12.0), math.radians(45.0)
+# Rooms with more fixtures of a kind, such as the washrooms of a stadium, tell no direction.
+_MAX_FIXTURES = 12
+# Kinds of which a plan has more fixtures, or in rooms of a larger area (m²), tell nothing, which bounds the work.
+_MAX_OF_KIND, _MAX_AREA_M2 = 500, 5000.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceCost:
+    """Cost of n poses by the hypothesis of the heading, in units of the matching cost.
+
+    Attributes:
+        hint: (n,) cost of the hints; infinite where strict ones exclude a pose.
+        row: (n,) numbers of the poses' rows in `fixtures`.
+        fixtures: (f, k) cost of the fixtures, or (f, 1) where it does not depend on the heading.
+    """
+
+    hint: Float[np.ndarray, "n"]
+    row: Int[np.ndarray, "n"]
+    fixtures: Float[np.ndarray, "f #k"]
+
+    @classmethod
+    def of(
+        cls,
+        plan: FloorPlan,
+        query: Query,
+        hints: Hints,
+        temperature: float,
+        position_m: Float[np.ndarray, "n 2"],
+        room_index: Int[np.ndarray, "n"],
+    ) -> PlaceCost | None:
+        """Return the cost of some poses; None if neither hints nor fixtures tell anything."""
+        seen = [] if query.objects is None else _seen_fixtures(plan, query.objects.objects)
+        if hints.are_none and not seen:
+            return None
+        hint = np.zeros(len(position_m))
+        if not hints.are_none:
+            hint = hints.penalty(plan, position_m, room_index) / temperature
+        row, fixtures = _fixture_costs(plan, query, seen, position_m, room_index)
+        return cls(hint, row, fixtures / temperature)
+
+    @property
+    def lowest(self) -> Float[np.ndarray, "n"]:
+        """Lowest cost of each pose under any hypothesis."""
+        return self.hint + self.fixtures.min(axis=1)[self.row]
+
+    def of_poses(self, pose: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m #k"]:
+        """Return the cost of some poses under every hypothesis, (m, 1) where it does not depend on that."""
+        return self.hint[pose, None] + self.fixtures[self.row[pose]]
+
+    def of_pairs(self, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
+        """Return the cost of some pairs of a pose and a hypothesis."""
+        column = hypothesis if self.fixtures.shape[1] > 1 else np.zeros_like(hypothesis)
+        return self.hint[pose] + self.fixtures[self.row[pose], column]
+
+
+def _seen_fixtures(plan: FloorPlan, objects: tuple[SeenObject, ...]) -> list[SeenObject]:
+    """Return the most probable object of each kind of fixture that the plan draws, with the kind as its name."""
+    best = dict[str, SeenObject]()
+    for each in objects:
+        kind = _FIXTURES.get(each.name)
+        places = plan.fixtures_by_kind.get(kind) if kind else None
+        if kind is None or places is None or len(places) > _MAX_OF_KIND:
+            continue
+        if plan.areas_m2[np.unique(places.room_index[places.room_index >= 0])].sum() > _MAX_AREA_M2:
+            continue
+        if kind not in best or best[kind].probability < each.probability:
+            best[kind] = SeenObject(kind, each.probability, each.azimuth)
+    return list(best.values())
+
+
+def _fixture_costs(
+    plan: FloorPlan,
+    query: Query,
+    seen: list[SeenObject],
+    position_m: Float[np.ndarray, "n 2"],
+    room_index: Int[np.ndarray, "n"],
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "f #k"]]:
+    """Return the negative log likelihood (nats, at least 0) of rows, and the number of each pose's row.
+
+    Poses in rooms without any of the fixtures share row 0.
+    """
+    row, nothing = np.zeros(len(position_m), np.intp), np.zeros((1, 1), np.float32)
+    if not seen:
+        return row, nothing
+    rooms = np.concatenate([plan.fixtures_by_kind[each.name].room_index for each in seen])
+    beside = np.flatnonzero(np.isin(room_index, rooms))
+    row[beside] = 1 + np.arange(len(beside))
+    cost = np.zeros((1 + len(beside), len(query.roll)), np.float32)
+    for each in seen:
+        share = each.probability / (each.probability + _EVEN)
+        agreement, places = np.zeros(cost.shape, np.float32), plan.fixtures_by_kind[each.name]
+        agreement[1:] = _agreement(places, query, each, position_m[beside], room_index[beside])
+        # At least 0, by the highest density there is, so that costs of poses that are compared later are comparable.
+        cost += _log_factor(share, _FIELD / (math.sqrt(2.0 * math.pi) * _AZIMUTH_SD)) - _log_factor(share, agreement)
+    return row, cost
+
+
+def _log_factor(share: float, agreement: float | Float[np.ndarray, "f k"]) -> float | Float[np.ndarray, "f k"]:
+    """Return log f of an object that is present with a probability."""
+    return np.log(1.0 - share + share * ((1.0 - _ELSEWHERE) * agreement + _ELSEWHERE))
+
+
+def _agreement(
+    places: FixturePlaces,
+    query: Query,
+    each: SeenObject,
+    position_m: Float[np.ndarray, "m 2"],
+    room_index: Int[np.ndarray, "m"],
+) -> Float[np.ndarray, "m k"]:
+    """Return g of every pose under every hypothesis."""
+    found = np.zeros((len(position_m), len(query.roll)), np.float32)
+    azimuth = query.roll + query.frame_heading + each.azimuth
+    order = np.argsort(room_index, kind="stable")
+    begin, end = (np.searchsorted(room_index[order], places.room_index, side) for side in ("left", "right"))
+    for number, room in enumerate(places.room_index):
+        rows, count = order[begin[number] : end[number]], int((places.room_index == room).sum())
+        if count > _MAX_FIXTURES:
+            found[rows] = 1.0
+            continue
+        away_m = places.centre_m[number] - position_m[rows]
+        distance_m = np.maximum(np.hypot(*away_m.T), 0.1)
+        deviation = np.hypot(_AZIMUTH_SD, np.minimum(0.5 * places.width_m[number] / distance_m, _MAX_SD))[:, None]
+        off = wrap_angle(azimuth - np.arctan2(away_m[:, 0], away_m[:, 1])[:, None]) / deviation
+        found[rows] += _FIELD / count * np.exp(-0.5 * np.square(off)) / (math.sqrt(2.0 * math.pi) * deviation)
+    return found
