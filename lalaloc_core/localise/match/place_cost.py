@@ -6,10 +6,10 @@ a pose from which the plan shows such a fixture there, at the azimuth φ:
     f(pose) = 1 - p + p ((1 - m) g(pose) + m),    g = mean over the fixtures of the room of F N(α - φ; σ)
 
 The classifier shares the probability q among all objects of the photograph, so p = q / (q + 0.15), which is not fitted.
-The fixture is not drawn, or stands in another room, with the probability m. N is the normal distribution with the deviation σ,
-of the object's azimuth and the fixture's width, and F the usual field of view, within which an object of unknown place
-would be anywhere. In rooms without such a fixture g is 0; rooms with many tell no direction, g is 1. Kinds that the
-plan draws nowhere are left out.
+The fixture is not drawn, or stands in another room, with the probability m. N is the normal distribution with the
+deviation σ, of the object's azimuth and the fixture's width, and F the usual field of view, within which an object of
+unknown place would be anywhere. In rooms without such a fixture g is 0; rooms with many tell no direction, g is 1.
+Kinds that the plan draws nowhere are left out.
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import HEADING_SEPARATION, Posterior, area_shares, distinct, signals_of, suppress
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import MatchingCost, PoseGrid, cost_by_chance, grid_candidate
+from lalaloc_core.localise.match import MatchingCost, PlaceCost, PoseGrid, cost_by_chance, grid_candidate
 from lalaloc_core.localise.match.cost_terms import latent_distances
-from lalaloc_core.localise.query import CameraHeight, Candidate, Query
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, Query
 from lalaloc_core.localise.refine.refinement import with_latents
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, run_steps
 from lalaloc_core.localise.search.retrieval import contradicted
@@ -237,6 +237,9 @@ class _SequenceSearch:
         prior = prior - np.logaddexp.reduce(prior) - math.log(len(query.roll))
         states = States(grid.poses.position_m[index], query.roll + query.frame_heading, query.sector)
         log_likelihood = -weights.temperature * cost + prior[index][None, :, None]
+        places = PlaceCost.of(plan, query, NO_HINTS, 1.0, states.position_m, grid.poses.room_index[index])
+        if places is not None:
+            log_likelihood -= places.of_poses(np.arange(len(index)))
         return Observation(query, weights, index, states, cost, log_likelihood, doubted)
 
     def best_paths(self, chain: PictureChain) -> list[Path]:
