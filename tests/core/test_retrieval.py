@@ -23,6 +23,7 @@ from lalaloc_core.localise.match import (
     LowestCosts,
     MatchingConfig,
     MatchingCost,
+    PlaceCost,
     PoseGrid,
     coarse_costs,
     layouts_at,
@@ -409,17 +410,21 @@ def test_pair_costs_equal_the_full_matrix(building: Building, grid: PoseGrid, qu
 @pytest.mark.parametrize(
     "limits", [{"at_most": 6000, "at_least": 200, "window": 0.5}, {"at_most": 300, "at_least": 300, "window": 0.0}]
 )
-@pytest.mark.parametrize("hinted", [False, True])
+@pytest.mark.parametrize("told", [None, "hints", "fixtures"])
 def test_likeliest_pairs_equal_a_complete_coarse_pass(
-    building: Building, grid: PoseGrid, queries: list[Query], limits: dict[str, Any], hinted: bool
+    building: Building, grid: PoseGrid, queries: list[Query], limits: dict[str, Any], told: str | None
 ) -> None:
-    compared, rng = 0, np.random.default_rng(2)
+    compared, rng, poses = 0, np.random.default_rng(2), len(grid.poses)
     for query in queries[:8]:
-        penalty = np.where(rng.random(len(grid.poses)) < 0.5, np.inf, 0.1) if hinted else None
+        # Half of the poses are excluded, or have a cost for each heading.
+        hint = np.where(rng.random(poses) < 0.5, np.inf, 0.1) if told == "hints" else np.zeros(poses)
+        fixtures = rng.random((8 if told == "fixtures" else 1, HYPOTHESES)).astype(np.float32) * 0.2
+        row = rng.integers(0, len(fixtures), poses)
+        penalty = None if told is None else PlaceCost(hint, row, fixtures)
         matching_cost = matching_cost_of(building, query)
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
         every = coarse_costs(binned, matching_cost, room_index)
-        every = every if penalty is None else every + penalty[:, None]
+        every = every if penalty is None else every + penalty.of_poses(np.arange(poses))
         found, pair = likeliest(binned, matching_cost, room_index, penalty, **limits)
         count = int((every <= every.min() + limits["window"]).sum())
         count = min(max(count, limits["at_least"]), limits["at_most"])
