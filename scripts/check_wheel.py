@@ -60,7 +60,7 @@ def ask(url: str) -> int:
                 print(f"check_wheel: not ready: {client.get('/readyz').text}", file=sys.stderr)
                 return 1
             time.sleep(0.2)
-        photograph = client.get("/example-kitchen.jpg").raise_for_status().content
+        photograph = client.get("/web/example-kitchen.jpg").raise_for_status().content
         fields = {"floorplan_id": _plans(client)[0]}
         answer = client.post("/localise", data=fields, files={"photo": photograph}).raise_for_status().json()
         page = client.get("/").raise_for_status()
