@@ -4,25 +4,35 @@ PYTHON ?= python3
 PORT ?= 8000
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+# Stamps of the environment: with what serving needs, and with everything.
+SERVING := $(VENV)/.serving
+STAMP := $(VENV)/.everything
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test ray lint openapi docs neighbours site client web lock notice audit digests clean
+.PHONY: help setup develop demo serve test ray lint openapi docs neighbours site client web lock notice audit digests clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-setup: $(STAMP) ## create .venv and install everything
+setup: $(SERVING) ## create .venv and install what serving and the command line need
 
-$(STAMP): pyproject.toml requirements.lock torch.lock scripts/setup.sh scripts/install_torch.py
-	PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh
+$(SERVING): pyproject.toml serving.lock scripts/setup.sh scripts/install_lock.py
+	@PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh serving
 	@touch $@
 
-demo: $(STAMP) ## localise the example photographs over HTTP, write demo.png
-	$(BIN)/python -m examples.demo
+develop: $(STAMP) ## install the rest as well: training, tests, documentation
 
-serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
-	$(BIN)/python -m examples.serve --port $(PORT)
+$(STAMP): pyproject.toml requirements.lock torch.lock scripts/setup.sh scripts/install_lock.py scripts/install_torch.py
+	@PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh everything
+	@touch $@ $(SERVING)
+
+demo: $(SERVING) ## localise the example photographs over HTTP, write demo.png
+	@$(BIN)/python -m examples.demo
+
+# Answers are kept for a day, so that links to them can be shared; photographs never are.
+serve: $(SERVING) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
+	@LALALOC_KEEP_ANSWERS_S=$${LALALOC_KEEP_ANSWERS_S:-86400} LALALOC_LOG_LEVEL=$${LALALOC_LOG_LEVEL:-warning} \
+		$(BIN)/lalaloc-service serve --example --port $(PORT)
 
 # Three processes with one thread each keep two cores busy, as many tests wait; a process without tests takes over those
 # of others. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
@@ -73,7 +83,7 @@ build/tools/bin/pip-audit:
 	$(BIN)/python -m venv build/tools
 	build/tools/bin/python -m pip install --quiet pip-audit==2.10.1
 
-lock: $(STAMP) ## write requirements.lock and docker/requirements.lock from constraints.txt
+lock: $(STAMP) ## write serving.lock, requirements.lock and docker/requirements.lock from constraints.txt
 	$(BIN)/python -m scripts.write_locks $(BIN)/uv
 
 notice: $(STAMP) ## write the licences of all that ships into NOTICE

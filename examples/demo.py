@@ -26,13 +26,14 @@ from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, ClientError, Localisation
 
 _PLAN_TIMEOUT_S = 120.0
-# Long timeouts prevent a fallback to a coarser stage on a busy machine. Info messages would interrupt the table.
+# Long timeouts prevent a fallback to a coarser stage on a busy machine. Messages of the log would interrupt the table,
+# and that a new database is empty is no news here.
 _DEFAULTS = {
     "LALALOC_LPO_DEADLINE_S": "30",
     "LALALOC_LPO_STALL_S": "60",
     "LALALOC_DECODE_STALL_S": "60",
     "LALALOC_REQUEST_DEADLINE_S": "60",
-    "LALALOC_LOG_LEVEL": "warning",
+    "LALALOC_LOG_LEVEL": "error",
 }
 
 

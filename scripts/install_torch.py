@@ -84,7 +84,7 @@ def pip_install(requirement: str, *, locked: bool = False) -> int:
     """
     index = os.environ.get("TORCH_INDEX")
     options = ["--extra-index-url", index] if index else []
-    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", *options]
+    command = [sys.executable, "-m", "pip", "install", "-qq", "--disable-pip-version-check", *options]
     if not locked:
         constraints = ["-c", str(ROOT / "constraints.txt")]
         return subprocess.run([*command, *constraints, requirement], check=False).returncode

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -129,19 +128,3 @@ def test_demo_runs_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
     assert done.stdout.count(".jpg") == 2 * len(VIEWS)
     with Image.open(out) as picture:
         assert picture.width > 1000
-
-
-@pytest.mark.slow
-def test_serve_uses_another_port_and_logs_no_readiness_checks(tmp_path: Path) -> None:
-    environment = os.environ | {"LALALOC_DATA_DIR": str(tmp_path / "data"), "LALALOC_WORKERS": "0"}
-    command = [sys.executable, "-m", "examples.serve", "--port", "0"]
-    with (tmp_path / "log").open("w+") as log:
-        process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=log, text=True)
-        assert process.stdout is not None
-        ready = process.stdout.readline()
-        process.terminate()
-        assert process.wait(60.0) == 0
-        log.seek(0)
-        lines = log.read()
-    assert re.match(r"ready: http://127\.0\.0\.1:(?!8000 )\d+ \(plan ", ready), lines
-    assert "/readyz" not in lines

@@ -58,9 +58,13 @@ def test_lock_has_the_versions_of_the_constraints(lock: str) -> None:
     assert _required_by(extras_of(lock)) - {"torch"} <= locked.keys(), "run `make lock`"
 
 
-def test_image_is_a_part_of_the_environment() -> None:
-    everything, image = (_locked(lock) for lock in LOCKS)
+def test_locks_of_image_and_serving_are_parts_of_the_environment() -> None:
+    everything, serving, image = (_locked(lock) for lock in LOCKS)
     assert image.keys() - everything.keys() == {"pillow-heif"}
+    assert serving.keys() <= everything.keys()
+    # What installs the packages, and builds this one; none of what only training and tests need.
+    assert {"setuptools", "uv"} <= serving.keys()
+    assert not serving.keys() & {"sympy", "matplotlib", "onnx", "pytest", "ray", "sphinx", "ifcopenshell"}
 
 
 def test_torch_lock_is_for_the_pinned_version() -> None:

@@ -19,7 +19,7 @@ from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
 # Columns of the printed table.
-_SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_within_2deg")
+_SHARES = ("within_10cm", "within_50cm", "within_1m", "within_1m_30deg", "correct_room", "heading_within_2deg")
 
 
 def add_commands(commands: Any) -> None:

@@ -10,6 +10,7 @@ import json
 import socket
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict
 from datetime import datetime, timedelta
 
@@ -45,6 +46,7 @@ def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `serve`."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)")
+    parser.add_argument("--example", action="store_true", help="store the example plan, unless there are plans already")
 
 
 def serve(arguments: argparse.Namespace) -> int:
@@ -58,7 +60,7 @@ def serve(arguments: argparse.Namespace) -> int:
     with _listener(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]
         check_address(host, settings)
-        _check_parts(settings)
+        _check_parts(settings, example=arguments.example)
         # The socket is bound, so clients can connect now; they are answered after the start.
         print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
         # Imported late, because it takes a second that help and keys do not need.
@@ -70,8 +72,10 @@ def serve(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_parts(settings: Settings) -> None:
+def _check_parts(settings: Settings, *, example: bool) -> None:
     """Check model, database and exporter before the start, so that errors are one line and not a log.
+
+    With `example`, store the example plan in an empty database.
 
     Raises:
         BundleError: no usable model.
@@ -80,7 +84,12 @@ def _check_parts(settings: Settings) -> None:
     if settings.otlp_endpoint is not None:
         otlp_exporter(settings.otlp_endpoint).shutdown()
     Bundle.open(settings.bundle).check()
-    open_store(settings).close()
+    with closing(open_store(settings)) as store:
+        if example:
+            # Imported late, as importers are.
+            from service.cli.example_plan import store_example
+
+            store_example(store, settings)
 
 
 def _listener(host: str, port: int) -> socket.socket:

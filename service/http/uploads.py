@@ -28,6 +28,7 @@ from service.uploaded_file import UploadedFile
 
 JSON = "application/json"
 GEOJSON = "application/geo+json"
+GEOPOSE = "application/geopose+json"
 MULTIPART = "multipart/form-data"
 # Boundaries and part headers, which do not count towards the limit.
 _ENVELOPE_BYTES = 64 * 1024

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAnswer, SequenceAnswer
+from service.schemas.oscp import OscpGeoPose, OscpQuaternion
+from service.schemas.sessions import TrackedPoseAnswer
 
 # Nine decimals of a degree are a tenth of a millimetre.
 _DECIMALS = 9
@@ -35,6 +38,26 @@ def geopose_at(
         ),
         angles=GeoPoseAngles(yaw=yaw_deg, pitch=0.0, roll=0.0),
     )
+
+
+def basic_quaternion(geopose: GeoPose) -> OscpGeoPose:
+    """Return a pose as Basic-Quaternion of OGC GeoPose 1.0: the rotation of Basic-YPR about up as a quaternion."""
+    half = 0.5 * math.radians(geopose.angles.yaw)
+    quaternion = OscpQuaternion(x=0.0, y=0.0, z=round(math.sin(half), 9) + 0.0, w=round(math.cos(half), 9) + 0.0)
+    return OscpGeoPose(position=geopose.position, quaternion=quaternion)
+
+
+def geopose_document(answer: LocaliseAnswer | TrackedPoseAnswer) -> dict[str, Any] | None:
+    """Return the pose of an answer as a document of OGC GeoPose 1.0, Basic-Quaternion; None without a geopose."""
+    return None if answer.geopose is None else basic_quaternion(answer.geopose).model_dump(mode="json")
+
+
+def geopose_documents(answer: SequenceAnswer) -> list[dict[str, Any]] | None:
+    """Return the poses of a sequence in order, each as by `geopose_document`; None unless all have one."""
+    geoposes = [pose.geopose for pose in answer.poses if pose.geopose is not None]
+    if len(geoposes) < len(answer.poses):
+        return None
+    return [basic_quaternion(geopose).model_dump(mode="json") for geopose in geoposes]
 
 
 def geojson_feature(answer: LocaliseAnswer) -> dict[str, Any] | None:

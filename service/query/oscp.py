@@ -14,16 +14,9 @@ from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.localise.belief import HEADING_WITHIN, RIGHT_WITHIN_M
 from lalaloc_core.localise.query import RADIUS_RANGE_M
 from service.errors import InvalidRequestError, UnanchoredPlanError
+from service.query.geopose import basic_quaternion
 from service.schemas import EarthPoint, GeoPose, LocaliseAnswer
-from service.schemas.oscp import (
-    OscpAccuracy,
-    OscpAnswer,
-    OscpFound,
-    OscpGeolocationReading,
-    OscpGeoPose,
-    OscpQuaternion,
-    OscpRequest,
-)
+from service.schemas.oscp import OscpAccuracy, OscpAnswer, OscpFound, OscpGeolocationReading, OscpRequest
 
 # Radius (m) for a reading without an accuracy.
 UNKNOWN_ACCURACY_M = 100.0
@@ -136,13 +129,11 @@ def compose_oscp_answer(request: OscpRequest, found: LocaliseAnswer, warnings: l
     """
     if found.geopose is None:
         raise UnanchoredPlanError(found.floorplan_id, found.venue_id)
-    half = 0.5 * math.radians(found.geopose.angles.yaw)
-    quaternion = OscpQuaternion(x=0.0, y=0.0, z=round(math.sin(half), 9) + 0.0, w=round(math.cos(half), 9) + 0.0)
     return OscpAnswer(
         id=request.id,
         timestamp=request.timestamp,
         accuracy=_accuracy(found, found.geopose),
-        geopose=OscpGeoPose(position=found.geopose.position, quaternion=quaternion),
+        geopose=basic_quaternion(found.geopose),
         lalaloc=OscpFound(
             floorplan_id=found.floorplan_id,
             level=found.level,

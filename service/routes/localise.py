@@ -11,9 +11,9 @@ from lalaloc_core.errors import InvalidHintError
 from service.errors import InvalidRequestError, UnanchoredPlanError
 from service.http.accept import preferred
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON
+from service.http.uploads import GEOJSON, GEOPOSE, JSON
 from service.query import PhotographQuery, PictureRequest
-from service.query.geopose import geojson_feature
+from service.query.geopose import geojson_feature, geopose_document
 from service.routes.dependencies import Call
 from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
 from service.routes.query_request import (
@@ -45,6 +45,10 @@ _PHOTO_SCHEMA = {
 }
 
 
+# Forms of an answer on Earth, by media type.
+_ON_EARTH = {GEOJSON: geojson_feature, GEOPOSE: geopose_document}
+
+
 @router.post(
     "/localise",
     summary="Localise a photograph",
@@ -55,7 +59,10 @@ _PHOTO_SCHEMA = {
             # Pictures are not listed under `content`, which would make the type of an answer in generated clients a
             # union with strings.
             "description": f"The answer; with `Accept: {_PNG}` or `Accept: {_SVG}`, its picture.",
-            "content": {GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}}},
+            "content": {
+                GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
+                GEOPOSE: {"schema": {"type": "object", "description": "A Basic-Quaternion of OGC GeoPose 1.0."}},
+            },
         }
     }
     | problem_responses(InvalidHintError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
@@ -74,18 +81,20 @@ async def localise(
     """Localise a photograph in a stored floor plan, or in the plans of a venue.
 
     With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
-    application/geo+json` it is a GeoJSON Feature on Earth, for plans and venues with an `anchor`.
+    application/geo+json` it is a GeoJSON Feature on Earth, with `Accept: application/geopose+json` a GeoPose
+    (Basic-Quaternion), for plans and venues with an `anchor`.
 
     The query waits for a plan that is still preparing. In a venue it searches the plans that are ready, warns about the
     others, and waits if none is ready. If pose refinement (`lpo`) is not done in time, the answer falls back to the VDR
     pose, with `"stage": "vdr"`.
     """
-    media = preferred(call.request, (JSON, _PNG, _SVG, GEOJSON))
-    if media in (JSON, GEOJSON) and picture is not None:
+    media = preferred(call.request, (JSON, _PNG, _SVG, *_ON_EARTH))
+    is_picture = media in (_PNG, _SVG)
+    if picture is not None and not is_picture:
         raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
     idempotent = call.idempotent(media)
     form, parts, context = await read_query(call, LocaliseForm, "max_photograph_bytes", files={PHOTO})
-    if form.venue_id is not None and media in (_PNG, _SVG):
+    if form.venue_id is not None and is_picture:
         raise InvalidRequestError(
             [("venue_id", f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id")]
         )
@@ -93,17 +102,17 @@ async def localise(
     if parts.named(FEATURES):
         if picture in ("both", "photograph"):
             raise InvalidRequestError([("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")])
-        picture = None if picture is None and media in (JSON, GEOJSON) else "plan"
+        picture = "plan" if is_picture else None
 
     async def respond(_token: str) -> Response:
         query = PhotographQuery(form, content, context)
         place = await call.place(form.floorplan_id, form.venue_id)
         check_anchor(place, media)
-        if media in (JSON, GEOJSON):
+        if not is_picture:
             answer = await call.runtime.localiser.localise(place, query)
             call.log(plan=answer.floorplan_id, revision=answer.floorplan_revision, stage=answer.stage)
             kept = await keep_answer(answer, call) if media == JSON else answer
-            return answer_as(kept, media, geojson_feature)
+            return answer_as(kept, media, _ON_EARTH)
         assert isinstance(place, PlanRecord)
         rooms = await call.rendition(place, "drawing")
         drawn = rooms.content.decode()

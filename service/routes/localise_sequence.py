@@ -10,9 +10,9 @@ from lalaloc_core.errors import InvalidFilmError, InvalidMotionError
 from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http.accept import preferred
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, Parts, Repeats, Settable
+from service.http.uploads import GEOJSON, GEOPOSE, JSON, Parts, Repeats, Settable
 from service.query import Content, QueryContext, SequenceQuery
-from service.query.geopose import geojson_features
+from service.query.geopose import geojson_features, geopose_documents
 from service.routes.dependencies import ApiCall, Call
 from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
 from service.routes.query_request import FILM, PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
@@ -38,13 +38,23 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
 }
 
 
+_GEOPOSES = "One Basic-Quaternion of OGC GeoPose 1.0 for each photograph, in their order."
+# Forms of an answer on Earth, by media type.
+_ON_EARTH = {GEOJSON: geojson_features, GEOPOSE: geopose_documents}
+
+
 @router.post(
     "/localise/sequence",
     summary="Localise several photographs of one visit",
     response_model=SequenceAnswer,
     openapi_extra=body_schema(SequenceForm, _PHOTOS_SCHEMA, film=_FILM_SCHEMA),
     responses={
-        200: {"content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}}}
+        200: {
+            "content": {
+                GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}},
+                GEOPOSE: {"schema": {"type": "array", "items": {"type": "object"}, "description": _GEOPOSES}},
+            }
+        }
     }
     | problem_responses(
         InvalidMotionError, InvalidFilmError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS
@@ -56,11 +66,12 @@ async def localise_sequence(call: Call) -> Response:
     Measured motions between them resolve places that look alike. Photographs that were taken while turning on one spot
     (`motion=turn`) are together as certain as one with a wider field of view; their angles follow from their overlap,
     and a `film` of the turn can be sent instead of them. In a venue, every pose has its `floorplan_id` and `level`.
-    With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection, one Feature per photograph, for plans
-    and venues with an `anchor`. The query waits for a plan that is still preparing. If pose refinement (`lpo`) is not
-    done in time, the answer falls back to the best path on the pose grid, with `"stage": "retrieval"`.
+    With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection, one Feature per photograph, with
+    `Accept: application/geopose+json` an array of GeoPoses (Basic-Quaternion), for plans and venues with an `anchor`.
+    The query waits for a plan that is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls
+    back to the best path on the pose grid, with `"stage": "retrieval"`.
     """
-    media = preferred(call.request, (JSON, GEOJSON))
+    media = preferred(call.request, (JSON, *_ON_EARTH))
     idempotent = call.idempotent(media)
     most = call.settings.photographs.max_sequence_photographs
     repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs"), FILM: Repeats(1, 1)}
@@ -72,7 +83,7 @@ async def localise_sequence(call: Call) -> Response:
         check_anchor(place, media)
         found = await call.runtime.localiser.localise_sequence(place, query)
         call.log(stage=found.stage)
-        return answer_as(found, media, geojson_features)
+        return answer_as(found, media, _ON_EARTH)
 
     return await idempotent.run_async(parts, respond, call.runtime.reads)
 

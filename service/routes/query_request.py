@@ -17,6 +17,7 @@ from lalaloc_core.localise.search.pipeline import StageClock
 from service import errors
 from service.http.uploads import (
     GEOJSON,
+    GEOPOSE,
     JSON,
     MULTIPART,
     Parts,
@@ -173,24 +174,29 @@ def check_anchor(place: PlanRecord | VenueRecord, media: str) -> None:
     """Check that the answer in a plan can be in latitude and longitude; that in a venue depends on the plan it finds.
 
     Raises:
-        UnanchoredPlanError: the answer is GeoJSON, and the plan has no anchor.
+        UnanchoredPlanError: the answer is GeoJSON or a GeoPose, and the plan has no anchor.
     """
-    if media == GEOJSON and isinstance(place, PlanRecord) and place.plan.anchor is None:
+    if media in (GEOJSON, GEOPOSE) and isinstance(place, PlanRecord) and place.plan.anchor is None:
         raise errors.UnanchoredPlanError(place.id)
 
 
-def answer_as(answer: Answer, media: str, to_geojson: Callable[[Answer], dict[str, Any] | None]) -> Response:
-    """Return an answer as JSON or GeoJSON.
+def answer_as(answer: Answer, media: str, on_earth: Mapping[str, Callable[[Answer], Any]]) -> Response:
+    """Return an answer as JSON, or in a form on Earth.
+
+    Args:
+        answer: the answer.
+        media: media type of the form.
+        on_earth: by media type, functions that return an answer in latitude and longitude, None without an anchor.
 
     Raises:
-        UnanchoredPlanError: GeoJSON is requested, and neither the plan nor the venue has an anchor.
+        UnanchoredPlanError: a form on Earth is requested, and neither the plan nor the venue has an anchor.
     """
-    if media != GEOJSON:
+    if media == JSON:
         return Response(answer.model_dump_json(), headers=VARY, media_type=JSON)
-    feature = to_geojson(answer)
-    if feature is None:
+    document = on_earth[media](answer)
+    if document is None:
         raise errors.UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
-    return Response(json.dumps(feature), headers=VARY, media_type=GEOJSON)
+    return Response(json.dumps(document), headers=VARY, media_type=media)
 
 
 async def keep_answer(answer: LocaliseAnswer, call: ApiCall) -> LocaliseAnswer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -11,10 +12,12 @@ from fastapi import APIRouter, Response, status
 from lalaloc_core.errors import InvalidHintError, InvalidMotionError, InvalidPoseError
 from lalaloc_core.render.sampling import grid_size
 from service import errors
+from service.http.accept import preferred
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, Parts, media_type
+from service.http.uploads import GEOPOSE, JSON, MULTIPART, Parts, media_type
 from service.query import MAX_POSES, TrackQuery
+from service.query.geopose import geopose_document
 from service.routes.dependencies import ApiCall, Call, is_id
 from service.routes.descriptions import (
     BODY_ERRORS,
@@ -25,7 +28,7 @@ from service.routes.descriptions import (
     STORE_ERRORS,
     json_body,
 )
-from service.routes.query_request import PHOTO, body_schema, photographs_of, read_query
+from service.routes.query_request import PHOTO, VARY, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import PhotographForm, SessionDocument, StoredPose
 from service.schemas.sessions import SessionAnswer
 from service.storage.records import PlanRecord
@@ -105,9 +108,17 @@ def delete_session(session_id: str, call: Call) -> None:
     summary="Send the next photograph of a session",
     response_model=SessionAnswer,
     openapi_extra=body_schema(PhotographForm, _PHOTOGRAPH),
-    responses=problem_responses(
+    responses={
+        200: {
+            "content": {
+                GEOPOSE: {"schema": {"type": "object", "description": "A Basic-Quaternion of OGC GeoPose 1.0."}}
+            }
+        }
+    }
+    | problem_responses(
         InvalidHintError,
         InvalidMotionError,
+        errors.UnanchoredPlanError,
         errors.UnknownSessionError,
         errors.SessionBusyError,
         errors.SessionOutdatedError,
@@ -125,9 +136,11 @@ async def add_photograph(session_id: str, call: Call) -> Response:
 
     One photograph of a session is computed at a time: another one gets 409 meanwhile. With `number`, a photograph that
     is sent twice, as after a lost answer, gets 409 instead of moving the camera twice; `GET /sessions/{session_id}`
-    then has the answer. With an idempotency key, it gets the same answer again.
+    then has the answer. With an idempotency key, it gets the same answer again. With `Accept:
+    application/geopose+json` the answer is the pose alone, as a GeoPose (Basic-Quaternion) on Earth.
     """
-    idempotent = call.idempotent()
+    media = preferred(call.request, (JSON, GEOPOSE))
+    idempotent = call.idempotent(media)
     media_type(call.request, (MULTIPART,))
     sessions = call.store.sessions
     await call.read(sessions.get, call.tenant, _id(session_id))
@@ -140,10 +153,12 @@ async def add_photograph(session_id: str, call: Call) -> Response:
         session = await call.read(sessions.claim, call.tenant, session_id, form.number, token)
         if session.claim == token:
             # An earlier attempt moved the camera, but its answer was not kept.
-            return Response(_answer(session), media_type=JSON)
+            return _response(session, media)
         try:
             document = SessionDocument.model_validate_json(session.options)
             place = await call.place(document.floorplan_id, document.venue_id)
+            # Before the camera moves.
+            check_anchor(place, media)
             if place.revision_id != session.revision_id:
                 changed = f"floor plan '{place.id}' was replaced"
                 if session.plan_id is None:
@@ -160,7 +175,7 @@ async def add_photograph(session_id: str, call: Call) -> Response:
             with suppress(errors.StoreUnavailableError):
                 await call.read(sessions.release, session)
             raise
-        return Response(_answer(after), media_type=JSON)
+        return _response(after, media)
 
     return await idempotent.run_async(parts, follow, call.runtime.reads)
 
@@ -198,6 +213,22 @@ def _id(session_id: str) -> str:
     if not is_id(session_id):
         raise errors.UnknownSessionError(session_id)
     return session_id
+
+
+def _response(session: SessionRecord, media: str) -> Response:
+    """Return the answer about a session, or its pose on Earth alone.
+
+    Raises:
+        UnanchoredPlanError: the pose has no place on Earth: neither the venue nor the plan of the pose has an anchor.
+    """
+    if media == JSON:
+        return Response(_answer(session), headers=VARY, media_type=JSON)
+    stored = _stored_pose(session)
+    assert stored is not None, "a photograph was followed"
+    document = geopose_document(stored.pose)
+    if document is None:
+        raise errors.UnanchoredPlanError(stored.pose.floorplan_id or str(session.plan_id), session.venue_id)
+    return Response(json.dumps(document), headers=VARY, media_type=media)
 
 
 def _answer(session: SessionRecord) -> str:

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import httpx
+import jsonschema
 import numpy as np
 import pyproj
 import pytest
@@ -31,6 +32,36 @@ def check_schema(geopose: dict[str, Any]) -> None:
         assert all(type(value) is float for value in geopose[part].values())
     assert abs(geopose["position"]["lat"]) <= 90.0
     assert abs(geopose["position"]["lon"]) <= 180.0
+
+
+# GeoPose.Basic.Quaternion.Strict.Schema.json of the same standard: these and no others, all required, all numbers.
+QUATERNION = {
+    "type": "object",
+    "properties": {
+        part: {
+            "type": "object",
+            "properties": {name: {"type": "number"} for name in names},
+            "required": list(names),
+            "additionalProperties": False,
+        }
+        for part, names in {"position": ("lat", "lon", "h"), "quaternion": ("x", "y", "z", "w")}.items()
+    },
+    "required": ["position", "quaternion"],
+    "additionalProperties": False,
+}
+AS_GEOPOSE = {"Accept": "application/geopose+json"}
+
+
+def assert_quaternion(document: dict[str, Any], geopose: dict[str, Any]) -> None:
+    """Check a Basic-Quaternion against the structure of the standard and the Basic-YPR of the same answer."""
+    jsonschema.validate(document, QUATERNION)
+    assert document["position"] == geopose["position"]
+    x, y, z, w = document["quaternion"].values()
+    assert math.hypot(x, y, z, w) == pytest.approx(1.0, abs=1e-8)
+    # Where the camera's forward axis points in (east, north, up), from the quaternion and from the yaw.
+    forward = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    yaw = math.radians(geopose["angles"]["yaw"])
+    assert forward == pytest.approx((-math.sin(yaw), math.cos(yaw), 0.0), abs=1e-6)
 
 
 def assert_at(geopose: dict[str, Any], pose: dict[str, Any], anchor: Anchor) -> None:
@@ -167,6 +198,55 @@ def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     place = geopose["position"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
     assert feature["properties"]["room"] == answer["room"]
+
+
+def test_answer_as_a_geopose(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
+    geopose = client.post("/localise", data=fields, files={"photo": panorama}).json()["geopose"]
+    response = client.post("/localise", data=fields, files={"photo": panorama}, headers=AS_GEOPOSE)
+    assert response.headers["content-type"] == "application/geopose+json"
+    assert response.headers["vary"] == "Accept"
+    assert_quaternion(response.json(), geopose)
+    # East is a quarter turn clockwise.
+    assert response.json()["quaternion"] == pytest.approx(
+        {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}, abs=1e-5
+    )
+    keyed = client.post(
+        "/localise", data=fields, files={"photo": panorama}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
+    )
+    assert_problem(keyed, 422, "invalid-request")
+    refused = client.post(
+        "/localise", data=fields | {"floorplan_id": upload(client)}, files={"photo": panorama}, headers=AS_GEOPOSE
+    )
+    assert "has no anchor" in assert_problem(refused, 409, "floorplan-unanchored")["detail"]
+
+
+def test_sequence_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    fields, files = {"floorplan_id": plan_id, "refine": "none"}, [("photo", panorama)] * 2
+    poses = client.post("/localise/sequence", data=fields, files=files).json()["poses"]
+    response = client.post("/localise/sequence", data=fields, files=files, headers=AS_GEOPOSE)
+    assert response.headers["content-type"] == "application/geopose+json"
+    for document, pose in zip(response.json(), poses, strict=True):
+        assert_quaternion(document, pose["geopose"])
+    refused = client.post(
+        "/localise/sequence", data=fields | {"floorplan_id": upload(client)}, files=files, headers=AS_GEOPOSE
+    )
+    assert_problem(refused, 409, "floorplan-unanchored")
+
+
+def test_session_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    path = f"/sessions/{client.post('/sessions', json={'floorplan_id': plan_id}).json()['id']}"
+    response = client.post(f"{path}/photographs", files={"photo": panorama}, headers=AS_GEOPOSE)
+    assert response.headers["content-type"] == "application/geopose+json"
+    assert_quaternion(response.json(), client.get(path).json()["pose"]["geopose"])
+    unanchored = f"/sessions/{client.post('/sessions', json={'floorplan_id': upload(client)}).json()['id']}"
+    refused = client.post(f"{unanchored}/photographs", files={"photo": panorama}, headers=AS_GEOPOSE)
+    assert_problem(refused, 409, "floorplan-unanchored")
+    # The refused photograph has not moved the camera.
+    assert client.get(unanchored).json()["photographs"] == 0
 
 
 def test_every_candidate_has_a_geopose(client: httpx.Client, panorama: bytes) -> None:

@@ -47,6 +47,7 @@ class StageScores:
     within_1cm: Estimate
     within_5cm: Estimate
     within_10cm: Estimate
+    within_50cm: Estimate
     within_1m: Estimate
     within_1m_30deg: Estimate
     correct_room: Estimate
@@ -249,6 +250,7 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
         within_1cm=bootstrap.share(error < 0.01),
         within_5cm=bootstrap.share(error < 0.05),
         within_10cm=bootstrap.share(error < 0.10),
+        within_50cm=bootstrap.share(error < 0.50),
         within_1m=bootstrap.share(error < 1.0),
         within_1m_30deg=bootstrap.share((error < 1.0) & (heading < 30.0)),
         correct_room=bootstrap.share(np.array(rooms)),

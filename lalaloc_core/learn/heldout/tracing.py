@@ -14,7 +14,7 @@ try:
     from embreex.mesh_construction import TriangleMesh
 except ImportError as error:  # pragma: no cover
     raise ImportError(
-        "heldout homes are traced by embree: install the extra `oracle` (embreex), as `make setup` does"
+        "heldout homes are traced by embree: install the extra `oracle` (embreex), as `make develop` does"
     ) from error
 
 # Rays start this far (m) from their surface, so that they do not hit it.
