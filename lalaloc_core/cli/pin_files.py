@@ -178,7 +178,8 @@ def write_pin_files(
     Raises:
         OSError: a file cannot be written.
     """
-    from lalaloc_core.draw.pin_report import report_pages, write_pdf
+    from lalaloc_core.draw.pdf import write_pdf
+    from lalaloc_core.draw.pin_report import DPI, report_pages
     from lalaloc_core.draw.pins import draw_pins
 
     entries, notes = document["photographs"], list[str]()
@@ -193,7 +194,7 @@ def write_pin_files(
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
         write_text(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
     title = " / ".join(dict.fromkeys(plan.name for plan in plans))
-    write_pdf(report_pages(title, plans, rows, _summary(document)), out / "report.pdf", title)
+    write_pdf(report_pages(title, plans, rows, _summary(document)), out / "report.pdf", DPI)
     if copies:
         notes += _write_copies(out / COPIES, plans, ids, files, entries)
     return notes

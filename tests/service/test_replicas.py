@@ -113,9 +113,7 @@ def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresS
             albums.wait_until_solved(replica, album_id)
         assert a.get(f"/albums/{album_id}").json() == b.get(f"/albums/{album_id}").json()
         for media in ("application/json", "text/csv", "image/svg+xml"):
-            texts = {
-                client.get(f"/albums/{album_id}/photographs", headers={"Accept": media}).text for client in (a, b)
-            }
+            texts = {client.get(f"/albums/{album_id}/photographs", headers={"Accept": media}).text for client in (a, b)}
             assert len(texts) == 1, media
         row = albums.photographs(b, album_id)[0]
         assert albums.correct(b, album_id, row["id"], {"elsewhere": True}).status_code == 200
