@@ -313,7 +313,7 @@ def _write_copies(
     from lalaloc_core.photograph.placed_copy import Place, placed_copy
 
     folder.mkdir(exist_ok=True)
-    beside = 0
+    beside, written = 0, set[Path]()
     for file, entry in zip(files, entries, strict=True):
         if entry["room"] is None:
             continue
@@ -334,5 +334,9 @@ def _write_copies(
         (folder / file.path.name).write_bytes(copied.content)
         if copied.sidecar is not None:
             beside += 1
-            (folder / file.path.name).with_suffix(".xmp").write_bytes(copied.sidecar)
+            path = (folder / file.path.name).with_suffix(".xmp")
+            # The name that all photo managers know; that with both suffixes for the second file of the same name.
+            path = folder / f"{file.path.name}.xmp" if path in written else path
+            path.write_bytes(copied.sidecar)
+            written.add(path)
     return [f"copies with their place in an .xmp file beside them: {beside}"] if beside else []

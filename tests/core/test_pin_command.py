@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pypdfium2
 import pytest
+from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
 from lalaloc_core.cli import main
@@ -197,12 +198,35 @@ def test_copy_states_the_place_and_keeps_everything_else(kind: str) -> None:
     assert xmp["GPSLatitude"].endswith("S")
 
 
-def test_other_formats_get_a_file_beside_them() -> None:
-    content = _picture("WEBP")
+@pytest.mark.parametrize("kind", ["WEBP", "HEIF"])
+def test_other_formats_get_a_file_beside_them(kind: str) -> None:
+    if kind == "HEIF":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    content = _picture(kind)
     copy = placed_copy(content, PLACE)
+    # Byte by byte, so that the pixels are the same whatever decodes them.
     assert copy.content == content
     assert copy.sidecar is not None
-    assert "Küche" in copy.sidecar.decode()
+    root = fromstring(copy.sidecar.decode().partition("?>")[2].rpartition("<?xpacket")[0])
+    names = [element.text for element in root.iter() if element.tag.endswith("}li")]
+    assert names == ["Küche", "Ground & first", "Ground & first|Küche"]
+    stated = {element.tag.rpartition("}")[2]: element.text for element in root.iter()}
+    assert (stated["Location"], stated["GPSImgDirection"]) == ("Küche", "27124/100")
+
+
+def test_files_of_one_name_get_files_beside_them_of_two(
+    tmp_path: Path, pinned: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = tmp_path / "visit", tmp_path / "out"
+    folder.mkdir()
+    for name in ("kitchen", "study"):
+        with Image.open(EXAMPLES / f"{name}.jpg") as picture:
+            picture.resize((512, 256)).save(folder / f"{name}.webp")
+    (folder / "study.webp").rename(folder / "kitchen.WEBP")
+    assert main(["pin", str(pinned[0].parent / "flat.json"), str(folder), "--out", str(out)]) == 0
+    assert "an .xmp file beside them: 2" in capsys.readouterr().err
+    copies = sorted(path.name for path in (out / "photographs").iterdir())
+    assert copies == ["kitchen.WEBP", "kitchen.webp", "kitchen.webp.xmp", "kitchen.xmp"]
 
 
 def test_keywords_of_the_file_stay() -> None:

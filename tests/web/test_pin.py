@@ -139,10 +139,19 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     page.mouse.move(centre[0] + 40, centre[1] + 20, steps=4)
     page.mouse.up()
     expect(pin).not_to_have_attribute("transform", place)
+    expect(page.locator("#pin-state")).to_contain_text("(solved)")
     moved = pin.locator("circle").bounding_box()
     assert moved is not None
     assert moved["x"] == pytest.approx(circle["x"] + 40, abs=6)
     expect(pin.locator(".arrow")).to_have_attribute("transform", turned)
+    # Outside of all rooms the pin goes back.
+    place = pin.get_attribute("transform") or ""
+    page.mouse.move(centre[0] + 40, centre[1] + 20)
+    page.mouse.down()
+    page.mouse.move(5, 5, steps=4)
+    page.mouse.up()
+    expect(page.locator("#pin-error")).to_contain_text("lies in no room")
+    expect(pin).to_have_attribute("transform", place)
 
 
 def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ import { acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
 import { clearError, InputError, say, showError } from "./notices";
 import { type CardActions, cardOf, movedOf } from "./pin_card";
+import { type Drawn, drawn, keep } from "./pin_drawn";
 import { Floors, type Row } from "./pin_floors";
-import { pinOf } from "./pin_map";
+import { type PinActions, pinOf } from "./pin_map";
 import { added, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
 import { plainWords } from "./plain_words";
@@ -16,7 +17,6 @@ import type { Plan } from "./types";
 import type { Schemas } from "../../clients/typescript/src/index";
 
 type Correction = Partial<Schemas["CorrectionDocument"]>;
-type Card = { key: string; element: HTMLElement };
 
 const POLL_MS = 700;
 const RADIUS = 1.5;
@@ -28,6 +28,7 @@ const GROUPS = [
   ["Pinned", ["sure", "corrected"]],
   ["Waiting", ["waiting"]],
 ] as const;
+
 const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
 
 class PinPage {
@@ -42,7 +43,8 @@ class PinPage {
   private readonly thumbnails = new Map<string, Thumbnail>();
   private readonly done: { id: string; before: Correction | null }[] = [];
   private readonly floors = new Floors();
-  private cards = new Map<string, Card>();
+  private readonly cards = new Map<string, Drawn<HTMLElement>>();
+  private readonly drawnPins = new Map<string, Drawn<SVGElement | null>>();
   private shown: string | null = null;
   private title = "";
   private waiting: File[] = [];
@@ -138,6 +140,7 @@ class PinPage {
     this.album = null;
     this.rows = [];
     this.cards.clear();
+    this.drawnPins.clear();
     this.done.length = 0;
     history.replaceState(null, "", location.pathname);
     show(byId("problems"));
@@ -292,7 +295,10 @@ class PinPage {
       ({ pin }) => room === "" || (pin?.place?.room_id === room && pin.place.floorplan_id === this.shown),
     );
     const focused = document.activeElement?.id;
-    show(this.pins, ...(this.shown === null ? [] : this.pinsOf(shown, this.shown, true)));
+    keep(
+      this.pins,
+      this.shown === null ? [] : this.pinsOf(shown, this.shown, { move: this.move, show: this.actions.show }),
+    );
     const groups = GROUPS.map(([title, states]) => {
       const own = shown.filter(({ pin }) => (states as readonly string[]).includes(pin?.state ?? "waiting"));
       return (
@@ -328,30 +334,39 @@ class PinPage {
     );
   }
 
-  private pinsOf(rows: Row[], planId: string, isActive = false): SVGElement[] {
+  /** Return the pins in a plan; without actions, for paper. */
+  private pinsOf(rows: Row[], planId: string, act: PinActions | null = null): SVGElement[] {
     const floor = this.floors.get(planId);
     if (floor === null) return [];
     const radius = RADIUS * unitOf(boxOf(floor.plan.plan));
-    const act = isActive ? { move: this.move, show: (row: Row) => this.mark(row) } : null;
+    const make = (row: Row) => pinOf(row, radius, this.svg, act);
     const own = rows.filter(({ pin }) => pin?.place?.floorplan_id === planId);
-    return own.map((row) => pinOf(row, radius, this.svg, act)).filter((pin) => pin !== null);
+    const pins = own.map((row) =>
+      act === null ? make(row) : drawn(this.drawnPins, row.id, [row.pin, radius], () => make(row)),
+    );
+    return pins.filter((pin) => pin !== null);
   }
 
   private readonly move = (row: Row, [x_m, y_m]: [number, number], heading_deg: number | null): void => {
     const floorplan_id = this.shown!;
-    void this.guarded(() => this.correct(row, { position: { x_m, y_m }, heading_deg, floorplan_id } as Correction));
+    void this.guarded(async () => {
+      try {
+        await this.correct(row, { position: { x_m, y_m }, heading_deg, floorplan_id } as Correction);
+      } catch (failure) {
+        // Back to where it was.
+        this.drawnPins.delete(row.id);
+        this.draw();
+        throw failure;
+      }
+    });
   };
 
   private card(row: Row): HTMLElement {
     const picture = this.thumbnails.get(row.id) ?? null;
-    const key = JSON.stringify([row.revision, row.pin, picture?.url, this.album?.solution?.camera_height_m]);
-    let card = this.cards.get(row.id);
-    if (card?.key !== key) {
-      const height = this.album?.solution?.camera_height_m ?? null;
-      card = { key, element: cardOf(row, picture, this.floors, height, this.actions) };
-      this.cards.set(row.id, card);
-    }
-    return card.element;
+    const height = this.album?.solution?.camera_height_m ?? null;
+    return drawn(this.cards, row.id, [row.revision, row.pin, picture?.url, height], () =>
+      cardOf(row, picture, this.floors, height, this.actions),
+    );
   }
 
   /** Show the plan of a photograph, and mark its pin and card. */
