@@ -45,7 +45,7 @@ test: $(STAMP) ## lint, build the site, run the tests
 	exit $$status
 
 # A new cluster per file, so that files do not share state.
-ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence
+ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence albums
 ray: $(STAMP) ## run the tests of Ray, and the API's tests on Ray (about 20 minutes)
 	$(BIN)/python -m pytest -m "slow or not slow" tests/service/test_on_ray.py
 	for file in $(ON_RAY); do TEST_DATABASE=ray $(BIN)/python -m pytest tests/service/test_$$file.py || exit 1; done

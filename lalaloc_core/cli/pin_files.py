@@ -178,7 +178,8 @@ def write_pin_files(
     Raises:
         OSError: a file cannot be written.
     """
-    from lalaloc_core.draw.pin_report import report_pages, write_pdf
+    from lalaloc_core.draw.pdf import write_pdf
+    from lalaloc_core.draw.pin_report import DPI, report_pages
     from lalaloc_core.draw.pins import draw_pins
 
     entries, notes = document["photographs"], list[str]()
@@ -193,7 +194,7 @@ def write_pin_files(
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
         write_text(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
     title = " / ".join(dict.fromkeys(plan.name for plan in plans))
-    write_pdf(report_pages(title, plans, rows, _summary(document)), out / "report.pdf", title)
+    write_pdf(report_pages(title, plans, rows, _summary(document)), out / "report.pdf", DPI)
     if copies:
         notes += _write_copies(out / COPIES, plans, ids, files, entries)
     return notes
@@ -312,7 +313,7 @@ def _write_copies(
     from lalaloc_core.photograph.placed_copy import Place, placed_copy
 
     folder.mkdir(exist_ok=True)
-    beside = 0
+    beside, written = 0, set[Path]()
     for file, entry in zip(files, entries, strict=True):
         if entry["room"] is None:
             continue
@@ -333,5 +334,9 @@ def _write_copies(
         (folder / file.path.name).write_bytes(copied.content)
         if copied.sidecar is not None:
             beside += 1
-            (folder / file.path.name).with_suffix(".xmp").write_bytes(copied.sidecar)
+            path = (folder / file.path.name).with_suffix(".xmp")
+            # The name that all photo managers know; that with both suffixes for the second file of the same name.
+            path = folder / f"{file.path.name}.xmp" if path in written else path
+            path.write_bytes(copied.sidecar)
+            written.add(path)
     return [f"copies with their place in an .xmp file beside them: {beside}"] if beside else []

@@ -71,6 +71,12 @@ def rasterise(svg: str) -> bytes:
     )
 
 
+def font_runs(text: str) -> list[tuple[Path, str]]:
+    """Return the parts of a text with the bundled font of each."""
+    plain, parts = _FONT_FOLDER / "DejaVuSans.ttf", re.split(f"({_EAST_ASIAN.pattern}+)", text)
+    return [(Path(_EAST_ASIAN_FONT) if number % 2 else plain, part) for number, part in enumerate(parts) if part]
+
+
 def pixels(svg: str) -> Image.Image:
     """Rasterise a drawing as an RGB picture."""
     with Image.open(io.BytesIO(rasterise(svg))) as image:

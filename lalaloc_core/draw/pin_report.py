@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, pixels, shortened, words
+from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words
 from lalaloc_core.draw.pins import PIN_COLOURS, DrawnPin, arrow_svg, pins_svg
 from lalaloc_core.draw.plan import plan_part
 from lalaloc_core.floorplan import FloorPlan
@@ -71,16 +70,6 @@ def report_pages(
     aside = [row for row in rows if row.pin is None]
     for first in range(0, len(aside), _LINES // 2):
         yield _aside_page(aside[first : first + _LINES // 2])
-
-
-def write_pdf(pages: Iterator[str], path: Path, title: str) -> None:
-    """Write the pages as a PDF of pictures, one after the other, so that long reports need little memory.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    for number, page in enumerate(pages):
-        pixels(page).save(path, "PDF", append=number > 0, resolution=DPI, title=title, producer="LaLaLoc")
 
 
 def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: int, notes: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from lalaloc_core.bundle import default_bundle
 from tests.service.conftest import StartApp
 
 ROOT = Path(__file__).parents[2]
@@ -26,39 +28,108 @@ console.log(await findHeading("f".repeat(32), photo, AbortSignal.timeout(60000))
 """
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(
-    shutil.which("node") is None or not (PACKAGE / "node_modules").is_dir(),
-    reason="needs Node, and `npm ci` in clients/typescript",
-)
-def test_readme_example_works_in_node(start_app: StartApp, tmp_path: Path) -> None:
-    def tsc(*arguments: str, cwd: Path) -> None:
-        done = subprocess.run(
-            ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments],
-            cwd=cwd,
-            stdout=subprocess.PIPE,
-            text=True,
-            timeout=300,
-        )
-        assert done.returncode == 0, done.stdout
+_RUN_ALBUM = """
+import { readFileSync } from "node:fs";
+import { Client, ServiceError } from "lalaloc-client";
 
+const [plan, kitchen, study] = process.argv.slice(2).map((path) => new Blob([readFileSync(path)]));
+const service = new Client({ baseUrl: "ADDRESS" });
+const { id: planId } = await service.uploadPlan(plan);
+const album = await service.createAlbum({ floorplan_id: planId, name: "Visit" });
+const send = async () => {
+  const lines = [];
+  for await (const line of service.addToAlbum(album.id, [kitchen, plan, study])) lines.push(line.status);
+  return lines;
+};
+const solved = async () => {
+  for (;;) {
+    const now = await service.album(album.id);
+    if (now.state !== "solving") return now;
+    await new Promise((done) => setTimeout(done, 200));
+  }
+};
+const report = { sent: await send(), again: await send(), state: (await solved()).state };
+const { photographs } = await service.albumPhotographs(album.id);
+report.rooms = photographs.map(({ pin }) => pin.place.room);
+await service.correctPhotograph(album.id, photographs[0].id, { elsewhere: true });
+await solved();
+report.corrected = (await service.albumPhotographs(album.id)).photographs.map(({ pin }) => pin.state);
+report.table = (await (await service.albumFile(album.id, "text/csv")).text()).trim().split("\\n").length;
+await service.deleteAlbumPhotograph(album.id, photographs[0].id);
+report.left = (await service.album(album.id)).photographs;
+report.listed = (await service.albums("visit")).albums.length;
+await service.deleteAlbum(album.id);
+report.gone = await service.album(album.id).catch((error) => error instanceof ServiceError && error.slug);
+console.log(JSON.stringify(report));
+"""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        shutil.which("node") is None or not (PACKAGE / "node_modules").is_dir(),
+        reason="needs Node, and `npm ci` in clients/typescript",
+    ),
+]
+
+
+def tsc(*arguments: str, cwd: Path) -> None:
+    """Run the compiler."""
+    done = subprocess.run(
+        ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def run_node(folder: Path, *files: Path) -> str:
+    """Run `run.js` of a folder; return what it prints."""
+    command = ["node", "run.js", *map(str, files)]
+    return subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, timeout=300, check=True).stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the compiled package installed."""
+    root = tmp_path_factory.mktemp("node")
     subprocess.run(["node", "types.mjs"], cwd=PACKAGE, check=True, timeout=300)
-    installed = tmp_path / "node_modules" / "lalaloc-client"
+    installed = root / "node_modules" / "lalaloc-client"
     tsc("--outDir", str(installed / "dist"), cwd=PACKAGE)
     shutil.copy(PACKAGE / "package.json", installed)
+    (root / "package.json").write_text('{"type": "module"}')
+    return root
+
+
+def test_readme_example_works_in_node(start_app: StartApp, folder: Path, tmp_path: Path) -> None:
     (example,) = re.findall(r"```ts\n(.*?)```", (PACKAGE / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     with start_app(tmp_path / "data") as app:
         address = str(app.base_url).rstrip("/")
-        (tmp_path / "example.ts").write_text(example.replace("http://127.0.0.1:8000", address))
-        (tmp_path / "package.json").write_text('{"type": "module"}')
-        (tmp_path / "run.js").write_text(_RUN.replace("ADDRESS", address))
+        (folder / "example.ts").write_text(example.replace("http://127.0.0.1:8000", address))
+        (folder / "run.js").write_text(_RUN.replace("ADDRESS", address))
         strict = ["--strict", "--target", "ES2022", "--module", "nodenext", "--lib", "ES2022,DOM,DOM.Iterable"]
-        tsc(*strict, "example.ts", cwd=tmp_path)
-        files = [str(ROOT / "examples" / name) for name in ("flat.json", "study.jpg")]
-        done = subprocess.run(
-            ["node", "run.js", *files], cwd=tmp_path, stdout=subprocess.PIPE, text=True, timeout=300, check=True
-        )
-    rooms, heading, unread, unknown = done.stdout.splitlines()
+        tsc(*strict, "example.ts", cwd=folder)
+        printed = run_node(folder, ROOT / "examples" / "flat.json", ROOT / "examples" / "study.jpg")
+    rooms, heading, unread, unknown = printed.splitlines()
     assert re.fullmatch(r'\["(bedroom|study)","not localised: .*"\]', rooms, re.IGNORECASE), rooms
     assert 0.0 <= float(heading) < 360.0
     assert (unread, unknown) == ("null", "unknown-floorplan")
+
+
+def test_album_is_pinned_corrected_and_deleted(start_app: StartApp, folder: Path, tmp_path: Path) -> None:
+    with start_app(tmp_path / "data", bundle=default_bundle(), request_deadline_s=90.0, sweep_s=0.2) as app:
+        (folder / "run.js").write_text(_RUN_ALBUM.replace("ADDRESS", str(app.base_url).rstrip("/")))
+        files = [ROOT / "examples" / name for name in ("flat.json", "kitchen.jpg", "study.jpg")]
+        report = json.loads(run_node(folder, *files))
+    assert report == {
+        "sent": [201, 422, 201],
+        "again": [200, 422, 200],
+        "state": "solved",
+        "rooms": ["kitchen", "study"],
+        "corrected": ["set_aside", "sure"],
+        "table": 3,
+        "left": 1,
+        "listed": 1,
+        "gone": "unknown-album",
+    }

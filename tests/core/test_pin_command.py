@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 import pypdfium2
 import pytest
+from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
 from lalaloc_core.cli import main
+from lalaloc_core.draw.canvas import document, words
+from lalaloc_core.draw.pdf import write_pdf
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -41,8 +44,8 @@ def _document(out: Path) -> Any:
 
 
 def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
-    document = _document(pinned[1])
-    rooms = {entry["photograph"]: entry["room"] for entry in document["photographs"]}
+    pins = _document(pinned[1])
+    rooms = {entry["photograph"]: entry["room"] for entry in pins["photographs"]}
     assert rooms == {
         "broken.jpg": None,
         "kitchen.jpg": "kitchen",
@@ -50,11 +53,11 @@ def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Pat
         "study copy.jpg": "study",
         "study.jpg": "study",
     }
-    notes = " ".join(document["notes"])
+    notes = " ".join(pins["notes"])
     assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
     assert "copies of other files, which have the same pin: 1" in notes
     assert "files that are no pictures, which are left out: 1" in notes
-    assert document["counts"]["set_aside"] == 1
+    assert pins["counts"]["set_aside"] == 1
 
 
 def test_tables_and_drawings_have_every_pin(pinned: tuple[Path, Path]) -> None:
@@ -69,6 +72,38 @@ def test_tables_and_drawings_have_every_pin(pinned: tuple[Path, Path]) -> None:
     assert (out / "plan.svg").read_text().count('class="pin ') == 4
     # The plan, three rooms, and what was set aside.
     assert len(pypdfium2.PdfDocument(out / "report.pdf")) == 5
+
+
+def test_text_of_the_report_can_be_selected(pinned: tuple[Path, Path]) -> None:
+    report = pypdfium2.PdfDocument(pinned[1] / "report.pdf")
+    pages = [page.get_textpage().get_text_range() for page in report]
+    assert all(name in pages[0] for name in ("bathroom", "corridor", "3 sure, 1 set aside"))
+    assert any("kitchen.jpg" in page and page.startswith("kitchen") for page in pages)
+    assert "broken.jpg" in pages[-1]
+
+
+def test_selected_text_lies_over_its_picture(tmp_path: Path) -> None:
+    name = "Küche 厨房 ж"
+    turned = f'<g transform="translate(500 600) rotate(90)">{words(0, 0, "turned", 40)}</g>'
+    parts = [words(100, 200, name, 40), words(900, 300, "end", 40, anchor="end"), turned]
+    write_pdf([document(1000, 1000, "Page", parts)], tmp_path / "page.pdf", 72)
+    page = pypdfium2.PdfDocument(tmp_path / "page.pdf")[0]
+    text = page.get_textpage()
+    assert text.get_text_range().splitlines()[:2] == [name, "end"]
+    ink = np.asarray(page.render(scale=1).to_pil().convert("L")) < 128
+    for word in (name, "end", "turned"):
+        found = text.search(word)
+        match = found.get_next()
+        assert match is not None
+        index, count = match
+        boxes = [text.get_charbox(number) for number in range(index, index + count)]
+        left, bottom = (min(box[side] for box in boxes) for side in (0, 1))
+        right, top = (max(box[side] for box in boxes) for side in (2, 3))
+        rows, columns = np.nonzero(
+            ink[round(1000 - top) - 9 : round(1000 - bottom) + 9, round(left) - 9 : round(right) + 9]
+        )
+        drawn = columns.min(), rows.min(), columns.max(), rows.max()
+        np.testing.assert_allclose(drawn, (9, 9, 9 + right - left, 9 + top - bottom), atol=6)
 
 
 def test_originals_stay_and_copies_have_the_same_pixels(pinned: tuple[Path, Path]) -> None:
@@ -163,12 +198,35 @@ def test_copy_states_the_place_and_keeps_everything_else(kind: str) -> None:
     assert xmp["GPSLatitude"].endswith("S")
 
 
-def test_other_formats_get_a_file_beside_them() -> None:
-    content = _picture("WEBP")
+@pytest.mark.parametrize("kind", ["WEBP", "HEIF"])
+def test_other_formats_get_a_file_beside_them(kind: str) -> None:
+    if kind == "HEIF":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    content = _picture(kind)
     copy = placed_copy(content, PLACE)
+    # Byte by byte, so that the pixels are the same whatever decodes them.
     assert copy.content == content
     assert copy.sidecar is not None
-    assert "Küche" in copy.sidecar.decode()
+    root = fromstring(copy.sidecar.decode().partition("?>")[2].rpartition("<?xpacket")[0])
+    names = [element.text for element in root.iter() if element.tag.endswith("}li")]
+    assert names == ["Küche", "Ground & first", "Ground & first|Küche"]
+    stated = {element.tag.rpartition("}")[2]: element.text for element in root.iter()}
+    assert (stated["Location"], stated["GPSImgDirection"]) == ("Küche", "27124/100")
+
+
+def test_files_of_one_name_get_files_beside_them_of_two(
+    tmp_path: Path, pinned: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = tmp_path / "visit", tmp_path / "out"
+    folder.mkdir()
+    for name in ("kitchen", "study"):
+        with Image.open(EXAMPLES / f"{name}.jpg") as picture:
+            picture.resize((512, 256)).save(folder / f"{name}.webp")
+    (folder / "study.webp").rename(folder / "kitchen.WEBP")
+    assert main(["pin", str(pinned[0].parent / "flat.json"), str(folder), "--out", str(out)]) == 0
+    assert "an .xmp file beside them: 2" in capsys.readouterr().err
+    copies = sorted(path.name for path in (out / "photographs").iterdir())
+    assert copies == ["kitchen.WEBP", "kitchen.webp", "kitchen.webp.xmp", "kitchen.xmp"]
 
 
 def test_keywords_of_the_file_stay() -> None:

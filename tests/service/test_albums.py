@@ -555,6 +555,7 @@ def test_expired_lease_is_taken_over(
         store.close()
 
 
+@pytest.mark.one_replica
 def test_album_that_cannot_be_solved_states_why(
     start_app: StartApp, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,9 +15,11 @@ from typing import Any
 import httpx
 import pytest
 
+from lalaloc_core.bundle import default_bundle
 from service.cli.entry_point import main as lalaloc_service
 from service.settings import SETTING_NAMES
 from service.storage import Store
+from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -69,6 +71,34 @@ def test_sqlite_backup_restores_everything(
     assert lalaloc_service(["restore", earlier[1], "--yes"]) == 0
     with start_app(**on_sqlite(data)) as client:
         assert client.get(f"/floorplans/{later}").status_code == 200
+
+
+def pinned_album(client: httpx.Client) -> tuple[str, dict[str, Any], list[dict[str, Any]]]:
+    """Return an album with two pins and a correction: its id, itself, and its photographs."""
+    album_id = albums.create(client, upload(client, albums.HOME))
+    lines = albums.add(client, album_id, [(albums.EXAMPLES / name).read_bytes() for name in albums.NAMES[:2]])
+    albums.correct(client, album_id, lines[0]["photograph"]["id"], {"elsewhere": True})
+    return album_id, albums.wait_until_solved(client, album_id), albums.photographs(client, album_id)
+
+
+def is_same_album(client: httpx.Client, album_id: str, album: Any, rows: Any) -> bool:
+    """Return True if an album is as it was, and goes on: a correction is undone, and all is solved again."""
+    same = client.get(f"/albums/{album_id}").json() == album and albums.photographs(client, album_id) == rows
+    albums.correct(client, album_id, rows[0]["id"], None)
+    albums.wait_until_solved(client, album_id)
+    return same and albums.photographs(client, album_id)[0]["pin"]["place"] is not None
+
+
+def test_sqlite_backup_restores_albums(start_app: StartApp, data: Path, tmp_path: Path) -> None:
+    backup = str(tmp_path / "backup.sqlite3")
+    shipped = on_sqlite(data) | {"bundle": default_bundle(), "request_deadline_s": 90.0, "sweep_s": 0.2}
+    with start_app(**shipped) as client:
+        before = pinned_album(client)
+        assert lalaloc_service(["backup", backup]) == 0
+        assert client.delete(f"/albums/{before[0]}").status_code == 204
+    assert lalaloc_service(["restore", backup, "--yes"]) == 0
+    with start_app(**shipped) as client:
+        assert is_same_album(client, *before)
 
 
 def test_lost_or_damaged_database_is_restored(
@@ -186,6 +216,21 @@ def test_postgresql_dump_restores_everything(
     with start_app(tmp_path / "b", database_url=url) as client:
         wait_for(lambda: client.get("/readyz").json()["plans_preparing"] == 0)
         assert stored(client, panorama) == before
+
+
+def test_postgresql_dump_restores_albums(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+    dump = str(tmp_path / "backup.dump")
+    shipped: dict[str, Any] = {"database_url": own_database(postgres), "bundle": default_bundle()}
+    shipped |= {"request_deadline_s": 90.0, "sweep_s": 0.2}
+    with start_app(tmp_path / "a", **shipped) as client:
+        before = pinned_album(client)
+        run(postgres, "pg_dump", "--format=custom", f"--file={dump}", shipped["database_url"])
+        assert client.delete(f"/albums/{before[0]}").status_code == 204
+    options = re.search(r"pg_restore (.*) --dbname", PAGE)
+    assert options is not None
+    run(postgres, "pg_restore", *options[1].split(), f"--dbname={shipped['database_url']}", dump)
+    with start_app(tmp_path / "b", **shipped) as client:
+        assert is_same_album(client, *before)
 
 
 def test_replicas_of_two_models_coexist(

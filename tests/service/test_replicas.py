@@ -18,6 +18,8 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
+from lalaloc_core.bundle import default_bundle
+from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.service.test_session_stream import put, received, refusal, stream
@@ -88,6 +90,37 @@ def test_two_replicas_act_as_one_service(
             assert {answer.status_code for answer in answers} == {200}
             assert proxy.delete(f"/floorplans/{plan_id}").status_code == 204
             assert localise(a, plan_id, panorama, heading_deg=0).status_code == 404
+
+
+def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+    shared: dict[str, Any] = {
+        "database_url": postgres.new_database(),
+        "bundle": default_bundle(),
+        "request_deadline_s": 90.0,
+        "sweep_s": 0.2,
+    }
+    pictures = [(albums.EXAMPLES / name).read_bytes() for name in albums.NAMES[:3]]
+    with ExitStack() as second, start_app(tmp_path / "a", **shared) as a:
+        b = second.enter_context(start_app(tmp_path / "b", **shared))
+        album_id = albums.create(a, upload(a, albums.HOME))
+        # Both replicas at once: each picture is stored once.
+        with ThreadPoolExecutor(2) as senders:
+            lines = list(senders.map(lambda replica: albums.add(replica, album_id, pictures), (a, b)))
+        assert [sorted(pair) for pair in zip(*([row["status"] for row in part] for part in lines), strict=True)] == [
+            [200, 201]
+        ] * 3
+        for replica in (a, b):
+            albums.wait_until_solved(replica, album_id)
+        assert a.get(f"/albums/{album_id}").json() == b.get(f"/albums/{album_id}").json()
+        for media in ("application/json", "text/csv", "image/svg+xml"):
+            texts = {client.get(f"/albums/{album_id}/photographs", headers={"Accept": media}).text for client in (a, b)}
+            assert len(texts) == 1, media
+        row = albums.photographs(b, album_id)[0]
+        assert albums.correct(b, album_id, row["id"], {"elsewhere": True}).status_code == 200
+        second.close()
+        # One replica goes: the other one answers, and solves what is due.
+        albums.wait_until_solved(a, album_id)
+        assert albums.photographs(a, album_id)[0]["pin"]["place"] is None
 
 
 def test_refusals_do_not_disable_a_replica(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import pypdfium2
 import pytest
-from playwright.sync_api import expect
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
 
 from lalaloc_core.bundle import default_bundle
 from tests.service.conftest import StartApp, upload
-from tests.web.conftest import EXAMPLES, Visit
+from tests.web.conftest import EXAMPLES, Visit, visit
+from tests.web.test_answer import _assert_accessible
+from tests.web.test_on_device import SLOW_MS, recorded
 
 FLAT = json.loads((EXAMPLES / "flat.json").read_text())
 FILES = [EXAMPLES / name for name in ("living_room.jpg", "kitchen.jpg", "bedroom.jpg")]
@@ -27,15 +35,31 @@ def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
         yield client
 
 
-def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> None:
-    page = phone.open("/pin")
+@pytest.fixture(scope="module")
+def grey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a picture that fits anywhere."""
+    path = tmp_path_factory.mktemp("pictures") / "grey.jpg"
+    Image.effect_noise((320, 240), 20).convert("RGB").save(path)
+    return path
+
+
+def pin_files(visited: Visit, files: list[Path], expected: int | None = None) -> Page:
+    """Add files to a new album of the shown plan, and wait until it is solved."""
+    page = visited.open("/pin")
     expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
-    damaged = tmp_path / "damaged.jpg"
-    damaged.write_bytes(b"no picture")
-    page.locator("#photo-files").set_input_files([*FILES, damaged])
-    expect(page.locator(".card")).to_have_count(3)
-    expect(page.locator("#problems li")).to_contain_text("damaged.jpg")
+    page.locator("#photo-files").set_input_files(files)
+    expect(page.locator(".card")).to_have_count(len(files) if expected is None else expected)
     expect(page.locator("#pin-state")).to_contain_text("(solved)")
+    return page
+
+
+def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> None:
+    damaged, other = tmp_path / "damaged.jpg", tmp_path / "notes.txt"
+    damaged.write_bytes(b"no picture")
+    other.write_text("hello")
+    page = pin_files(phone, [*FILES, damaged, other], expected=3)
+    expect(page.locator("#problems")).to_contain_text("damaged.jpg: the photograph is not a readable")
+    expect(page.locator("#problems")).to_contain_text("left out: 1")
     expect(page.locator("#plan .pin")).to_have_count(3)
     expect(page.locator(".card img")).to_have_count(3)
     pin = page.locator("#pin-1")
@@ -43,21 +67,176 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
     # By keyboard alone: the pin moves, its arrow turns, and both are undone.
     pin.focus()
     page.keyboard.press("ArrowUp")
-    expect(pin).to_have_class("pin corrected")
+    expect(pin).to_have_class(re.compile("corrected"))
     expect(pin).not_to_have_attribute("transform", before or "")
     page.get_by_role("button", name="Undo").click()
-    expect(pin).not_to_have_class("pin corrected")
+    expect(pin).not_to_have_class(re.compile("corrected"))
     expect(pin).to_have_attribute("transform", before or "")
     page.get_by_role("button", name="Elsewhere").last.click()
     expect(page.locator("#plan .pin")).to_have_count(2)
+    expect(page.locator("#photographs h3", has_text="Set aside (1)")).to_be_visible()
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#plan .pin")).to_have_count(3)
     with page.expect_download() as table:
         page.get_by_role("button", name="CSV").click()
     assert "kitchen.jpg" in Path(table.value.path()).read_text()
     page.locator("#room-filter").select_option(label="kitchen")
-    kitchen = page.locator("#plan .pin").count()
-    assert kitchen < 3
-    assert page.locator(".card").count() == kitchen
+    expect(page.locator("#plan .pin")).to_have_count(1)
+    assert page.locator(".card").count() == 1
     page.locator("#room-filter").select_option("")
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    # The same folder again adds nothing.
+    page.locator("#photo-files").set_input_files(FILES)
+    expect(page.locator("#problems")).to_contain_text("Photographs that the album has already: 3")
+    expect(page.locator(".card")).to_have_count(3)
+
+
+def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -> None:
+    page = pin_files(desktop, [grey, FILES[1]])
+    _assert_accessible(page)
+    card = page.locator(".card", has_text="grey.jpg")
+    if card.locator(".choices").count() == 0:
+        pytest.fail("the picture without content is pinned for sure")
+    suggestion = card.locator(".choices button").nth(1).get_attribute("aria-label") or ""
+    room = suggestion.removeprefix("2: ").rpartition(",")[0]
+    card.focus()
+    page.keyboard.press("2")
+    expect(card).to_contain_text(f"{room}, corrected")
+    # Nothing is left to check, so the focus is on the way back.
+    expect(page.get_by_role("button", name="Undo")).to_be_focused()
+    page.keyboard.press("Control+z")
+    expect(card).not_to_contain_text("corrected")
+    card.focus()
+    page.keyboard.press("0")
+    expect(page.locator("#photographs h3", has_text="Set aside (1)")).to_be_visible()
+    kitchen = page.locator(".card", has_text="kitchen.jpg")
+    kitchen.focus()
+    page.keyboard.press("Enter")
+    expect(kitchen).to_contain_text("kitchen, corrected")
+
+
+def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
+    page = pin_files(desktop, [FILES[1]])
+    pin = page.locator("#pin-1")
+    circle = pin.locator("circle").bounding_box()
+    assert circle is not None
+    before = pin.locator(".arrow").get_attribute("transform") or ""
+    heading, reach = math.radians(float(re.findall(r"[\d.]+", before)[0])), 0.8 * circle["width"]
+    centre = circle["x"] + circle["width"] / 2, circle["y"] + circle["height"] / 2
+    # From the tip to the north.
+    page.mouse.move(centre[0] + reach * math.sin(heading), centre[1] - reach * math.cos(heading))
+    page.mouse.down()
+    page.mouse.move(centre[0], centre[1] - 60, steps=4)
+    page.mouse.up()
+    expect(pin).to_have_class(re.compile("corrected"))
+    turned = pin.locator(".arrow").get_attribute("transform") or ""
+    assert turned != before
+    angle = float(re.findall(r"[\d.]+", turned)[0])
+    assert min(angle, 360.0 - angle) < 3.0
+    place = pin.get_attribute("transform") or ""
+    page.mouse.move(*centre)
+    page.mouse.down()
+    page.mouse.move(centre[0] + 40, centre[1] + 20, steps=4)
+    page.mouse.up()
+    expect(pin).not_to_have_attribute("transform", place)
+    expect(page.locator("#pin-state")).to_contain_text("(solved)")
+    moved = pin.locator("circle").bounding_box()
+    assert moved is not None
+    assert moved["x"] == pytest.approx(circle["x"] + 40, abs=6)
+    expect(pin.locator(".arrow")).to_have_attribute("transform", turned)
+    # Outside of all rooms the pin goes back.
+    place = pin.get_attribute("transform") or ""
+    page.mouse.move(centre[0] + 40, centre[1] + 20)
+    page.mouse.down()
+    page.mouse.move(5, 5, steps=4)
+    page.mouse.up()
+    expect(page.locator("#pin-error")).to_contain_text("lies in no room")
+    expect(pin).to_have_attribute("transform", place)
+
+
+def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, bundle=default_bundle(), request_deadline_s=90.0, sweep_s=0.2) as client:
+        for visited in visit(browser, client, color_scheme="dark", reduced_motion="reduce"):
+            page = visited.open("/pin")
+            page.locator("#photo-files").set_input_files(FILES[:2])
+            expect(page.locator("#pin-state")).to_contain_text("2 photographs wait for it")
+            _assert_accessible(page)
+            page.locator("#plan-file").set_input_files(EXAMPLES / "flat.json")
+            expect(page.locator("#pin-state")).to_contain_text("(solved)")
+            expect(page.locator("#plan .pin")).to_have_count(2)
+            _assert_accessible(page)
+            # The page can be loaded again; previews have stayed in the page before.
+            page.reload()
+            expect(page.locator("#plan .pin")).to_have_count(2)
+            expect(page.locator(".shot.none")).to_have_count(2)
+
+
+def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:
+    rooms = [{**room, "polygon": [[x, y / 2] for x, y in room["polygon"]]} for room in FLAT["rooms"]]
+    squeezed = {key: value for key, value in FLAT.items() if key in ("ceiling_height_m", "camera_height_m")}
+    upper = upload(desktop.client, squeezed | {"name": "Upper", "rooms": rooms})
+    lower = upload(desktop.client, FLAT | {"name": "Lower"})
+    plans = [{"floorplan_id": upper, "level": 1}, {"floorplan_id": lower, "level": 0}]
+    venue = desktop.client.post("/venues", json={"name": "House", "plans": plans}).json()
+    page = desktop.open("/pin")
+    page.locator("#plan-choice").select_option(f"venue:{venue['id']}")
+    expect(page.locator("#level-choice option")).to_have_count(2)
+    page.locator("#photo-files").set_input_files(FILES[1])
+    expect(page.locator("#pin-state")).to_contain_text("(solved)")
+    page.locator("#level-choice").select_option(upper)
+    expect(page.locator("#plan .pin")).to_have_count(0)
+    page.locator(".card").focus()
+    expect(page.locator("#level-choice")).to_have_value(lower)
+    expect(page.locator("#plan .pin.current")).to_have_count(1)
+    desktop.client.delete(f"/venues/{venue['id']}")
+    for plan_id in (upper, lower):
+        desktop.client.delete(f"/floorplans/{plan_id}")
+
+
+def test_photographs_stay_on_the_device(browser: Browser, service: httpx.Client) -> None:
+    with recorded(service) as (wire, through):
+        for visited in visit(browser, through):
+            page = visited.open("/pin")
+            expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
+            page.get_by_label("Keep these photographs on my device").check()
+            page.locator("#photo-files").set_input_files(FILES[1])
+            expect(page.locator("#pin-state")).to_contain_text("(solved)", timeout=SLOW_MS)
+            expect(page.locator(".card")).to_contain_text("kitchen.jpg")
+            expect(page.locator(".card")).to_contain_text("kitchen, ")
+        assert len(wire.bodies()) == 1
+        assert FILES[1].read_bytes()[1000:2000] not in bytes(wire.sent)
+
+
+def test_changed_plan_lists_what_moved(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Changing"})
+    page = pin_files(desktop, FILES[1:2])
+    rooms = [{**room, "polygon": [[x + 5, y] for x, y in room["polygon"]]} for room in FLAT["rooms"]]
+    doors = [{**opening, "line": [[x + 5, y] for x, y in opening["line"]]} for opening in FLAT["openings"]]
+    desktop.client.put(f"/floorplans/{plan_id}", json={**FLAT, "rooms": rooms, "openings": doors}).raise_for_status()
+    # The page looks when it is seen again.
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    expect(page.locator("#moved-list li")).to_have_text(re.compile(r"1 kitchen.jpg: kitchen, 5\.\d m away"))
+    desktop.client.delete(f"/floorplans/{plan_id}")
+
+
+def test_print_has_the_plan_and_a_page_per_room(desktop: Visit, grey: Path) -> None:
+    page = pin_files(desktop, [*FILES, grey])
+    page.locator(".card", has_text="grey.jpg").focus()
+    page.keyboard.press("0")
+    expect(page.locator("#photographs h3", has_text="Set aside (1)")).to_be_visible()
+    document = pypdfium2.PdfDocument(io.BytesIO(page.pdf(format="A4")))
+    texts = [sheet.get_textpage().get_text_range().split("\r\n") for sheet in document]
+    assert (texts[0][0], texts[-1][0]) == ("Pinned flat", "Set aside")
+    assert {text[0] for text in texts[1:-1]} == {"living room", "kitchen", "bedroom"}
+    assert any("kitchen.jpg" in line for text in texts for line in text if text[0] == "kitchen")
+
+
+def test_folders_within_a_folder_are_added(desktop: Visit, tmp_path: Path) -> None:
+    folder = tmp_path / "visit"
+    (folder / "inner").mkdir(parents=True)
+    shutil.copy(FILES[0], folder)
+    shutil.copy(FILES[1], folder / "inner")
+    page = desktop.open("/pin")
+    expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
+    page.locator("#photo-folder").set_input_files(folder)
+    expect(page.locator(".card")).to_have_count(2)

@@ -2,6 +2,7 @@
 
 import { Compass } from "./compass";
 import { byId, h, show } from "./dom";
+import { acceptDrops, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
 import type { Answer, Hints, Together } from "./types";
@@ -39,11 +40,6 @@ const SETTINGS = {
 } as const;
 type Setting = keyof typeof SETTINGS;
 const NAMES = Object.keys(SETTINGS) as Setting[];
-
-const PICTURES = /^image\/(jpeg|png|webp|heic|heif)$/;
-// Some systems do not know the type of phones' files.
-const PHONE_FILES = /\.hei[cf]$/i;
-const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
 
 /** Form of the chosen photograph, and the strip of all photographs. */
 export class Photos {
@@ -260,23 +256,4 @@ export class Photos {
       }),
     );
   }
-}
-
-/** Accept files dropped on an element. */
-export function acceptDrops(target: HTMLElement, take: (files: File[]) => void): void {
-  for (const name of ["dragenter", "dragover"]) {
-    target.addEventListener(name, (event) => {
-      if (!(event as DragEvent).dataTransfer?.types.includes("Files")) return;
-      event.preventDefault();
-      target.classList.add("dropping");
-    });
-  }
-  target.addEventListener("dragleave", (event) => {
-    if (!target.contains((event as DragEvent).relatedTarget as Node | null)) target.classList.remove("dropping");
-  });
-  target.addEventListener("drop", (event) => {
-    event.preventDefault();
-    target.classList.remove("dropping");
-    take([...((event as DragEvent).dataTransfer?.files ?? [])]);
-  });
 }

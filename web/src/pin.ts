@@ -1,31 +1,35 @@
-/** Page at /pin: a plan, a folder of photographs, and a pin for each. */
+/** Page at /pin: a plan or venue, a folder of photographs, and a pin for each. */
 
-import { api, ServiceError } from "./api";
-import { throughCamera } from "./camera";
-import { ARROWS, button, byId, download, followPointer, h, s, show } from "./dom";
+import { api } from "./api";
+import { button, byId, download, h, named, s, show } from "./dom";
+import { acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
-import { degrees, layoutLines, radians } from "./layout";
-import { clearError, say, showError } from "./notices";
-import { acceptDrops } from "./photos";
-import { boxOf, drawNames, drawPlan, lostAreas, path } from "./plan_drawing";
-import { placeOf } from "./pose_marker";
-import { equirectangular } from "./projection";
-import type { Layout, Plan, Point } from "./types";
+import { clearError, InputError, say, showError } from "./notices";
+import { type CardActions, cardOf, movedOf } from "./pin_card";
+import { type Drawn, drawn, keep } from "./pin_drawn";
+import { Floors, type Row } from "./pin_floors";
+import { type PinActions, pinOf } from "./pin_map";
+import { added, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
+import { showPages } from "./pin_print";
+import { plainWords } from "./plain_words";
+import { boxOf, drawNames, drawPlan, lostAreas, unitOf } from "./plan_drawing";
+import type { Plan } from "./types";
 import type { Schemas } from "../../clients/typescript/src/index";
 
-type Row = Schemas["AlbumPhotographAnswer"];
-type Correction = Schemas["CorrectionDocument"];
-type Place = Schemas["PinPlace"];
+type Correction = Partial<Schemas["CorrectionDocument"]>;
 
 const POLL_MS = 700;
-const AT_ONCE = 20;
-const STEP_M = 0.25;
-const TURN_DEG = 15;
-const RADIUS = 0.2;
-const SHOWN = { width: 400, height: 300 };
-const percent = (share: number): string => `${Math.round(100 * share)} %`;
-const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
+const RADIUS = 1.5;
 const FILES = { GeoJSON: "application/geo+json", CSV: "text/csv", SVG: "image/svg+xml" } as const;
+// Groups of the list, by the state of the pins.
+const GROUPS = [
+  ["To check", ["uncertain"]],
+  ["Set aside", ["set_aside"]],
+  ["Pinned", ["sure", "corrected"]],
+  ["Waiting", ["waiting"]],
+] as const;
+
+const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
 
 class PinPage {
   private readonly svg = byId("plan") as unknown as SVGSVGElement;
@@ -34,30 +38,69 @@ class PinPage {
   private readonly pins = s("g");
   private readonly error = byId("pin-error");
   private readonly filter = byId<HTMLSelectElement>("room-filter");
-  private readonly thumbnails = new Map<string, { url: string; width: number; height: number }>();
+  private readonly choice = byId<HTMLSelectElement>("plan-choice");
+  private readonly levels = byId<HTMLSelectElement>("level-choice");
+  private readonly thumbnails = new Map<string, Thumbnail>();
   private readonly done: { id: string; before: Correction | null }[] = [];
-  private plan: Plan | null = null;
-  private layout: Layout | null = null;
-  private album: string | null = null;
+  private readonly floors = new Floors();
+  private readonly cards = new Map<string, Drawn<HTMLElement>>();
+  private readonly drawnPins = new Map<string, Drawn<SVGElement | null>>();
+  private shown: string | null = null;
+  private title = "";
+  private waiting: File[] = [];
+  private album: Schemas["AlbumAnswer"] | null = null;
   private rows: Row[] = [];
-  private polling = false;
+  private polling: Promise<void> | null = null;
 
   async start(): Promise<void> {
     connectKeyDialog();
     this.svg.append(this.base, this.names, this.pins);
-    const choice = byId<HTMLSelectElement>("plan-choice");
-    choice.addEventListener("change", () => void this.guarded(async () => this.take(await api.plan(choice.value))));
+    this.choice.addEventListener("change", () => void this.guarded(() => this.choose(this.choice.value)));
+    this.levels.addEventListener("change", () => void this.guarded(() => this.showPlan(this.levels.value)));
     this.onFiles("plan-file", async ([file]) => this.take(await api.uploadPlan(file!)));
     for (const id of ["photo-files", "photo-folder"]) this.onFiles(id, (files) => this.add(files));
-    acceptDrops(byId("folder"), (files) => void this.guarded(() => this.add(files)));
-    acceptDrops(byId("place"), (files) => void this.guarded(async () => this.take(await api.uploadPlan(files[0]!))));
+    acceptDrops(byId("folder"), (files) => void this.guarded(() => this.addAny(files)));
+    acceptDrops(byId("place"), (files) => void this.guarded(() => this.addAny(files, files.length === 1)));
     this.filter.addEventListener("change", () => this.draw());
     byId("undo").addEventListener("click", () => void this.guarded(() => this.undo()));
-    await this.guarded(async () => {
-      const { floorplans } = await api.plans();
-      show(choice, ...floorplans.map((plan) => h("option", { value: plan.id }, plan.name)));
-      if (floorplans.length > 0) await this.take(await api.plan(floorplans[0]!.id));
+    addEventListener("keydown", (event) => {
+      if (event.key !== "z" || !(event.ctrlKey || event.metaKey) || event.target instanceof HTMLInputElement) return;
+      event.preventDefault();
+      void this.guarded(() => this.undo());
     });
+    // The plan can have been changed in another tab.
+    document.addEventListener("visibilitychange", () => {
+      if (document.visibilityState === "visible") void this.guarded(() => this.refresh());
+    });
+    addEventListener("beforeprint", () => this.fillPages());
+    await this.guarded(() => this.begin());
+  }
+
+  /** List plans and venues; show the album that the address names, or the newest plan. */
+  private async begin(): Promise<void> {
+    const [{ floorplans }, { venues }] = await Promise.all([api.plans(), api.venues()]);
+    const option = (kind: string, id: string, name: string) => h("option", { value: `${kind}:${id}` }, name);
+    const list = (label: string, options: HTMLElement[]) => options.length > 0 && h("optgroup", { label }, ...options);
+    show(
+      this.choice,
+      list(
+        "Plans",
+        floorplans.map((plan) => option("plan", plan.id, plan.name)),
+      ),
+      list(
+        "Venues",
+        venues.map((venue) => option("venue", venue.id, venue.name)),
+      ),
+    );
+    const id = named("album");
+    if (id !== null) {
+      const album = await api.album(id);
+      const place = album.venue_id === null ? `plan:${album.floorplan_id}` : `venue:${album.venue_id}`;
+      await this.choose(place);
+      this.choice.value = place;
+      this.album = album;
+      await this.follow();
+    } else if (floorplans.length > 0) await this.take(await api.plan(floorplans[0]!.id));
   }
 
   private onFiles(id: string, act: (files: File[]) => Promise<void>): void {
@@ -78,79 +121,163 @@ class PinPage {
     }
   }
 
-  /** Show a plan; another plan begins another album. */
+  private async choose(value: string): Promise<void> {
+    const [kind, id] = value.split(":") as [string, string];
+    if (kind === "plan") return this.take(await api.plan(id));
+    const [venue, first] = await Promise.all([api.venue(id), this.floors.takeVenue(id)]);
+    if (first === null) throw new InputError(`The venue ${venue.name} has no plans.`);
+    await this.reset(venue.name, first);
+  }
+
   private async take(plan: Plan): Promise<void> {
-    this.plan = plan;
-    this.layout = await api.layout(plan.id);
+    await this.floors.takePlan(plan);
+    await this.reset(plan.name, plan.id);
+  }
+
+  /** Begin another album in a plan or venue. */
+  private async reset(title: string, planId: string): Promise<void> {
+    this.title = title;
     this.album = null;
     this.rows = [];
+    this.cards.clear();
+    this.drawnPins.clear();
     this.done.length = 0;
-    const box = boxOf(plan.plan, lostAreas(plan));
+    history.replaceState(null, "", location.pathname);
+    show(byId("problems"));
+    show(this.levels, ...this.floors.names.map(([id, name]) => h("option", { value: id }, name)));
+    this.levels.hidden = this.floors.venue === null;
+    byId("pin-state").textContent = "";
+    await this.showPlan(planId);
+    const files = this.waiting.splice(0);
+    if (files.length > 0) await this.add(files);
+  }
+
+  private async showPlan(id: string): Promise<void> {
+    await this.floors.load([id]);
+    const floor = this.floors.get(id);
+    if (floor === null) return;
+    this.shown = id;
+    this.levels.value = id;
+    const lost = lostAreas(floor.plan),
+      box = boxOf(floor.plan.plan, lost);
     this.svg.setAttribute("viewBox", `${box.x} ${box.y} ${box.width} ${box.height}`);
-    drawPlan(this.base, plan.plan, lostAreas(plan));
-    drawNames(this.names, plan.plan, box, lostAreas(plan));
-    const rooms = plan.plan.rooms.map((room, index) =>
-      h("option", { value: this.layout!.rooms[index]!.id }, room.name ?? `Room ${index + 1}`),
+    drawPlan(this.base, floor.plan.plan, lost);
+    drawNames(this.names, floor.plan.plan, box, lost);
+    const rooms = floor.plan.plan.rooms.map((room, index) =>
+      h("option", { value: floor.layout.rooms[index]!.id }, room.name ?? `Room ${index + 1}`),
     );
     show(this.filter, h("option", { value: "" }, "all"), ...rooms);
+    byId<HTMLAnchorElement>("edit-plan").href = `/#plan=${id}`;
+    byId("edit-plan").hidden = false;
     this.draw();
   }
 
-  /** Add files to the album of the plan, a few at a time. */
-  private async add(files: File[]): Promise<void> {
-    if (this.plan === null) throw new Error("Choose or upload a floor plan first.");
-    this.album ??= (await api.createAlbum({ floorplan_id: this.plan.id, name: this.plan.name })).id;
-    const pictures = files.filter((file) => file.size > 0 && !file.name.startsWith("."));
-    for (let first = 0; first < pictures.length; first += AT_ONCE) {
-      const part = pictures.slice(first, first + AT_ONCE);
-      for await (const line of api.addToAlbum(this.album, part)) {
-        const file = part[line.index]!;
-        if (line.photograph) await this.keep(line.photograph.id, file);
-        else byId("problems").append(h("li", {}, `${file.name}: ${line.problem?.detail ?? "not added"}`));
-        byId("pin-state").textContent = `${first + line.index + 1} of ${pictures.length} photographs sent`;
-      }
-      void this.follow();
-    }
+  /** Take a plan, photographs, or both. */
+  private async addAny(files: File[], isPlan = false): Promise<void> {
+    const plans = isPlan ? files : files.filter((file) => !isPicture(file));
+    const pictures = files.filter((file) => !plans.includes(file));
+    if (plans.length === 1) await this.take(await api.uploadPlan(plans[0]!));
+    if (pictures.length > 0 || plans.length > 1) await this.add([...pictures, ...(plans.length > 1 ? plans : [])]);
   }
 
-  private async keep(id: string, file: File): Promise<void> {
-    if (this.thumbnails.has(id)) return;
-    try {
-      const picture = await createImageBitmap(file);
-      this.thumbnails.set(id, { url: URL.createObjectURL(file), width: picture.width, height: picture.height });
-      picture.close();
-    } catch {
-      // A kind of picture that the browser does not show.
+  /** Add files to the album, which is made for the first ones. */
+  private async add(files: File[]): Promise<void> {
+    const { photographs, note } = photographsOf(files);
+    const tell = (text: string): void => byId("problems").append(h("li", {}, text));
+    if (note !== null) tell(note);
+    if (photographs.length === 0) return;
+    if (this.shown === null) {
+      this.waiting.push(...photographs);
+      byId("pin-state").textContent = `Choose or upload a floor plan: ${this.waiting.length} photographs wait for it.`;
+      return;
     }
+    const place = this.floors.venue === null ? { floorplan_id: this.shown } : { venue_id: this.floors.venue };
+    const album = (this.album ??= await api.createAlbum({ ...place, name: this.title } as Schemas["AlbumDocument"]));
+    history.replaceState(null, "", `#album=${album.id}`);
+    const free = Math.max((await api.limits()).max_album_photographs - this.rows.length, 0);
+    if (photographs.length > free)
+      tell(`The album has room for ${free} more photographs, so that ${photographs.length - free} were left out.`);
+    let sent = 0,
+      copies = 0;
+    for await (const { file, line } of added(album.id, photographs.slice(0, free))) {
+      if (typeof line === "string") tell(`${file.name}: ${line}`);
+      else if (!line.photograph) tell(`${file.name}: ${plainWords(line.problem?.detail ?? "not added")}`);
+      else {
+        if (line.status === 200) copies++;
+        const picture = this.thumbnails.has(line.photograph.id) ? null : await thumbnailOf(file);
+        if (picture !== null) this.thumbnails.set(line.photograph.id, picture);
+      }
+      byId("pin-state").textContent = `${++sent} of ${Math.min(photographs.length, free)} photographs read`;
+      if (sent % 5 === 0) void this.guarded(() => this.follow());
+    }
+    if (copies > 0) tell(`Photographs that the album has already: ${copies}`);
+    await this.polling;
+    await this.follow();
   }
 
   /** Read the pins until they are those of the latest change. */
-  private async follow(): Promise<void> {
-    if (this.polling) return;
-    this.polling = true;
-    try {
-      for (let state = "solving"; state === "solving" && this.album !== null;) {
-        const album = await api.album(this.album);
-        state = album.state;
-        this.rows = (await api.albumPhotographs(this.album)).photographs;
-        const sure = this.rows.filter(({ pin }) => pin?.state === "sure" || pin?.state === "corrected").length;
-        const what = state === "failed" ? (album.reason ?? "failed") : state;
-        byId("pin-state").textContent = `${sure} of ${album.photographs} photographs pinned for sure (${what})`;
-        this.draw();
-        if (state === "solving") await wait(POLL_MS);
-      }
-    } catch (failure) {
-      if (failure instanceof ServiceError) showError(this.error, failure);
-      else throw failure;
-    } finally {
-      this.polling = false;
+  private follow(): Promise<void> {
+    return (this.polling ??= this.poll().finally(() => (this.polling = null)));
+  }
+
+  private async poll(): Promise<void> {
+    for (let album = this.album; album !== null && album.id === this.album?.id; await wait(POLL_MS)) {
+      const now = await api.album(album.id);
+      const { photographs } = await api.albumPhotographs(album.id);
+      const places = photographs.flatMap(({ pin }) => [
+        ...(pin?.place ? [pin.place] : []),
+        ...(pin?.suggestions ?? []),
+      ]);
+      await this.floors.load(places.map((place) => place.floorplan_id));
+      if (album.id !== this.album?.id) return;
+      this.album = now;
+      this.rows = photographs;
+      const sure = photographs.filter(({ pin }) => pin?.state === "sure" || pin?.state === "corrected").length;
+      const states = { outdated: "outdated: it can only be read", failed: now.reason ?? "failed" } as Record<
+        string,
+        string
+      >;
+      byId("pin-state").textContent =
+        `${sure} of ${now.photographs} photographs pinned for sure (${states[now.state] ?? now.state})`;
+      this.draw();
+      if (now.state !== "solving") return;
     }
   }
 
-  private async correct(row: Row, correction: Correction | null, isUndo = false): Promise<void> {
+  private async refresh(): Promise<void> {
+    if (!(await this.floors.refresh()) || this.shown === null) return;
+    this.cards.clear();
+    await this.showPlan(this.shown);
+    await this.follow();
+  }
+
+  private readonly actions: CardActions = {
+    choose: (row, { floorplan_id, position, heading_deg }, isKey) =>
+      this.state(row, { floorplan_id, position: { x_m: position.x_m, y_m: position.y_m }, heading_deg }, isKey),
+    elsewhere: (row, isKey) => this.state(row, { elsewhere: true }, isKey),
+    confirm: (row, isKey) => this.state(row, { confirmed: true }, isKey),
+    restore: (row) => this.state(row, null, false),
+    show: (row) => this.mark(row),
+  };
+
+  /** Correct a photograph; by key, go on to the next one. */
+  private state(row: Row, correction: Correction | null, isKey: boolean): void {
+    void this.guarded(async () => {
+      await this.correct(row, correction);
+      if (isKey) (document.querySelector<HTMLElement>("#photographs .uncertain .card") ?? byId("undo")).focus();
+    });
+  }
+
+  private async correct(
+    row: Pick<Row, "id" | "correction">,
+    correction: Correction | null,
+    isUndo = false,
+  ): Promise<void> {
+    if (this.album === null) return;
+    await api.correctPhotograph(this.album.id, row.id, correction as Schemas["CorrectionDocument"] | null);
     if (!isUndo) this.done.push({ id: row.id, before: row.correction });
-    await api.correctPhotograph(this.album!, row.id, correction);
     byId<HTMLButtonElement>("undo").disabled = this.done.length === 0;
+    await this.polling;
     await this.follow();
   }
 
@@ -162,158 +289,102 @@ class PinPage {
     say("Undone.");
   }
 
-  private moveTo(row: Row, [x_m, y_m]: Point, heading_deg: number | null): void {
-    void this.guarded(() => this.correct(row, { position: { x_m, y_m }, heading_deg } as Correction));
-  }
-
   private draw(): void {
     const room = this.filter.value;
-    const shown = this.rows.filter(({ pin }) => room === "" || pin?.place?.room_id === room);
+    const shown = this.rows.filter(
+      ({ pin }) => room === "" || (pin?.place?.room_id === room && pin.place.floorplan_id === this.shown),
+    );
     const focused = document.activeElement?.id;
-    show(this.pins, ...shown.map((row) => this.pinOf(row)));
-    const rank = ({ pin }: Row): number => (pin?.state === "uncertain" ? 0 : pin?.state === "set_aside" ? 1 : 2);
-    const sorted = [...shown].sort((a, b) => rank(a) - rank(b) || a.number - b.number);
-    show(byId("photographs"), ...sorted.map((row) => this.card(row)));
-    if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
-    byId("exports").hidden = this.rows.length === 0;
+    keep(
+      this.pins,
+      this.shown === null ? [] : this.pinsOf(shown, this.shown, { move: this.move, show: this.actions.show }),
+    );
+    const groups = GROUPS.map(([title, states]) => {
+      const own = shown.filter(({ pin }) => (states as readonly string[]).includes(pin?.state ?? "waiting"));
+      return (
+        own.length > 0 && [h("h3", {}, `${title} (${own.length})`), h("ul", {}, ...own.map((row) => this.card(row)))]
+      );
+    });
+    show(byId("photographs"), ...groups.flatMap((group) => group || []));
+    if (focused && document.activeElement?.id !== focused)
+      document.getElementById(focused)?.focus({ preventScroll: true });
+    const moved = this.rows.map(movedOf).filter((text) => text !== null);
+    byId("moved").hidden = moved.length === 0;
+    show(byId("moved-list"), ...moved.map((text) => h("li", {}, text)));
+    byId("keys").hidden = this.rows.length === 0;
+    this.drawExports();
+  }
+
+  private drawExports(): void {
+    const place = byId("exports");
+    place.hidden = this.rows.length === 0;
+    if (place.childElementCount > 0) return;
+    const plan = (): string | undefined => (this.floors.venue === null ? undefined : (this.shown ?? undefined));
+    const save = async (name: string, media: (typeof FILES)[keyof typeof FILES]): Promise<void> => {
+      const file = await api.albumFile(this.album!.id, media, media === FILES.SVG ? plan() : undefined);
+      download(file, `pins.${name.toLowerCase()}`);
+    };
     const kinds = Object.entries(FILES).map(([name, media]) =>
-      button(name, () => {
-        void this.guarded(async () => download(await api.albumFile(this.album!, media), `pins.${name.toLowerCase()}`));
-      }),
+      button(name, () => void this.guarded(() => save(name, media))),
     );
     show(
-      byId("exports"),
+      place,
       ...kinds,
       button("Print", () => print()),
     );
   }
 
-  /** Return the pin of a photograph: drag it, or move it by arrow keys; Page Up and Page Down turn its arrow. */
-  private pinOf(row: Row): SVGElement | null {
-    const place = row.pin?.place;
-    if (!place || place.floorplan_id !== this.plan?.id) return null;
-    const { x_m, y_m } = place.position;
-    const heading = place.heading_deg;
-    const tip = `M${-0.8 * RADIUS} ${-0.7 * RADIUS}L0 ${-2.6 * RADIUS}L${0.8 * RADIUS} ${-0.7 * RADIUS}Z`;
-    const arrow = heading === null ? null : s("path", { d: tip, transform: `rotate(${heading})` });
-    const label = `Photograph ${row.number}, ${place.room}, ${row.pin!.state}, ${percent(row.pin!.confidence)}`;
-    const pin = s(
-      "g",
-      { class: `pin ${row.pin!.state}`, id: `pin-${row.number}`, tabindex: 0, role: "button", "aria-label": label },
-      arrow,
-      s("circle", { r: RADIUS }),
-      s("text", { y: 0.08 }, row.number),
+  /** Return the pins in a plan; without actions, for paper. */
+  private pinsOf(rows: Row[], planId: string, act: PinActions | null = null): SVGElement[] {
+    const floor = this.floors.get(planId);
+    if (floor === null) return [];
+    const radius = RADIUS * unitOf(boxOf(floor.plan.plan));
+    const make = (row: Row) => pinOf(row, radius, this.svg, act);
+    const own = rows.filter(({ pin }) => pin?.place?.floorplan_id === planId);
+    const pins = own.map((row) =>
+      act === null ? make(row) : drawn(this.drawnPins, row.id, [row.pin, radius], () => make(row)),
     );
-    const put = ([x, y]: Point): void => pin.setAttribute("transform", `translate(${x} ${-y})`);
-    put([x_m, y_m]);
-    pin.addEventListener("pointerdown", (event) => {
-      let target: Point | null = null;
-      followPointer((moved) => put((target = placeOf(this.svg, moved))));
-      addEventListener("pointerup", () => target && this.moveTo(row, target, heading), { once: true });
-      event.preventDefault();
-      pin.focus();
-    });
-    pin.addEventListener("keydown", (event) => {
-      const step = ARROWS[event.key];
-      if (step) this.moveTo(row, [x_m + STEP_M * step[0], y_m + STEP_M * step[1]], heading);
-      else if (event.key === "PageUp" || event.key === "PageDown")
-        this.moveTo(row, [x_m, y_m], ((heading ?? 0) + (event.key === "PageUp" ? TURN_DEG : 360 - TURN_DEG)) % 360);
-      else return;
-      event.preventDefault();
-    });
-    return pin;
+    return pins.filter((pin) => pin !== null);
   }
+
+  private readonly move = (row: Row, [x_m, y_m]: [number, number], heading_deg: number | null): void => {
+    const floorplan_id = this.shown!;
+    void this.guarded(async () => {
+      try {
+        await this.correct(row, { position: { x_m, y_m }, heading_deg, floorplan_id } as Correction);
+      } catch (failure) {
+        // Back to where it was.
+        this.drawnPins.delete(row.id);
+        this.draw();
+        throw failure;
+      }
+    });
+  };
 
   private card(row: Row): HTMLElement {
-    const { pin } = row;
-    const facts =
-      pin === null
-        ? "waiting"
-        : `${pin.place?.room ?? "no room"}, ${percent(pin.confidence)}${pin.reason && `: ${pin.reason}`}`;
-    const choices = pin === null || pin.state === "corrected" ? [] : pin.suggestions;
-    return h(
-      "li",
-      { class: `card ${pin?.state ?? ""}` },
-      this.shot(row, pin?.place ?? null),
-      h(
-        "div",
-        {},
-        h("strong", { class: "name" }, `${row.number} ${row.name ?? ""}`),
-        h("p", {}, facts),
-        h("p", { class: "hint" }, row.view.taken_at),
-      ),
-      h(
-        "div",
-        { class: "choices" },
-        ...choices.map((place, index) => {
-          const choose = (): void => this.moveTo(row, [place.position.x_m, place.position.y_m], place.heading_deg);
-          const label = `Photograph ${row.number}: ${place.room}, ${percent(place.probability)}`;
-          const key = h("button", {
-            type: "button",
-            id: `choice-${row.number}-${index}`,
-            "aria-label": label,
-            onclick: choose,
-          });
-          key.append(this.smallPlan(place), `${place.room} ${percent(place.probability)}`);
-          return key;
-        }),
-        pin !== null &&
-          pin.state !== "corrected" &&
-          button("Elsewhere", () => void this.guarded(() => this.correct(row, { elsewhere: true } as Correction)), {
-            id: `elsewhere-${row.number}`,
-          }),
-        row.correction !== null &&
-          button("Remove the correction", () => void this.guarded(() => this.correct(row, null))),
-      ),
+    const picture = this.thumbnails.get(row.id) ?? null;
+    const height = this.album?.solution?.camera_height_m ?? null;
+    return drawn(this.cards, row.id, [row.revision, row.pin, picture?.url, height], () =>
+      cardOf(row, picture, this.floors, height, this.actions),
     );
   }
 
-  /** Return the thumbnail with the walls of a place drawn over it. */
-  private shot(row: Row, place: Place | null): HTMLElement {
-    const picture = this.thumbnails.get(row.id);
-    if (!picture) return h("div", { class: "shot" });
-    const size = { width: SHOWN.width, height: (SHOWN.width * picture.height) / picture.width };
-    const over = s("svg", { viewBox: `0 0 ${size.width} ${size.height}`, "aria-hidden": true });
-    const room = this.layout?.rooms.find(({ id }) => id === place?.room_id);
-    if (place && room && place.heading_deg !== null) {
-      const turn = radians(place.heading_deg!);
-      const height = this.plan?.plan.camera_height_m ?? 1.5;
-      const lines = layoutLines(place.position.x_m, place.position.y_m, room, height).map(({ points }) =>
-        points.map(([azimuth, elevation]): Point => [
-          radians(((degrees(azimuth - turn) + 540) % 360) - 180),
-          elevation,
-        ]),
-      );
-      const drawn =
-        row.view.projection === "equirectangular" ? equirectangular(lines, size) : throughCamera(lines, row.view, size);
-      over.append(s("path", { d: drawn.map((line) => `M${line.map((point) => point.join(" ")).join("L")}`).join("") }));
-    }
-    return h(
-      "div",
-      { class: "shot" },
-      h("img", { src: picture.url, alt: row.name ?? `Photograph ${row.number}` }),
-      over,
-    );
+  /** Show the plan of a photograph, and mark its pin and card. */
+  private mark(row: Row): void {
+    const planId = row.pin?.place?.floorplan_id;
+    const marked = (): void => {
+      for (const element of document.querySelectorAll(".current")) element.classList.remove("current");
+      for (const id of [`pin-${row.number}`, `card-${row.number}`])
+        document.getElementById(id)?.classList.add("current");
+    };
+    if (planId && planId !== this.shown && this.filter.value === "") void this.showPlan(planId).then(marked);
+    else marked();
   }
 
-  private smallPlan(place: Place): SVGElement {
-    const box = boxOf(this.plan!.plan);
-    return s(
-      "svg",
-      { viewBox: `${box.x} ${box.y} ${box.width} ${box.height}`, "aria-hidden": true },
-      s("path", {
-        class: "solid",
-        d: this.plan!.plan.rooms.map((room) => path(room.polygon)).join(""),
-        fill: "none",
-        "stroke-width": 0.1,
-      }),
-      s("circle", {
-        class: "spot",
-        cx: place.position.x_m,
-        cy: -place.position.y_m,
-        r: 0.05 * Math.max(box.width, box.height),
-      }),
-    );
+  private fillPages(): void {
+    const height = this.album?.solution?.camera_height_m ?? null;
+    const pins = (rows: Row[], planId: string): SVGElement[] => this.pinsOf(rows, planId);
+    showPages(byId("pages"), this.title, this.rows, this.floors, this.thumbnails, height, pins);
   }
 }
 

@@ -2,11 +2,11 @@
 
 import { api, ServiceError } from "./api";
 import { button, byId, h, show } from "./dom";
+import { acceptDrops } from "./drops";
 import { followPlan } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
-import { acceptDrops } from "./photos";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */

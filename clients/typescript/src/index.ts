@@ -231,7 +231,12 @@ function query(fields: object, ...pictures: Picture[]): { method: string; body: 
   const { method, body } = form(fields, "photo");
   for (const picture of pictures) {
     if (picture instanceof Blob) body.append("photo", picture);
-    else body.append("features", picture.features, "photo.features");
+    else
+      body.append(
+        "features",
+        picture.features,
+        picture.features instanceof File ? picture.features.name : "photo.features",
+      );
   }
   return { method, body };
 }

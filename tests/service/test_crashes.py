@@ -1,7 +1,10 @@
-"""Sessions of a service that is killed: real processes, on SQLite and PostgreSQL."""
+"""Sessions and albums of a service that is killed: real processes, on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 import os
 import random
 import signal
@@ -9,11 +12,16 @@ import threading
 from functools import partial
 from pathlib import Path
 from time import sleep
+from typing import Any
 
 import httpx
 import pytest
+from PIL import Image
 
+from lalaloc_core.bundle import default_bundle
 from service.storage.store import Store
+from tests.core.taken import EXAMPLES
+from tests.service import test_albums as albums
 from tests.service.conftest import upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_sessions import begin, send
@@ -115,4 +123,75 @@ def test_session_survives_kills_at_any_moment(
     # What the quota counts is what is stored.
     used = store.quota.account("default").used.sessions
     assert used >= len(record.state or b"") + len(record.pose or "")
+    store.close()
+
+
+def small_pictures(count: int) -> list[bytes]:
+    """Return different pictures of the example rooms."""
+    names, found = ("kitchen", "bedroom", "study", "living_room"), []
+    for number in range(count):
+        buffer = io.BytesIO()
+        with Image.open(EXAMPLES / f"{names[number % len(names)]}.jpg") as picture:
+            picture.resize((512 + 2 * (number // len(names)), 256)).save(buffer, "JPEG", quality=90)
+        found.append(buffer.getvalue())
+    return found
+
+
+@pytest.mark.slow
+def test_album_keeps_everything_acknowledged_before_kills(tmp_path: Path, settings: dict[str, str]) -> None:
+    rng, pictures, album_id = random.Random(7), small_pictures(12), ""
+    stored: dict[str, str] = {}
+    corrected: dict[str, Any] = {}
+    options = settings | {"GRID_LEASE_S": "2", "SWEEP_S": "0.5"}
+
+    def check(client: httpx.Client) -> list[dict[str, Any]]:
+        rows = albums.photographs(client, album_id)
+        ids = {row["sha256"]: row["id"] for row in rows}
+        assert stored.items() <= ids.items()
+        assert len(ids) == len(rows) == client.get(f"/albums/{album_id}").json()["photographs"]
+        assert [row["number"] for row in rows] == list(range(1, len(rows) + 1))
+        for row in rows:
+            if row["id"] in corrected:
+                assert row["correction"]["position"] == corrected[row["id"]]["position"]
+        return rows
+
+    def send(client: httpx.Client) -> None:
+        """Send all pictures, and correct those that are acknowledged, until the service dies."""
+        parts = [("photo", (f"{number}.jpg", content)) for number, content in enumerate(pictures)]
+        with client.stream("POST", f"/albums/{album_id}/photographs", files=parts) as response:
+            for text in response.iter_lines():
+                line = json.loads(text)
+                # A photograph whose answer was lost can be stored already.
+                assert line["status"] == 200 or line["photograph"]["sha256"] not in stored, text
+                stored[line["photograph"]["sha256"]] = line["photograph"]["id"]
+        for number, id in enumerate(stored.values()):
+            correction = {"position": {"x_m": 1.0 + 0.1 * number, "y_m": 2.0}}
+            if albums.correct(client, album_id, id, correction).status_code == 200:
+                corrected[id] = correction
+
+    for longest_s in (1.0, 2.0, 4.0, 6.0):
+        with running_service(default_bundle(), tmp_path / "data", **options) as service:
+            if not album_id:
+                album_id = albums.create(service.client, upload(service.client, albums.HOME))
+            check(service.client)
+            killer = threading.Timer(rng.uniform(0.3, 1.0) * longest_s, service.process.kill)
+            killer.start()
+            try:
+                while True:
+                    send(service.client)
+            except httpx.TransportError:
+                killer.join()
+            service.process.wait(60.0)
+    assert stored
+    with running_service(default_bundle(), tmp_path / "data", **options) as service:
+        # An album that a killed process solved is taken over when its lease ends.
+        send(service.client)
+        assert stored.keys() == {hashlib.sha256(picture).hexdigest() for picture in pictures}
+        albums.wait_until_solved(service.client, album_id)
+        assert {row["pin"]["state"] for row in check(service.client)} == {"corrected"}
+        assert not service.client.get(f"/albums/{album_id}").json()["reason"]
+    store = Store(database_of(settings, tmp_path))
+    used = store.quota.account("default").used.albums
+    store.quota.recount()
+    assert store.quota.account("default").used.albums == used > 0
     store.close()

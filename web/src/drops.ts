@@ -1,0 +1,44 @@
+/** Files and folders that are dropped on the page. */
+
+const PICTURES = /^image\/(jpeg|png|webp|heic|heif)$/;
+// Some systems do not know the type of phones' files.
+const PHONE_FILES = /\.hei[cf]$/i;
+
+/** Return true for a file that can be a photograph. */
+export const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
+
+/** Accept files, and the files of folders, dropped on an element. */
+export function acceptDrops(target: HTMLElement, take: (files: File[]) => void): void {
+  for (const name of ["dragenter", "dragover"]) {
+    target.addEventListener(name, (event) => {
+      if (!(event as DragEvent).dataTransfer?.types.includes("Files")) return;
+      event.preventDefault();
+      target.classList.add("dropping");
+    });
+  }
+  target.addEventListener("dragleave", (event) => {
+    if (!target.contains((event as DragEvent).relatedTarget as Node | null)) target.classList.remove("dropping");
+  });
+  target.addEventListener("drop", (event) => {
+    event.preventDefault();
+    target.classList.remove("dropping");
+    const transfer = (event as DragEvent).dataTransfer;
+    // Entries are only known while the event is handled.
+    const entries = [...(transfer?.items ?? [])].map((item) => item.webkitGetAsEntry?.() ?? null);
+    if (entries.some((entry) => entry?.isDirectory))
+      void Promise.all(entries.map((entry) => (entry === null ? [] : filesOf(entry)))).then((all) => take(all.flat()));
+    else take([...(transfer?.files ?? [])]);
+  });
+}
+
+async function filesOf(entry: FileSystemEntry): Promise<File[]> {
+  if (entry.isFile) return [await new Promise<File>((done, fail) => (entry as FileSystemFileEntry).file(done, fail))];
+  const reader = (entry as FileSystemDirectoryEntry).createReader(),
+    files: File[] = [];
+  for (;;) {
+    // A reader gives a part of the entries at a time.
+    const entries = await new Promise<FileSystemEntry[]>((done, fail) => reader.readEntries(done, fail));
+    if (entries.length === 0) return files;
+    for (const each of entries) files.push(...(await filesOf(each)));
+  }
+}

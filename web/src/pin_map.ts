@@ -1,0 +1,81 @@
+/** Pins on the plan: dragged or moved by arrow keys; arrows are turned at their tips or by Page Up and Page Down. */
+
+import { ARROWS, followPointer, s } from "./dom";
+import { degrees } from "./layout";
+import { percent } from "./pin_card";
+import type { Row } from "./pin_floors";
+import { placeOf } from "./pose_marker";
+import type { Point } from "./types";
+
+const STEP_M = 0.25;
+const TURN_DEG = 15;
+
+export interface PinActions {
+  move(row: Row, position: Point, heading_deg: number | null): void;
+  /** The pin has got the focus. */
+  show(row: Row): void;
+}
+
+/** Return the pin of a photograph with a radius (m); without actions, for paper. */
+export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActions | null): SVGElement | null {
+  const place = row.pin?.place;
+  if (!place) return null;
+  const { x_m, y_m } = place.position,
+    heading = place.heading_deg;
+  const tip = `M${-0.8 * radius} ${-0.7 * radius}L0 ${-2.4 * radius}L${0.8 * radius} ${-0.7 * radius}Z`;
+  const arrow = heading === null ? null : s("path", { class: "arrow", d: tip, transform: `rotate(${heading})` });
+  const label = `Photograph ${row.number}, ${place.room}, ${row.pin!.state}, ${percent(row.pin!.confidence)}`;
+  const roles = act === null ? {} : { id: `pin-${row.number}`, tabindex: 0, role: "button", "aria-label": label };
+  const pin = s(
+    "g",
+    { class: `pin ${row.pin!.state}`, ...roles },
+    arrow,
+    s("circle", { r: radius, "stroke-width": 0.3 * radius }),
+    s("text", { y: 0.38 * radius, "font-size": (row.number < 100 ? 1.1 : 0.8) * radius }, row.number),
+  );
+  const put = ([x, y]: Point): void => pin.setAttribute("transform", `translate(${x} ${-y})`);
+  put([x_m, y_m]);
+  if (act === null) return pin;
+  const follow = (begin: PointerEvent, moved: (at: Point) => void, done: () => void): void => {
+    begin.preventDefault();
+    begin.stopPropagation();
+    pin.focus();
+    followPointer((event) => moved(placeOf(svg, event)));
+    const end = (): void => {
+      removeEventListener("pointerup", end);
+      removeEventListener("pointercancel", end);
+      done();
+    };
+    addEventListener("pointerup", end);
+    addEventListener("pointercancel", end);
+  };
+  pin.addEventListener("pointerdown", (event) => {
+    let target: Point | null = null;
+    follow(
+      event,
+      (at) => put((target = at)),
+      () => target && act.move(row, target, heading),
+    );
+  });
+  arrow?.addEventListener("pointerdown", (event) => {
+    let turned: number | null = null;
+    follow(
+      event as PointerEvent,
+      ([x, y]) => {
+        turned = (degrees(Math.atan2(x - x_m, y - y_m)) + 360) % 360;
+        arrow.setAttribute("transform", `rotate(${turned})`);
+      },
+      () => turned !== null && act.move(row, [x_m, y_m], turned),
+    );
+  });
+  pin.addEventListener("keydown", (event) => {
+    const step = ARROWS[event.key];
+    if (step) act.move(row, [x_m + STEP_M * step[0], y_m + STEP_M * step[1]], heading);
+    else if (event.key === "PageUp" || event.key === "PageDown")
+      act.move(row, [x_m, y_m], ((heading ?? 0) + (event.key === "PageUp" ? TURN_DEG : 360 - TURN_DEG)) % 360);
+    else return;
+    event.preventDefault();
+  });
+  pin.addEventListener("focus", () => act.show(row));
+  return pin;
+}

@@ -1,0 +1,103 @@
+/** Photographs of a folder: those that are sent, in portions, and their thumbnails, which stay in the browser. */
+
+import type { Picture, Schemas } from "../../clients/typescript/src/index";
+import { api } from "./api";
+import { device } from "./device/device";
+import { h } from "./dom";
+import { isPicture } from "./drops";
+import { InputError } from "./notices";
+
+export interface Thumbnail {
+  url: string;
+  /** Height by width. */
+  shape: number;
+}
+
+type Line = Schemas["AlbumLine"];
+
+const WIDTH = 480;
+const AT_ONCE = 20;
+const PORTION_BYTES = 60e6;
+// Photographs that a busy service refuses are sent again.
+const ATTEMPTS = 4;
+const MAX_WAIT_S = 30;
+
+/** Return the photographs among some files in the order of their names, and a sentence on the others. */
+export function photographsOf(files: File[]): { photographs: File[]; note: string | null } {
+  const seen = files.filter((file) => !file.name.startsWith("."));
+  const photographs = seen.filter((file) => isPicture(file));
+  photographs.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
+  const others = seen.length - photographs.length;
+  const note = others === 0 ? null : `Files that are no JPEG, PNG, WebP or HEIC, which are left out: ${others}`;
+  return { photographs, note };
+}
+
+/** Add photographs to an album; yield each with its line, or with the reason why there is none. */
+export async function* added(album: string, files: File[]): AsyncGenerator<{ file: File; line: Line | string }> {
+  await device.start();
+  if (device.isOn) {
+    for (const file of files) yield { file, line: await fromDevice(album, file) };
+    return;
+  }
+  let left = files;
+  for (let attempt = 1; left.length > 0; attempt++) {
+    const busy: File[] = [];
+    let waitS = 0;
+    for (const part of portions(left)) {
+      for await (const line of api.addToAlbum(album, part)) {
+        const retryS = line.retry_after_s ?? null;
+        if (retryS === null || attempt === ATTEMPTS) yield { file: part[line.index]!, line };
+        else {
+          busy.push(part[line.index]!);
+          waitS = Math.max(waitS, retryS);
+        }
+      }
+    }
+    if (busy.length > 0) await new Promise((done) => setTimeout(done, 1000 * Math.min(waitS, MAX_WAIT_S)));
+    left = busy;
+  }
+}
+
+function* portions(files: File[]): Generator<File[]> {
+  for (let part: File[] = [], bytes = 0, index = 0; index <= files.length; index++) {
+    const file = files[index];
+    if (part.length > 0 && (!file || part.length === AT_ONCE || bytes + file.size > PORTION_BYTES)) {
+      yield part;
+      part = [];
+      bytes = 0;
+    }
+    if (file) {
+      part.push(file);
+      bytes += file.size;
+    }
+  }
+}
+
+/** Send the features of a photograph, and the name of its file. */
+async function fromDevice(album: string, file: File): Promise<Line | string> {
+  const named = (picture: Picture): Picture =>
+    "features" in picture ? { features: new File([picture.features], file.name) } : picture;
+  try {
+    return await device.send([file], {}, async ([picture]) => {
+      for await (const line of api.addToAlbum(album, [named(picture!)])) return line;
+      return "not added";
+    });
+  } catch (failure) {
+    if (failure instanceof InputError) return failure.message;
+    throw failure;
+  }
+}
+
+/** Return a small copy of a picture; null for kinds that the browser does not show. */
+export async function thumbnailOf(file: File): Promise<Thumbnail | null> {
+  try {
+    const picture = await createImageBitmap(file, { resizeWidth: WIDTH, resizeQuality: "medium" });
+    const canvas = h("canvas", { width: picture.width, height: picture.height });
+    canvas.getContext("2d")!.drawImage(picture, 0, 0);
+    picture.close();
+    const content = await new Promise<Blob | null>((done) => canvas.toBlob(done, "image/jpeg", 0.85));
+    return content && { url: URL.createObjectURL(content), shape: canvas.height / canvas.width };
+  } catch {
+    return null;
+  }
+}
