@@ -103,6 +103,7 @@ def judged_turn(found: SequenceLocalisation, joint: Localisation) -> SequenceLoc
     pictures = [
         replace(
             picture,
+            query=replace(picture.query, is_turn=True),
             posterior=_judged(picture, joint.posterior),
             signals={picture.stage: joint.signals[joint.stage]},
             linked_fit=0.0,
