@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-Y5OS2IJ7.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,b}from"./chunk-2ETW2KNK.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};

@@ -102,8 +102,9 @@ class _Visit:
         if confidence is None or confidence.position >= CONFIDENT:
             return []
         arcs, field = [self.photograph.azimuths], self.photograph.hfov.value
-        known = known_of(self.found, confidence, arcs=arcs, field=field)
-        return next_steps(self.shot.home.plan, self.model.bundle.manifest, known, step_m=self.grid.step_m)
+        manifest = self.model.bundle.manifest
+        known = known_of(self.found, confidence, manifest, arcs=arcs, field=field)
+        return next_steps(self.shot.home.plan, manifest, known, step_m=self.grid.step_m)
 
     def row(self, step: NextStep, *, best: bool) -> _Row:
         """Carry a step out."""
@@ -166,7 +167,7 @@ class _Visit:
         return localise(plan, self.grid, self.model.encoder, query, refiner=self.model.refiner, hints=hints)
 
     def _confidence(self, found: Localisation) -> Confidence | None:
-        return found.confidence(self.model.bundle.manifest.confidence_for(view=True))
+        return found.confidence(self.model.bundle.manifest.confidence_for(view=True, turn=found.query.is_turn))
 
     def _outcome(self, found: Localisation) -> tuple[float, float]:
         confidence = self._confidence(found)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -37,12 +38,16 @@ from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise
-from lalaloc_core.photograph import StatedCamera
+from lalaloc_core.photograph import StatedCamera, open_photograph
 
 _SPLIT = SPLIT_NUMBERS["validation"]
+# Phones, and the share of upright ones; their pixels are finer than those that the encoder reads.
+_UPRIGHT, _LYING = Phone(width=360, height=480), Phone(width=480, height=360, hfov_deg=67.0)
+_UPRIGHT_SHARE = 0.7
 # Photographs once around, and the fewest of a part of a turn.
 _PHOTOGRAPHS, _FEWEST = 12, 3
 # Spots of a home, and standard deviation of the relative headings.
@@ -92,42 +97,53 @@ def calibrate_turns(folder: Path, settings: TurnSettings) -> Bundle:
         InvalidInputError: the bundle has no encoder of views.
     """
     bundle = Bundle.open(folder)
-    view = bundle.manifest.view
-    if view is None:
+    if bundle.manifest.view is None:
         raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --turns")
-    found = turn_predictions(bundle, settings)
-    metrics = dict(bundle.manifest.metrics)
+    return store_turn_confidence(bundle, turn_predictions(bundle, settings))
+
+
+def store_turn_confidence(bundle: Bundle, found: TurnPredictions) -> Bundle:
+    """Fit the confidence of turns on predictions, and store it in the bundle's manifest with validation figures."""
+    view, metrics = bundle.manifest.view, dict(bundle.manifest.metrics)
+    assert view is not None, "the bundle has no encoder of views"
+    homes = len({prediction.scene for prediction in found.searched.own})
     metrics["turn_validation_queries"] = (
-        f"{len(found.searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in "
-        f"{settings.homes} generated validation homes, with an arm of {Phone().arm_m:g} m; confidence besides on the "
-        f"same disturbed, and on {len(found.searched.mismatched)} turns in other buildings"
+        f"{len(found.searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in {homes} generated "
+        f"validation homes, with an arm of {_UPRIGHT.arm_m:g} m; confidence besides on the same disturbed, and on "
+        f"{len(found.searched.mismatched)} turns in other buildings"
     )
     for name, answers in (("turn_validation", found.known), ("turn_validation_heading_searched", found.searched)):
         metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
         metrics[f"{name}_confidence"] = cross_validate(answers)
     view = replace(view, turn_confidence=fit_confidence(found.known, found.searched))
-    return write_manifest(folder, replace(bundle.manifest, view=view, metrics=metrics))
+    return write_manifest(bundle.folder, replace(bundle.manifest, view=view, metrics=metrics))
 
 
 def turn_predictions(bundle: Bundle, settings: TurnSettings) -> TurnPredictions:
     """Localise turns in their own plans, disturbed, and in plans of other buildings."""
     model = LocalModel(bundle)
-    lists: dict[bool, dict[str, list[Prediction]]] = {
-        known: {"own": [], "disturbed": [], "mismatched": []} for known in (True, False)
-    }
+    lists: dict[bool, dict[str, list[Prediction]]] = {known: defaultdict(list) for known in (True, False)}
     for index in tqdm(range(settings.homes), desc="turns of homes", disable=None, leave=False):
-        scene, other = f"home-{index:05d}", _other_plan(settings, index)
-        for number, taken in enumerate(_turns_of_home(settings, index)):
-            rng = np.random.default_rng([settings.seed, index, number])
-            plan = taken.shot.home.plan
-            own, disturbed = _Turn(model, taken, rng), _Turn(model, _disturbed(taken, rng), rng)
-            factor = math.exp(rng.normal(0.0, _LENGTH_ERROR))
-            worse = without_openings(plan) if index % _PER_UNOPENED_HOME == 0 else plan
-            for known, parts in lists.items():
-                parts["own"].append(own.located(plan, scene, number, known=known))
-                parts["disturbed"].append(disturbed.located(worse, scene, number, known=known, height_factor=factor))
-                parts["mismatched"].append(own.located(other, scene, number, known=known))
+        for known, part, prediction in _predictions(model, settings, index):
+            lists[known][part].append(prediction)
     return TurnPredictions(*(Answers(**lists[known]) for known in (True, False)))
+
+
+def _predictions(
+    model: LocalModel, settings: TurnSettings, index: int
+) -> Iterator[tuple[bool, Literal["own", "disturbed", "mismatched"], Prediction]]:
+    """Yield the predictions for the turns of a home: whether the heading is known, and the list that they belong to."""
+    scene, other = f"home-{index:05d}", _other_plan(settings, index)
+    for number, taken in enumerate(_turns_of_home(settings, index)):
+        rng = np.random.default_rng([settings.seed, index, number])
+        plan = taken.shot.home.plan
+        own, disturbed = _Turn(model, taken), _Turn(model, _disturbed(taken, rng))
+        factor = math.exp(rng.normal(0.0, _LENGTH_ERROR))
+        worse = without_openings(plan) if index % _PER_UNOPENED_HOME == 0 else plan
+        for known in (True, False):
+            yield known, "own", own.located(plan, scene, number, known=known)
+            yield known, "disturbed", disturbed.located(worse, scene, number, known=known, height_factor=factor)
+            yield known, "mismatched", own.located(other, scene, number, known=known)
 
 
 def _other_plan(settings: TurnSettings, index: int) -> FloorPlan:
@@ -144,7 +160,7 @@ def _turns_of_home(settings: TurnSettings, index: int) -> Iterator[_Taken]:
     home, rng = home_of(_SPLIT, settings.seed, index)
     renderers = split_renderer_cache(_SPLIT, settings.seed, settings.textures)
     for shot in sample_shots(home, _SPOTS, rng):
-        phone = Phone() if rng.random() < 0.7 else Phone(width=640, height=480, hfov_deg=67.0)
+        phone = _UPRIGHT if rng.random() < _UPRIGHT_SHARE else _LYING
         frames = photographs_of_turn(shot, renderers, phone, _PHOTOGRAPHS, rng)
         turns = [float(wrap_angle(frame.heading - shot.heading)) for frame in frames]
         turns = [turns[0], *(turn + rng.normal(0.0, _ANGLE_SD) for turn in turns[1:])]
@@ -163,13 +179,23 @@ def _disturbed(taken: _Taken, rng: np.random.Generator) -> _Taken:
 
 
 class _Turn:
-    """A turn, encoded when it is first needed."""
+    """A turn whose photographs were read."""
 
-    def __init__(self, model: LocalModel, taken: _Taken, rng: np.random.Generator) -> None:
+    def __init__(self, model: LocalModel, taken: _Taken) -> None:
         """Read the photographs."""
         self._model, self._taken = model, taken
-        stated = StatedCamera(projection="perspective", hfov_deg=taken.phone.hfov_deg)
-        self._photographs = [model.open(encode_jpeg(picture), stated) for picture in taken.pictures]
+        manifest = model.bundle.manifest
+        self._photographs = [
+            open_photograph(
+                encode_jpeg(picture),
+                sphere_size=sphere_size(manifest),
+                stated=StatedCamera(projection="perspective", hfov_deg=taken.phone.hfov_deg),
+                patch_size=patch_size(manifest),
+                # Disturbed renderings of white walls are as pale as paper.
+                refuse_drawings=False,
+            )
+            for picture in taken.pictures
+        ]
 
     def located(
         self, plan: FloorPlan, scene: str, number: int, *, known: bool, height_factor: float = 1.0

@@ -20,9 +20,10 @@ from lalaloc_core.learn.synth.rendering.panorama import Window
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot
 from lalaloc_core.photograph.cameras import Perspective
 
-# Parts of the sphere that are rendered for a photograph and for a frame of a film, with room for tilts; their sizes.
+# Parts of the sphere that are rendered for a picture, with room for tilts, and their sizes: a finer one, and one for
+# cameras of at most so many pixels a radian.
 _WINDOW, _WINDOW_SIZE = Window(math.radians(100.0), math.radians(56.0)), (1008, 900)
-_FILM_WINDOW, _FILM_WINDOW_SIZE = Window(math.radians(75.0), math.radians(50.0)), (650, 488)
+_COARSE_WINDOW, _COARSE_WINDOW_SIZE, _COARSE = Window(math.radians(75.0), math.radians(50.0)), (650, 488), 370.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +77,7 @@ def _frames(
 ) -> Iterator[Frame]:
     """Yield the picture of each pose: heading, pitch and roll."""
     for heading, pitch, roll in poses:
-        sphere = _seen_from(shot, renderers, phone, heading, _WINDOW, _WINDOW_SIZE)
+        sphere = _seen_from(shot, renderers, phone, heading)
         yield Frame(cut_view(sphere, phone.camera, azimuth=0.0, pitch=pitch, roll=roll), heading, pitch, roll)
 
 
@@ -85,14 +86,14 @@ def film_of_turn(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the frames of a film that a phone at arm's length takes; the first looks along the shot's heading."""
     for instant in instants:
-        sphere = _seen_from(shot, renderers, phone, shot.heading + instant.turn, _FILM_WINDOW, _FILM_WINDOW_SIZE)
+        sphere = _seen_from(shot, renderers, phone, shot.heading + instant.turn)
         yield exposed(sphere, phone.camera, instant, azimuth=0.0)
 
 
-def _seen_from(
-    shot: Shot, renderers: RendererCache, phone: Phone, heading: float, window: Window, size: tuple[int, int]
-) -> UInt8[np.ndarray, "h w 3"]:
+def _seen_from(shot: Shot, renderers: RendererCache, phone: Phone, heading: float) -> UInt8[np.ndarray, "h w 3"]:
     """Render a part of the sphere at the end of the arm; the rest is grey."""
+    is_coarse = phone.camera.fx <= _COARSE
+    window, size = (_COARSE_WINDOW, _COARSE_WINDOW_SIZE) if is_coarse else (_WINDOW, _WINDOW_SIZE)
     place = shot.position_m + arm_within(shot, phone.arm_m) * np.array([math.sin(heading), math.cos(heading)])
     turned = dataclasses.replace(shot, position_m=place, heading=heading % TWO_PI)
     seen = renderers.renderer(*size, (1, 1), window).render([turned])[0].cpu().numpy()
