@@ -131,7 +131,6 @@ def test_only_features_leave_a_phone_with_the_box_ticked(camera: Browser, servic
             page = phone.open_example()
             page.get_by_label(BOX).check()
             protocol = page.context.new_cdp_session(page)
-            _hold(protocol, 0.0)
             page.get_by_role("button", name="Look around").click()
             find = page.locator("#look-dialog .primary")
             for number, alpha in enumerate((0.0, 335.0), start=1):
@@ -168,10 +167,10 @@ def test_gyroscope_is_asked_for_again_after_a_refusal(phone: Visit) -> None:
     # Without it, the picture tells how far the camera has turned.
     expect(find).to_have_text(re.compile("\\(2 photo"))
     page.keyboard.press("Escape")
-    # Before the camera starts, so that no photograph lacks a direction.
     protocol = page.context.new_cdp_session(page)
-    _hold(protocol, 0.0)
     page.get_by_role("button", name="Look around").click()
+    # The page waits for it.
+    _hold(protocol, 0.0)
     expect(find).to_have_text(re.compile("\\(1 photo"))
     _hold(protocol, 335.0)
     expect(find).to_have_text(re.compile("\\(2 photo"))

@@ -108,9 +108,9 @@ def store_turn_confidence(bundle: Bundle, found: TurnPredictions) -> Bundle:
     assert view is not None, "the bundle has no encoder of views"
     homes = len({prediction.scene for prediction in found.searched.own})
     metrics["turn_validation_queries"] = (
-        f"{len(found.searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in {homes} generated "
-        f"validation homes, with an arm of {_UPRIGHT.arm_m:g} m; confidence besides on the same disturbed, and on "
-        f"{len(found.searched.mismatched)} turns in other buildings"
+        f"{len(found.searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in {homes} "
+        f"generated validation homes, with an arm of {_UPRIGHT.arm_m:g} m; confidence besides on the same disturbed, "
+        f"and on {len(found.searched.mismatched)} turns in other buildings"
     )
     for name, answers in (("turn_validation", found.known), ("turn_validation_heading_searched", found.searched)):
         metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
