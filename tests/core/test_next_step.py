@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 
 from lalaloc_core.bundle import Bundle, Manifest, default_bundle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Support
 from lalaloc_core.localise.localisability.next_step import Known, NextStep, next_step, next_steps
-from lalaloc_core.localise.localisability.step_report import known_of, words_of
-from lalaloc_core.localise.query import CameraHeight
-from tests.core.taken import EXAMPLES
-from tests.strategies import present
+from lalaloc_core.localise.localisability.step_report import words_of
 
 _FIELD = math.radians(80.0)
 
@@ -42,8 +38,8 @@ def _known(*places: tuple[float, float, float], fit: float = 1.0, **facts: objec
     position_m = np.array([place[:2] for place in places])
     heading = np.radians([place[2] for place in places])
     support = Support(np.arange(len(places)), position_m, heading, np.full(len(places), 1.0 / len(places)))
-    facts = {"fit_after": lambda ratio: fit * math.exp(-ratio)} | facts
     facts = {"arcs": [(-_FIELD / 2, _FIELD / 2)], "field": _FIELD, "height_m": 1.5, "is_view": True} | facts
+    facts = {"answer": 1.0} | facts
     return Known(support=support, fit=fit, **facts)  # pyright: ignore[reportArgumentType]
 
 
@@ -76,27 +72,13 @@ def test_heading_tells_places_apart_that_look_along_other_azimuths(manifest: Man
     assert "heading" not in _steps(_plan(), manifest, _known(*places, heading=True))
 
 
-def test_statement_that_excludes_the_best_place_lowers_the_fit(manifest: Manifest) -> None:
-    # Of three draws two are of the left room, whose places are more probable than the right one's.
-    equal = _known((2.0, 1.5, 0.0), (2.0, 1.5, 0.0), (12.0, 1.5, 90.0), fit=0.9)
-    weights = np.array([0.36, 0.36, 0.28])
-    known = replace(equal, support=replace(equal.support, weight=weights))
-    steps = _steps(_plan(), manifest, replace(known, fit=0.6, fit_after=lambda ratio: 0.6 * math.exp(-ratio)))
-    for kind in ("heading", "rooms"):
-        assert steps[kind].confidence == pytest.approx(0.6 * (2.0 / 3.0 + math.sqrt(0.28 / 0.36) / 3.0), abs=0.01)
-
-
-def test_fit_falls_with_the_cost_of_the_places_that_are_left(manifest: Manifest) -> None:
-    plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_bytes())
-    model, height = LocalModel(Bundle.open(default_bundle())), CameraHeight(1.5)
-    photograph = model.open((EXAMPLES / "phone.jpg").read_bytes())
-    found = model.localise(plan, model.grid(plan, 1.5), model.encoder.query(photograph, None, height))
-    confidence = present(found.confidence(manifest.confidence_for(view=True)))
-    known = known_of(found, confidence, manifest, arcs=[photograph.azimuths], field=photograph.hfov.value)
-    fits = [known.fit_after(ratio) for ratio in (0.0, 1.0, 3.0, 10.0)]
-    assert fits[0] == pytest.approx(confidence.fit)
-    assert fits == sorted(fits, reverse=True)
-    assert fits[-1] < 0.8 * fits[0]
+def test_statements_presume_that_the_answer_has_less_than_the_largest_share(manifest: Manifest) -> None:
+    places = [(2.0, 1.5, 0.0), (12.0, 1.5, 90.0)]
+    # Half of the posterior is near the best place, but only 0.4 near the one that fits best.
+    steps = _steps(_plan(), manifest, _known(*places, fit=0.9, answer=0.4))
+    assert steps["heading"].confidence == pytest.approx(0.9 * 0.8)
+    assert steps["rooms"].confidence == pytest.approx(0.9 * 0.8)
+    assert steps["rooms"].bits == pytest.approx(1.0)
 
 
 def test_turn_tells_rooms_of_other_sizes_apart_but_not_equal_ones(manifest: Manifest) -> None:

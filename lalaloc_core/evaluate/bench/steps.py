@@ -102,9 +102,8 @@ class _Visit:
         if confidence is None or confidence.position >= CONFIDENT:
             return []
         arcs, field = [self.photograph.azimuths], self.photograph.hfov.value
-        manifest = self.model.bundle.manifest
-        known = known_of(self.found, confidence, manifest, arcs=arcs, field=field)
-        return next_steps(self.shot.home.plan, manifest, known, step_m=self.grid.step_m)
+        known = known_of(self.found, confidence, arcs=arcs, field=field)
+        return next_steps(self.shot.home.plan, self.model.bundle.manifest, known, step_m=self.grid.step_m)
 
     def row(self, step: NextStep, *, best: bool) -> _Row:
         """Carry a step out."""

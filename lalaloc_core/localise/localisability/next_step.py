@@ -5,14 +5,14 @@ with it. For another photograph, predictions are drawn at some of the places, as
 compared with what all places would show. The work is bounded for plans of any size.
 
 The expected confidence is the probability that the photograph is of the plan, times the expected share of the
-posterior within 1 m of its best place after the step. A statement that excludes the best place lowers that probability,
-because the photograph fits the places that are left less well.
+posterior within 1 m of its best place after the step. The answer is the place that fits best, near which the share need
+not be the largest. Statements leave that as it is: the share after one is lower by the factor of the answer's share.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -42,9 +42,6 @@ HEADING_ERROR = math.radians(10.0)
 _HEADINGS_TOLD = (-0.8, -0.4, 0.0, 0.4, 0.8)
 # Rooms that are named for a choice, and the smallest probability of one.
 _ROOMS, _MIN_ROOM = 5, 0.03
-# Share of a difference in log probability between the best place and others that is left once these are refined, too;
-# chosen on 28 photographs of 14 test homes, and checked on other homes.
-_REFINED = 0.5
 # Smallest increase of the confidence that is worth a step.
 _WORTH = 0.02
 
@@ -78,7 +75,7 @@ class Known:
     Attributes:
         support: its posterior.
         fit: probability that the photograph is of the plan.
-        fit_after: the same if the best place were less probable by a factor, by its logarithm.
+        answer: share of the posterior within 1 m of the answer.
         arcs: azimuths (radians, first and last) that were seen, relative to the photograph's centre.
         field: horizontal field of view (radians) of another photograph; 2π for spheres.
         height_m: the camera height.
@@ -89,7 +86,7 @@ class Known:
 
     support: Support
     fit: float
-    fit_after: Callable[[float], float]
+    answer: float
     arcs: Sequence[tuple[float, float]]
     field: float
     height_m: float
@@ -164,31 +161,23 @@ class _Belief:
         """Share within 1 m of the best place."""
         return float((self.weight @ self._near).max())
 
-    def told(
-        self,
-        likelihood: Float[np.ndarray, "k n"],
-        *,
-        near: Bool[np.ndarray, "n n"] | None = None,
-        fit: Float[np.ndarray, "k"] | None = None,
-    ) -> _Told:
+    def told(self, likelihood: Float[np.ndarray, "k n"], *, near: Bool[np.ndarray, "n n"] | None = None) -> _Told:
         """Return the mean information and the mean share within 1 m of the best place after some observations.
 
         `likelihood` is that of each observation at every place; `near` states which places are close, if not those of
-        the photograph. Shares are multiplied by `fit`.
+        the photograph.
         """
         after = likelihood * self.weight
         total = after.sum(axis=1, keepdims=True)
-        possible = total[:, 0] > 0.0
-        after = after[possible] / total[possible]
+        after = after[total[:, 0] > 0.0] / total[total[:, 0] > 0.0]
         if not len(after):
             return _Told(0.0, self.share)
         cells = np.zeros((len(after), int(self.cell.max()) + 1))
         np.add.at(cells.T, self.cell, after.T)
         before = np.bincount(self.cell, self.weight)
         ratio = np.divide(cells, before, out=np.ones_like(cells), where=cells > 0.0)
-        share = (after @ (self._near if near is None else near.astype(float))).max(axis=1)
-        share = share if fit is None else share * fit[possible]
-        return _Told(float((cells * np.log2(ratio)).sum(axis=1).mean()), float(share.mean()))
+        share = after @ (self._near if near is None else near.astype(float))
+        return _Told(float((cells * np.log2(ratio)).sum(axis=1).mean()), float(share.max(axis=1).mean()))
 
     @cached_property
     def _near(self) -> Float[np.ndarray, "n n"]:
@@ -203,13 +192,14 @@ def near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n
 def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[NextStep]:
     """Yield the steps that state the heading or choose a room."""
     every, weight = np.arange(len(belief.weight)), belief.weight
+    fit = known.fit * min(known.answer / belief.share, 1.0)
     # The mean over places takes each as often as it is probable.
     drawn = every[np.minimum(np.searchsorted(np.cumsum(weight), (every + 0.5) / len(every)), len(every) - 1)]
     if not known.heading:
-        told = np.concatenate([belief.heading[drawn] + share * HEADING_ERROR for share in _HEADINGS_TOLD])
-        agree = np.abs(wrap_angle(told[:, None] - belief.heading[None])) <= HEADING_ERROR
-        bits, confidence = belief.told(agree.astype(float), fit=_fits(known, *_best_by_heading(known.support, told)))
-        yield NextStep(kind="heading", bits=bits, confidence=confidence)
+        told = [belief.heading[drawn] + share * HEADING_ERROR for share in _HEADINGS_TOLD]
+        agree = np.abs(wrap_angle(np.concatenate(told)[:, None] - belief.heading[None])) <= HEADING_ERROR
+        bits, share = belief.told(agree.astype(float))
+        yield NextStep(kind="heading", bits=bits, confidence=fit * share)
     room = belief.poses.room_index
     mass = np.bincount(room, weight, minlength=len(plan.rooms))
     probable = np.argsort(-mass, kind="stable")[: np.count_nonzero(mass >= _MIN_ROOM)]
@@ -218,29 +208,9 @@ def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[Next
     kinds = np.array([names.index(name) for name in names])
     if known.rooms or len(np.unique(kinds[probable])) < 2:
         return
-    at = plan.room_index_at(known.support.position_m)
-    best = np.zeros(len(plan.rooms))
-    np.maximum.at(best, kinds[at[at >= 0]], known.support.weight[at >= 0])
-    agree = kinds[room[drawn]][:, None] == kinds[room][None]
-    bits, confidence = belief.told(agree.astype(float), fit=_fits(known, best[kinds[room[drawn]]], best.max()))
+    bits, share = belief.told((kinds[room[drawn]][:, None] == kinds[room][None]).astype(float))
     rooms = tuple(int(index) for index in probable[:_ROOMS])
-    yield NextStep(kind="rooms", bits=bits, confidence=confidence, rooms=rooms)
-
-
-def _best_by_heading(support: Support, told: Float[np.ndarray, "k"]) -> tuple[Float[np.ndarray, "k"], float]:
-    """Return the highest weight of places with about each told heading, and of all."""
-    degree = np.zeros(360)
-    np.maximum.at(degree, np.floor(np.degrees(support.heading)).astype(int) % 360, support.weight)
-    reach = round(math.degrees(HEADING_ERROR))
-    around = np.max([np.roll(degree, shift) for shift in range(-reach, reach + 1)], axis=0)
-    return around[np.floor(np.degrees(told)).astype(int) % 360], float(degree.max())
-
-
-def _fits(known: Known, left: Float[np.ndarray, "k"], best: float) -> Float[np.ndarray, "k"]:
-    """Return the probability that the photograph is of the plan if places up to a weight are left."""
-    ratio = _REFINED * np.log(best / np.clip(left, 1e-30, best))
-    values, which = np.unique(np.round(ratio, 2), return_inverse=True)
-    return np.array([known.fit_after(float(value)) for value in values])[which]
+    yield NextStep(kind="rooms", bits=bits, confidence=fit * share, rooms=rooms)
 
 
 class _Door(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from typing import Any
 
 from lalaloc_core.bundle import Manifest
@@ -13,8 +12,6 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Confidence
 from lalaloc_core.localise.localisability.next_step import Known, NextStep, next_step
 from lalaloc_core.localise.search.pipeline import Localisation
-
-_TINY = 1e-9
 
 
 def step_after(
@@ -42,7 +39,7 @@ def step_after(
     """
     if confidence is None:
         return None
-    known = known_of(found, confidence, manifest, arcs=arcs, field=field, rooms_known=rooms_known)
+    known = known_of(found, confidence, arcs=arcs, field=field, rooms_known=rooms_known)
     step = next_step(plan, manifest, known, step_m=step_m)
     return None if step is None else _document(plan, step)
 
@@ -50,39 +47,17 @@ def step_after(
 def known_of(
     found: Localisation,
     confidence: Confidence,
-    manifest: Manifest,
     *,
     arcs: Sequence[tuple[float, float]],
     field: float,
     rooms_known: bool = False,
 ) -> Known:
     """Return the facts about an answer that steps are computed from; see `step_after`."""
-    query = found.query
-    is_view = query.is_view
-    model = manifest.confidence_for(view=is_view, turn=query.is_turn)
-    temperature, signals = manifest.evidence_for(view=is_view).temperature, found.signals[found.stage]
-
-    def fit_after(ratio: float) -> float:
-        """Return the fit at a higher cost; `confidence.fit` has the share of the searched plans as a factor."""
-        added = ratio / temperature
-        grown = math.log((signals.cost + added) / max(signals.cost, _TINY)) if added else 0.0
-        changed = replace(
-            signals,
-            cost=signals.cost + added,
-            cost_to_chance=signals.cost_to_chance + grown,
-            answer_to_chance=signals.answer_to_chance + grown,
-        )
-        assert model is not None
-        before, after = (
-            model.fit_probability(found.stage, asdict(each), heading_known=query.heading_known) or 0.0
-            for each in (signals, changed)
-        )
-        return confidence.fit * min(after / max(before, _TINY), 1.0)
-
+    is_view = found.query.is_view
     return Known(
         support=found.posterior.support,
         fit=confidence.fit,
-        fit_after=fit_after,
+        answer=found.posterior.position,
         arcs=arcs,
         field=field if is_view else TWO_PI,
         height_m=found.camera_height_m,
