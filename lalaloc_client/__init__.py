@@ -75,6 +75,7 @@ from lalaloc_client.model import (
     VenueAnchor,
     VenuePlan,
 )
+from lalaloc_client.on_device import TurnFeatures
 from lalaloc_client.requests import QueryOptions, ViewOptions
 from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOptions, TrackedPose
@@ -139,6 +140,7 @@ __all__ = [
     "SessionOptions",
     "TrackedPose",
     "Tracker",
+    "TurnFeatures",
     "UnauthorisedError",
     "Venue",
     "VenueAnchor",

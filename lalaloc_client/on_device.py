@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from lalaloc_client.answers import DroppedFrames, FilmReading, SequenceLocalisation
 from lalaloc_client.errors import OnDeviceError
 from lalaloc_client.requests import Photograph, QueryOptions, ViewOptions, picture_file
 
@@ -16,7 +19,27 @@ if TYPE_CHECKING:
     from lalaloc_core.localise.encode.features import FeatureEncoder
     from lalaloc_core.photograph import StatedCamera
 
+Film: TypeAlias = "bytes | str | os.PathLike[str]"
 _CAMERA = frozenset(ViewOptions.__optional_keys__)
+
+
+@dataclass(frozen=True)
+class TurnFeatures:
+    """Features of the photographs of a turn, or of the frames of a film, and the angles that features cannot tell.
+
+    Attributes:
+        features: a file for each photograph, or frame that was kept.
+        relative_heading_deg: headings relative to the first photograph, None where unknown; None if none is known.
+        relative_heading_std_deg: their standard deviation.
+        times_s: times of the frames; None for photographs.
+        film: reading of the film; None for photographs.
+    """
+
+    features: list[bytes]
+    relative_heading_deg: list[float | None] | None = None
+    relative_heading_std_deg: float | None = None
+    times_s: tuple[float, ...] | None = None
+    film: FilmReading | None = None
 
 
 class OnDeviceModel:
@@ -124,6 +147,75 @@ class OnDeviceModel:
             return self._encoder.features(view)
         except InvalidPhotographError as error:
             raise OnDeviceError(str(error)) from error
+
+    def turn(self, turn: Film | Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
+        """Return the features of a film of a turn, or of its photographs in order; `load` comes first.
+
+        Photographs of which one is a sphere, or is features already, have no angles.
+
+        Raises:
+            OnDeviceError: the film or a photograph cannot be read, or the model gives no features of such photographs.
+        """
+        from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
+
+        try:
+            if isinstance(turn, (bytes, str, os.PathLike)):
+                return self._film(turn if isinstance(turn, bytes) else Path(turn).read_bytes(), options)
+            return self._photographs(turn, options)
+        except (InvalidFilmError, InvalidPhotographError) as error:
+            raise OnDeviceError(str(error)) from error
+
+    def _film(self, content: bytes, options: Mapping[str, Any]) -> TurnFeatures:
+        from lalaloc_core.localise.encode.photograph_encoder import patch_size
+        from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+        from lalaloc_core.photograph.film import read_film
+
+        assert self._encoder is not None
+        film = read_film(content, stated=_stated_camera(options), patch_size=patch_size(self._bundle.manifest))
+        headings_deg, std_deg = LinkedTurn.of(film.angles).stated
+        return TurnFeatures(
+            [self._encoder.features(photograph) for photograph in film.photographs],
+            headings_deg,
+            std_deg,
+            film.times_s,
+            FilmReading(
+                frames_read=film.frames,
+                frames_kept=len(film.photographs),
+                dropped=tuple(DroppedFrames(reason, frames) for reason, frames in film.dropped.items()),
+                duration_s=film.duration_s,
+                turned_deg=math.degrees(film.turned),
+                warnings=film.warnings,
+            ),
+        )
+
+    def _photographs(self, photographs: Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
+        from lalaloc_core.localise.encode.features import is_features
+        from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+        from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+        from lalaloc_core.photograph import open_photograph
+        from lalaloc_core.photograph.turned import open_turn
+
+        assert self._encoder is not None
+        contents, stated = [picture_file(photograph) for photograph in photographs], _stated_camera(options)
+        manifest = self._bundle.manifest
+        sphere, patch = sphere_size(manifest), patch_size(manifest)
+
+        def overlaps(content: bytes) -> bool:
+            if is_features(content):
+                return False
+            return not open_photograph(content, stated=stated, sphere_size=sphere, patch_size=patch).is_sphere
+
+        if not all(map(overlaps, contents)):
+            return TurnFeatures([self.features(content, options) for content in contents])
+        opened, angles = open_turn(contents, stated, sphere_size=sphere, patch_size=patch)
+        return TurnFeatures([self._encoder.features(view) for view in opened], *LinkedTurn.of(angles).stated)
+
+
+def filmed(answer: SequenceLocalisation, sent: TurnFeatures) -> SequenceLocalisation:
+    """Return an answer to the features of a film as one to the film, with the times of its poses."""
+    assert sent.times_s is not None
+    poses = (replace(pose, time_s=time_s) for pose, time_s in zip(answer.poses, sent.times_s, strict=True))
+    return replace(answer, poses=tuple(poses), film=sent.film)
 
 
 def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], QueryOptions]:

@@ -87,6 +87,14 @@ _TURN_ROWS = {
     "unknown_angles": "three of 80° from one spot, unknown angles",
 }
 
+_FILM_ROWS = {
+    "stated": "twelve photographs of 53°, upright, angles stated",
+    "overlap": "… angles from overlap",
+    "overlap_unknown_field": "… angles from overlap, field of view unknown",
+    "film": "hand-held film of 8 s, nothing stated",
+}
+_ANNOTATED_ROWS = {"annotated_sphere": "sphere of a real room", "annotated_film": "hand-held film of 8 s, cut from it"}
+
 _UNINFORMATIVE_ROWS = {
     "blank_wall": "wall without openings, 50°",
     "ceiling": "ceiling, 80°, 60° upwards",
@@ -129,6 +137,32 @@ def views_table() -> str:
         rows.append((title, *shares, f"{scores['median_cm']:.0f} cm", error, f"{scores['n']}"))
     head = "views of furnished homes | < 1 m [95 %] | < 1 m and 30° | among five | median | calibration error | n"
     return table(head, rows)
+
+
+def films_table() -> str:
+    """Return accuracy and calibration of turns and films in furnished synthetic homes as a Markdown table."""
+    rows = []
+    for name, title in _FILM_ROWS.items():
+        found = _bench()["films"][name]
+        angles = "–" if name == "stated" else f"{found['median_angle_error_deg']:.1f}°"
+        field = f"{100 * found['median_field_error']:.1f} %" if name in ("overlap_unknown_field", "film") else "–"
+        shares = _percent(found["within_1m"]), f"{found['median_cm']:.0f} cm", f"{found['mean_confidence']:.2f}"
+        error = f"{found['expected_calibration_error']:.3f}"
+        rows.append((title, *shares, error, angles, field, f"{found['n']}"))
+    head = "turns in furnished homes, heading unknown | < 1 m | median | mean confidence | calibration error"
+    return table(f"{head} | error of angles | of the field of view | n", rows)
+
+
+def annotated_films_table() -> str:
+    """Return the shares of films and spheres of real rooms that are located, as a Markdown table."""
+    rows = []
+    for name, title in _ANNOTATED_ROWS.items():
+        found = _bench()["films"][name]
+        shares = _percent(found["located"]), _percent(found["right_room"]), _percent(found["within_1m"])
+        error = f"{found['expected_calibration_error']:.3f}"
+        rows.append((title, *shares, f"{found['mean_confidence']:.2f}", error, f"{found['n']}"))
+    head = "in plans of twenty rooms, heading unknown | located | right room | < 1 m | mean confidence"
+    return table(f"{head} | calibration error | n", rows)
 
 
 def uninformative_table() -> str:

@@ -17,6 +17,8 @@ import yaml
 from lalaloc_core.cli import entry_point
 from scripts.figures import (
     accuracy_table,
+    annotated_films_table,
+    films_table,
     localisability_table,
     neighbours_table,
     paper_tables,
@@ -159,6 +161,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy_table,
     "terms": terms_table,
     "views": views_table,
+    "films": films_table,
+    "annotated_films": annotated_films_table,
     "localisability": localisability_table,
     "uninformative": uninformative_table,
     "speed": speed_table,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lalaloc_client.asynchronous.backend import Fetch, Lock, run_blocking
-from lalaloc_client.on_device import OnDeviceModel
+from lalaloc_client.on_device import Film, OnDeviceModel, TurnFeatures
 from lalaloc_client.requests import Photograph
 
 
@@ -29,11 +29,23 @@ class AsyncDevice:
         Raises:
             OnDeviceError: see `OnDeviceModel`.
         """
+        model = await self._current()
+        return [await run_blocking(model.features, photograph, options) for photograph in photographs]
+
+    async def turn(self, turn: Film | Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
+        """Return the features of a turn, and its angles, given options about its camera.
+
+        Raises:
+            OnDeviceError: see `OnDeviceModel`.
+        """
+        model = await self._current()
+        return await run_blocking(model.turn, turn, options)
+
+    async def _current(self) -> OnDeviceModel:
         async with self._lock:
             if self._model is None:
                 self._model = await self._loaded()
-            model = self._model
-        return [await run_blocking(model.features, photograph, options) for photograph in photographs]
+            return self._model
 
     async def _loaded(self) -> OnDeviceModel:
         model = await run_blocking(OnDeviceModel, await self._fetch("/model/manifest.json"))

@@ -17,7 +17,7 @@ from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.asynchronous.device import AsyncDevice
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
-from lalaloc_client.on_device import split_options
+from lalaloc_client.on_device import Film, TurnFeatures, split_options
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
     Photograph,
@@ -120,6 +120,25 @@ class AsyncTransport:
         self._device.forget()
         features = await self._device.features(photographs, camera)
         return await self.query(query_request, path, features, values, others)
+
+    async def localise_turn(
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+    ) -> tuple[bytes, TurnFeatures]:
+        """Send the features of a turn with its angles; return the answer, and what was sent."""
+        camera, others = split_options(options)
+        for attempt in range(2):
+            sent = await self._device.turn(turn, camera)
+            angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
+            if sent.relative_heading_deg is not None:
+                angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
+            try:
+                fields = {**values, "motion": "turn", **angles}
+                return await self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
+            except ConflictError as error:
+                if attempt or error.type != _FOREIGN_FEATURES:
+                    raise
+            self._device.forget()
+        raise AssertionError("the second attempt answers or raises")
 
     async def _fetch(self, path: str) -> bytes:
         return await self.content(Request("GET", path, headers={"Accept": "*/*"}))

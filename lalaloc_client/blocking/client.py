@@ -38,6 +38,7 @@ from lalaloc_client.model import (
     VenuePlan,
     VenuePlanPage,
 )
+from lalaloc_client.on_device import TurnFeatures, filmed
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
     JSON,
@@ -503,7 +504,7 @@ class Client(Albums):
             camera_heights_m: height of each photograph, None for the common one; all share one relative error.
             refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
             top_k: number of candidates per photograph. Default: set by the service.
-            on_device: as for `localise`.
+            on_device: as for `localise`; the angles of a turn are computed on this device, too.
             **options: camera of all photographs, see `ViewOptions`.
         """
         values = {
@@ -521,7 +522,10 @@ class Client(Albums):
             "refine": refine,
             "top_k": top_k,
         }
-        content = self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
+        if on_device and motion == "turn" and relative_heading_deg is None:
+            content, _ = self.localise_turn(panoramas, values, options)
+        else:
+            content = self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
         return parse(SequenceLocalisation, content)
 
     def localise_film(
@@ -534,6 +538,7 @@ class Client(Albums):
         camera_height_std_m: float | None = None,
         refine: SequenceRefine | None = None,
         top_k: int | None = None,
+        on_device: bool = False,
         **options: Unpack[ViewOptions],
     ) -> SequenceLocalisation:
         """Localise a film of one slow turn, once around on the spot.
@@ -547,6 +552,8 @@ class Client(Albums):
             camera_height_std_m: its standard deviation, as in `QueryOptions`.
             refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
             top_k: number of candidates per frame. Default: set by the service.
+            on_device: read the film on this device, and send the features of its frames and their angles alone; as for
+                `localise`.
             **options: the camera, see `ViewOptions`.
         """
         values = {
@@ -558,8 +565,27 @@ class Client(Albums):
             "refine": refine,
             "top_k": top_k,
         }
+        if on_device:
+            content, sent = self.localise_turn(film, values, options)
+            return filmed(parse(SequenceLocalisation, content), sent)
         request = run_blocking(film_request, "/localise/sequence", film, values, options)
         return parse(SequenceLocalisation, self.content(request))
+
+    def encode_turn(
+        self, turn: bytes | str | os.PathLike[str] | Sequence[Photograph], **options: Unpack[ViewOptions]
+    ) -> TurnFeatures:
+        """Compute the features of a film of a turn, or of its photographs in order, on this device; send nothing.
+
+        `localise_sequence` takes them with `motion="turn"` and the relative headings, now or later.
+
+        Args:
+            turn: content or path of a film as for `localise_film`, or a list of photographs as for `localise_sequence`.
+            **options: the camera, see `ViewOptions`.
+
+        Raises:
+            OnDeviceError: the extra `onnx` is missing, or the turn cannot be read.
+        """
+        return self._device.turn(turn, options)
 
     def track(
         self, floorplan_id: str | None = None, *, venue_id: str | None = None, **options: Unpack[SessionOptions]

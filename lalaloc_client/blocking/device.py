@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lalaloc_client.blocking.backend import Fetch, Lock, run_blocking
-from lalaloc_client.on_device import OnDeviceModel
+from lalaloc_client.on_device import Film, OnDeviceModel, TurnFeatures
 from lalaloc_client.requests import Photograph
 
 
@@ -30,11 +30,23 @@ class Device:
         Raises:
             OnDeviceError: see `OnDeviceModel`.
         """
+        model = self._current()
+        return [run_blocking(model.features, photograph, options) for photograph in photographs]
+
+    def turn(self, turn: Film | Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
+        """Return the features of a turn, and its angles, given options about its camera.
+
+        Raises:
+            OnDeviceError: see `OnDeviceModel`.
+        """
+        model = self._current()
+        return run_blocking(model.turn, turn, options)
+
+    def _current(self) -> OnDeviceModel:
         with self._lock:
             if self._model is None:
                 self._model = self._loaded()
-            model = self._model
-        return [run_blocking(model.features, photograph, options) for photograph in photographs]
+            return self._model
 
     def _loaded(self) -> OnDeviceModel:
         model = run_blocking(OnDeviceModel, self._fetch("/model/manifest.json"))

@@ -18,7 +18,7 @@ from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from lalaloc_client.blocking.device import Device
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
-from lalaloc_client.on_device import split_options
+from lalaloc_client.on_device import Film, TurnFeatures, split_options
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
     Photograph,
@@ -121,6 +121,25 @@ class Transport:
         self._device.forget()
         features = self._device.features(photographs, camera)
         return self.query(query_request, path, features, values, others)
+
+    def localise_turn(
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+    ) -> tuple[bytes, TurnFeatures]:
+        """Send the features of a turn with its angles; return the answer, and what was sent."""
+        camera, others = split_options(options)
+        for attempt in range(2):
+            sent = self._device.turn(turn, camera)
+            angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
+            if sent.relative_heading_deg is not None:
+                angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
+            try:
+                fields = {**values, "motion": "turn", **angles}
+                return self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
+            except ConflictError as error:
+                if attempt or error.type != _FOREIGN_FEATURES:
+                    raise
+            self._device.forget()
+        raise AssertionError("the second attempt answers or raises")
 
     def _fetch(self, path: str) -> bytes:
         return self.content(Request("GET", path, headers={"Accept": "*/*"}))

@@ -64,6 +64,8 @@ class ViewManifest:
         top_deg: elevation of a patch's upper border.
         opening_prior, room_type_prior, evidence, confidence, errors: as those of the manifest, for views; without
             fitted weights or confidence, those of spheres apply.
+        turn_confidence: as `confidence`, for several photographs from one spot; None, as in bundles of earlier
+            versions, applies that of single ones.
     """
 
     config: dict[str, Any]
@@ -76,6 +78,7 @@ class ViewManifest:
     evidence: MatchingWeights | None = None
     confidence: ConfidenceModel | None = None
     errors: PredictionErrors | None = None
+    turn_confidence: ConfidenceModel | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,10 +158,10 @@ class Manifest:
         own = None if self.view is None or not view else self.view.evidence
         return self.evidence if own is None else own
 
-    def confidence_for(self, *, view: bool) -> ConfidenceModel | None:
-        """Return the models of the confidence for spheres or for views."""
-        own = None if self.view is None or not view else self.view.confidence
-        return self.confidence if own is None else own
+    def confidence_for(self, *, view: bool, turn: bool = False) -> ConfidenceModel | None:
+        """Return the models of the confidence for spheres, for views, or for turns of several views."""
+        own = [self.view.turn_confidence if turn else None, self.view.confidence] if self.view and view else []
+        return next((model for model in own if model is not None), self.confidence)
 
     @property
     def sha256(self) -> str:

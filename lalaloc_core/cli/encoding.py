@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from lalaloc_core.photograph import StatedCamera
 
 _HEIGHT_M = 1.5
-# Least standard deviation of the angles of a turn that is stated.
-_LEAST_STD_DEG = 0.5
 
 
 def add_commands(commands: Any) -> None:
@@ -107,14 +104,8 @@ def _encode_turn(
         raise InvalidInputError(f"'{out}' cannot be made: {error.strerror}") from error
     for index, photograph in enumerate(turn.photographs):
         _write(out / f"{index:02}.features", encoder.features(photograph))
-    angles = turn.linked.angles
-    std_deg = max(math.degrees(angle.heading_sd) for angle in angles if not angle.group)
-    fields = {
-        "motion": "turn",
-        # Angles to photographs of other groups are unknown.
-        "relative_heading_deg": [None if angle.group else round(math.degrees(angle.heading), 2) for angle in angles],
-        "relative_heading_std_deg": round(max(std_deg, _LEAST_STD_DEG), 2),
-    }
+    headings_deg, std_deg = turn.linked.stated
+    fields = {"motion": "turn", "relative_heading_deg": headings_deg, "relative_heading_std_deg": std_deg}
     _write(out / "turn.json", json.dumps(fields, indent=1).encode())
 
 

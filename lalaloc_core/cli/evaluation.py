@@ -111,6 +111,11 @@ def add_commands(commands: Any) -> None:
         "--views", action="store_true", help="calibrate the encoder of views, on views of 55° to 110°, not on spheres"
     )
     calibrate.add_argument(
+        "--turns",
+        action="store_true",
+        help="only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home",
+    )
+    calibrate.add_argument(
         "--errors", action="store_true", help="only measure the predictions' errors, for `plan check --localisability`"
     )
     calibrate.add_argument(
@@ -252,6 +257,13 @@ def _calibrate(arguments: argparse.Namespace) -> None:
 
         sphere, view = calibrate_errors(arguments.bundle, arguments.homes)
         print_json({"sphere_spread": sphere.spread, "view_spread": view.spread})
+        return
+    if arguments.turns:
+        from lalaloc_core.evaluate.calibrate.turn_confidence import TurnSettings, calibrate_turns
+
+        settings = TurnSettings(homes=arguments.homes, seed=arguments.seed, textures=arguments.textures)
+        metrics = calibrate_turns(arguments.bundle, settings).manifest.metrics
+        print_json({name: value for name, value in metrics.items() if name.startswith("turn_")})
         return
     from lalaloc_core.evaluate.calibrate.calibration import CalibrationConfig, calibrate
 

@@ -227,7 +227,7 @@ def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedC
         grid = model.grid(plan, plan.camera_height_m if model.encoder.predicts_profile else height.height_m)
         found = model.localise_turn(plan, grid, turn.photographs, turn.linked, height)
     first, confidence = found.pictures[0], found.confidence(bundle.manifest)
-    confidence_model = bundle.manifest.confidence_for(view=first.query.is_view)
+    confidence_model = bundle.manifest.confidence_for(view=first.query.is_view, turn=first.query.is_turn)
     drawn = drawn_answer(plan, grid, first, confidence_model, _SOURCES["searched"], photograph=turn.photographs[0])
     details = {
         "stage": found.stage,

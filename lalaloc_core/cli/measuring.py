@@ -46,7 +46,10 @@ def add_commands(commands: Any) -> None:
     )
     bench.add_argument("--out", type=Path, metavar="FILE", help="also write the JSON to FILE; --only updates FILE")
     bench.add_argument(
-        "--annotated", type=Path, metavar="DIR", help="folder of annotated photographs, for albums of real rooms"
+        "--annotated",
+        type=Path,
+        metavar="DIR",
+        help="folder of annotated photographs, for albums and films of real rooms",
     )
     bench.add_argument("--only", choices=_GROUPS, action="append", help="one group of figures; repeat for more")
     bench.add_argument(

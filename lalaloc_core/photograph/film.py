@@ -43,12 +43,18 @@ _CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8"}
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 # Samples per second, and of a whole film.
 _RATE, _SAMPLES = 12.0, 240
+# Times of frames in files are rounded by so much.
+_TIME_ROUNDED_S = 0.002
 # Longer side (pixels) of kept frames.
 _LONG_SIDE = 960
 # Mean grey level of frames that are too dark.
 _DARK = 12.0
 # Standard deviation (radians) of turns by optical flow: constant, and as a share of the turn.
 _FLOW_SD, _FLOW_SHARE = math.radians(2.0), 0.04
+# Standard deviation (radians) of angles that count as exact; see `localise.sequence.turn_localisation`.
+_SURE_SD = math.radians(5.0)
+# Frames of groups that are left out at most.
+_ALONE = 2
 # Largest turn (radians, by optical flow, which can be wrong by a third) whose frames are kept.
 _MOST_TURN = 1.5 * TWO_PI
 # Turn (radians) that a film shows at least.
@@ -82,10 +88,11 @@ class Film:
 
 @dataclass(eq=False)
 class _Sample:
-    """A frame that can be kept: its time, angle by optical flow, sharpness and picture."""
+    """A frame that can be kept: its time, angle by optical flow and the guessed part of it, sharpness and picture."""
 
     time_s: float
     heading: float
+    doubt: float
     sharpness: float
     picture: UInt8[np.ndarray, "h w 3"]
 
@@ -147,11 +154,16 @@ def read_film(
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
     photographs, angles = _turned([sample.picture for sample in kept], samples.full_size, stated, size)
     tracker.calibrate(photographs[0].hfov.value, samples.full_size)
-    tracked = tracker.scale * np.array([sample.heading for sample in kept])
+    tracked, doubt = (
+        tracker.scale * np.array([getattr(sample, name) for sample in kept]) for name in ("heading", "doubt")
+    )
+    joined = _joined(angles, tracked, doubt)
+    if len(joined) < len(kept):
+        samples.dropped["blank, at an unknown angle"] += len(kept) - len(joined)
     return Film(
-        photographs=tuple(photographs),
-        times_s=tuple(sample.time_s for sample in kept),
-        angles=tuple(_joined(angles, tracked)),
+        photographs=tuple(photographs[index] for index in joined),
+        times_s=tuple(kept[index].time_s for index in joined),
+        angles=tuple(joined.values()),
         frames=samples.frames,
         dropped=dict(samples.dropped),
         duration_s=samples.last_s,
@@ -182,22 +194,38 @@ def _turned(
     return photographs, angles
 
 
-def _joined(angles: Sequence[TurnAngles], tracked: Float[np.ndarray, "n"]) -> list[TurnAngles]:
-    """Return the angles as one group, groups being joined by the turns that optical flow tells."""
-    joined = list(angles)
+def _joined(
+    angles: Sequence[TurnAngles], tracked: Float[np.ndarray, "n"], doubt: Float[np.ndarray, "n"]
+) -> dict[int, TurnAngles]:
+    """Return the angles of frames as one group, by number: groups are joined by the turns that optical flow tells.
+
+    `doubt` is the part (radians) of `tracked` that was guessed. If most frames overlap, those that overlap with none
+    and whose angles would be guesses, of blank walls, are left out: all angles of a turn count as exact, or none.
+    """
     heading = np.array([angle.heading for angle in angles])
     group = np.array([angle.group for angle in angles])
+    size = np.bincount(group)
+    main = int(size.argmax())
+    members = np.flatnonzero(group == main)
     offset = {
         number: float(np.angle(np.exp(1j * (tracked - heading)[group == number]).sum()))
         for number in set(group.tolist())
     }
+    joined: dict[int, TurnAngles] = {}
     for index, angle in enumerate(angles):
-        if angle.group:
-            turn = float(wrap_angle(angle.heading + offset[angle.group] - offset[0]))
-            apart = float(np.abs(tracked[index] - tracked[group == 0]).min())
-            heading_sd = math.hypot(angle.heading_sd, _FLOW_SD + _FLOW_SHARE * apart)
+        turn, heading_sd = angle.heading + offset[angle.group] - offset[main], angle.heading_sd
+        if angle.group != main:
+            apart = np.abs(tracked[index] - tracked[members])
+            guessed = np.abs(doubt[index] - doubt[members])
+            flow_sd = float((_FLOW_SHARE * apart + guessed).min())
+            heading_sd = math.hypot(heading_sd, _FLOW_SD + flow_sd)
+        if heading_sd <= _SURE_SD or size[angle.group] > _ALONE or 2 * len(members) <= len(angles):
             joined[index] = replace(angle, group=0, heading=turn, heading_sd=heading_sd)
-    return joined
+    first = min(joined)
+    turned = {
+        index: replace(a, heading=float(wrap_angle(a.heading - joined[first].heading))) for index, a in joined.items()
+    }
+    return turned | {first: replace(turned[first], heading_sd=0.0)}
 
 
 def _warnings(tracker: FlowTracker) -> list[str]:
@@ -244,10 +272,11 @@ def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Sampl
                     f"decoding took more than {limits.max_cpu_s:g} s of CPU time for the first {time_s:.1f} s of the "
                     "film, the limit (LALALOC_MAX_FILM_CPU_S): send a film with fewer pixels, or a shorter one"
                 )
-            if time_s + 1e-6 < next_s:
+            if time_s + _TIME_ROUNDED_S < next_s:
                 samples.dropped["between samples"] += 1
                 continue
-            next_s = time_s + interval_s
+            # Samples stay at their rate on average, whatever that of the frames.
+            next_s = max(next_s + interval_s, time_s)
             seen, frame = capture.retrieve()
             if not seen or frame is None:
                 samples.dropped["damaged"] += 1
@@ -273,7 +302,9 @@ def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples,
         return
     heading = tracker.follow(grey)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
-    samples.add(_Sample(time_s, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step)
+    samples.add(
+        _Sample(time_s, heading, tracker.doubt, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
+    )
 
 
 @contextmanager

@@ -15,6 +15,9 @@ _LONG_SIDE, _CORNERS, _QUALITY, _APART = 400, 200, 0.01, 6
 _LEAST, _TOGETHER = 8, 3.0
 # Field of view of the shorter side of phones' films, and the step of kept frames as a share of the field.
 _USUAL_FIELD, _STEP_SHARE = math.radians(53.0), 0.25
+# Error of the turn (radians) to a sample that shows nothing to follow: as a share of the turn before, at least, and
+# where nothing was followed before.
+_GUESSED_SHARE, _GUESSED, _GUESSED_FIRST = 0.3, math.radians(1.0), math.radians(4.0)
 # Walking: change of size (natural logarithm) over the film, or of the share of corners that move together.
 _GROWN, _APART_SHARE = math.log(1.6), 0.45
 # Shaking: nod (radians) between samples.
@@ -26,6 +29,7 @@ class FlowTracker:
 
     Attributes:
         heading: angle (radians) since the first sample, clockwise.
+        doubt: sum of the errors (radians) that guesses of lost samples can have made.
         step: angle (radians) between frames that are kept.
         scale: factor that makes headings those of the true field of view; see `calibrate`.
     """
@@ -33,6 +37,7 @@ class FlowTracker:
     def __init__(self, hfov: float | None = None) -> None:
         """Begin with the horizontal field of view (radians); None for that of phones."""
         self.heading, self.step = 0.0, _STEP_SHARE * (hfov or _USUAL_FIELD)
+        self.doubt = 0.0
         self.scale = 1.0
         self._hfov = hfov
         self._before: UInt8[np.ndarray, "h w"] | None = None
@@ -55,6 +60,7 @@ class FlowTracker:
         if moved is None:
             # Blank or blurred: the turn goes on as before.
             self._lost += 1
+            self.doubt += max(_GUESSED_SHARE * abs(self._speed), _GUESSED) if self._shares else _GUESSED_FIRST
         else:
             # Angles, because pixels near the border are narrower.
             angles = np.arctan(moved.places / self._focal(small))

@@ -58,7 +58,7 @@ def compose_answer(
         warnings: warnings besides those about the heading and the photograph.
         with_step: compute the next step of an answer that is not sure.
     """
-    model = bundle.manifest.confidence_for(view=found.query.is_view)
+    model = bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
     final, uncertainty = found.best[found.stage], None
     if model is not None and final.information is not None:
         placed = ground.place(final)

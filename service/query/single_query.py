@@ -95,7 +95,7 @@ class SingleSearch:
         if isinstance(where, PlanRecord):
             wanted = query.form.include == "posterior"
             return {"posterior": posterior_answer(ground, found.posterior)} if wanted else {}
-        model = self._parts.bundle.manifest.confidence_for(view=found.query.is_view)
+        model = self._parts.bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
         confidence = found.confidence(model, ground.share(found))
         plans = ground.plan_probabilities(found, None if confidence is None else confidence.fit)
         return {"venue_id": where.id, "plans": plans[: query.form.top_k]}

@@ -14,7 +14,8 @@ from lalaloc_client import ConflictError, InvalidError, OnDeviceError, Unauthori
 from lalaloc_core.bundle import MANIFEST_NAME, default_bundle
 from lalaloc_core.localise.encode.features import DEVICE_FILES
 from tests.client.conftest import FailingServer, MakeClient, Planned
-from tests.core.taken import EXAMPLES
+from tests.core.filmed import encode, needs_ffmpeg, turn
+from tests.core.taken import EXAMPLES, jpeg
 from tests.service.conftest import StartApp, upload
 
 KITCHEN, PHONE = EXAMPLES / "kitchen.jpg", EXAMPLES / "phone.jpg"
@@ -58,6 +59,52 @@ def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) ->
     assert len(found.poses) == 2
     with pytest.raises(OnDeviceError, match="hfov_deg is 900"):
         service.localise(home, PHONE, on_device=True, hfov_deg=900.0)
+
+
+@needs_ffmpeg
+@pytest.mark.slow
+def test_film_stays_on_the_device(service: Any, home: str, tmp_path: Path) -> None:
+    path = tmp_path / "turn.mp4"
+    content = encode(turn()[:46], path)
+    with pytest.raises(UnauthorisedError, match="features-required"):
+        service.localise_film(home, path, hfov_deg=53.0, refine="none")
+    answer = service.localise_film(home, content, on_device=True, hfov_deg=53.0)
+    assert answer.poses[0].room == "living room"
+    assert answer.film is not None
+    assert (answer.film.frames_read, answer.film.frames_kept) == (46, len(answer.poses))
+    times_s = [pose.time_s for pose in answer.poses]
+    assert times_s == sorted(times_s)
+    assert 0.0 <= times_s[0] < times_s[-1] <= answer.film.duration_s
+    # The camera turns by 60° in a second, which the service knows as stated.
+    for pose in answer.poses:
+        angle = pose.view.relative_heading
+        assert angle.source == "given"
+        missed_deg = angle.value_deg - 60.0 * (pose.time_s - times_s[0])
+        assert (missed_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=2.0)
+    with pytest.raises(OnDeviceError, match="is no MP4, MOV or WebM film"):
+        service.localise_film(home, b"no film", on_device=True)
+
+
+def test_photographs_of_a_turn_are_linked_on_the_device(service: Any, home: str) -> None:
+    frames = [jpeg(frame) for frame in turn()[:13:4]]
+    sent = service.encode_turn(frames, hfov_deg=53.0)
+    assert sent.relative_heading_deg == pytest.approx([0.0, 24.0, 48.0, 72.0], abs=1.0)
+    assert 0.5 <= sent.relative_heading_std_deg < 5.0
+    assert sent.film is None
+    found = service.localise_sequence(home, frames, motion="turn", on_device=True, hfov_deg=53.0, refine="none")
+    angles = [pose.view.relative_heading for pose in found.poses]
+    assert [angle.value_deg for angle in angles] == pytest.approx(sent.relative_heading_deg, abs=0.01)
+    again = service.localise_sequence(
+        home,
+        sent.features,
+        motion="turn",
+        relative_heading_deg=sent.relative_heading_deg,
+        relative_heading_std_deg=sent.relative_heading_std_deg,
+        refine="none",
+    )
+    assert again.poses[0].position == found.poses[0].position
+    # Of features, nothing overlaps.
+    assert service.encode_turn(sent.features).relative_heading_deg is None
 
 
 def test_damaged_cache_is_loaded_again(service: Any, home: str, cache: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -11,12 +12,15 @@ from pathlib import Path
 import pytest
 
 from lalaloc_core.bundle import default_bundle
+from lalaloc_core.photograph.cameras import Perspective
+from tests.core.taken import jpeg, sphere, take
 from tests.service.conftest import StartApp
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "clients" / "typescript"
 _RUN = """
 import { readFileSync } from "node:fs";
+import { Client } from "lalaloc-client";
 import { findHeading, findRooms } from "./example.js";
 
 const [plan, photo] = process.argv.slice(2).map((path) => new Blob([readFileSync(path)]));
@@ -25,6 +29,14 @@ const { floorplans } = await (await fetch("ADDRESS/floorplans")).json();
 console.log(await findHeading(floorplans[0].id, photo, AbortSignal.timeout(60000)));
 console.log(await findHeading(floorplans[0].id, plan, AbortSignal.timeout(60000)));
 console.log(await findHeading("f".repeat(32), photo, AbortSignal.timeout(60000)).catch((error) => error.slug));
+const service = new Client({ baseUrl: "ADDRESS" });
+const fields = { floorplan_id: floorplans[0].id, hfov_deg: 53, refine: "none" };
+const frames = process.argv.slice(4).map((path) => new Blob([readFileSync(path)]));
+for (const headings of [[0, 40], [null, null]]) {
+  const turn = frames.map((picture, index) => ({ picture, headingDeg: headings[index] }));
+  const { poses } = await service.localiseTurn(fields, turn);
+  console.log(JSON.stringify(poses.map(({ view }) => view.relative_heading)));
+}
 """
 
 
@@ -110,11 +122,20 @@ def test_readme_example_works_in_node(start_app: StartApp, folder: Path, tmp_pat
         (folder / "run.js").write_text(_RUN.replace("ADDRESS", address))
         strict = ["--strict", "--target", "ES2022", "--module", "nodenext", "--lib", "ES2022,DOM,DOM.Iterable"]
         tsc(*strict, "example.ts", cwd=folder)
-        printed = run_node(folder, ROOT / "examples" / "flat.json", ROOT / "examples" / "study.jpg")
-    rooms, heading, unread, unknown = printed.splitlines()
+        files = [ROOT / "examples" / name for name in ("flat.json", "study.jpg")]
+        camera = Perspective.of_hfov(360, 480, math.radians(53.0))
+        for heading_deg in (0.0, 40.0):
+            files.append(folder / f"{heading_deg:g}.jpg")
+            files[-1].write_bytes(jpeg(take(sphere("study"), camera, heading_deg=heading_deg)))
+        printed = run_node(folder, *files)
+    rooms, heading, unread, unknown, given, overlap = printed.splitlines()
     assert re.fullmatch(r'\["(bedroom|study)","not localised: .*"\]', rooms, re.IGNORECASE), rooms
     assert 0.0 <= float(heading) < 360.0
     assert (unread, unknown) == ("null", "unknown-floorplan")
+    assert [(angle["value_deg"], angle["source"]) for angle in json.loads(given)] == [(0, "given"), (40, "given")]
+    first, second = json.loads(overlap)
+    assert (first["source"], second["source"]) == ("estimated", "estimated")
+    assert second["value_deg"] == pytest.approx(40.0, abs=2.0)
 
 
 def test_album_is_pinned_corrected_and_deleted(start_app: StartApp, folder: Path, tmp_path: Path) -> None:

@@ -79,6 +79,27 @@ def test_times_are_those_of_the_frames(h264: bytes, tmp_path: Path) -> None:
     assert not [time_s for time_s in film.times_s if 3.1 < time_s < 4.9]
 
 
+def test_frames_at_the_rate_of_samples_are_all_used(tmp_path: Path) -> None:
+    source, target = tmp_path / "turn.mp4", tmp_path / "turn.webm"
+    encode(turn()[:30], source)
+    # Times in WebM are whole milliseconds.
+    run("-r", "12", "-i", str(source), *VP9, str(target))
+    film = read_film(target.read_bytes(), stated=FIELD)
+    assert film.frames == 30
+    assert "between samples" not in film.dropped
+
+
+def test_blank_frames_at_unknown_angles_are_left_out(tmp_path: Path) -> None:
+    blank = np.full_like(turn()[0], 128)
+    frames = [*turn()[:31], *[blank] * 12, *turn()[43:61]]
+    film = read_film(encode(frames, tmp_path / "wall.mp4"), stated=FIELD)
+    assert film.dropped["blank, at an unknown angle"] >= 2
+    assert len(film.photographs) + sum(film.dropped.values()) == film.frames
+    # The two sides of the wall overlap where the turn closes.
+    assert misses_deg(film).max() < 4.0
+    assert max(angle.heading_sd for angle in film.angles) < math.radians(5.0)
+
+
 def zoomed(index: int) -> np.ndarray:
     frame, share = turn()[0], 1.0 - 0.012 * index
     height, width = (round(share * side) for side in frame.shape[:2])

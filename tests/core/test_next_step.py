@@ -39,6 +39,7 @@ def _known(*places: tuple[float, float, float], fit: float = 1.0, **facts: objec
     heading = np.radians([place[2] for place in places])
     support = Support(np.arange(len(places)), position_m, heading, np.full(len(places), 1.0 / len(places)))
     facts = {"arcs": [(-_FIELD / 2, _FIELD / 2)], "field": _FIELD, "height_m": 1.5, "is_view": True} | facts
+    facts = {"answer": 1.0} | facts
     return Known(support=support, fit=fit, **facts)  # pyright: ignore[reportArgumentType]
 
 
@@ -69,6 +70,15 @@ def test_heading_tells_places_apart_that_look_along_other_azimuths(manifest: Man
     assert steps["heading"].confidence == pytest.approx(1.0)
     assert steps["heading"].bits == pytest.approx(math.log2(3.0), abs=0.01)
     assert "heading" not in _steps(_plan(), manifest, _known(*places, heading=True))
+
+
+def test_statements_presume_that_the_answer_has_less_than_the_largest_share(manifest: Manifest) -> None:
+    places = [(2.0, 1.5, 0.0), (12.0, 1.5, 90.0)]
+    # Half of the posterior is near the best place, but only 0.4 near the one that fits best.
+    steps = _steps(_plan(), manifest, _known(*places, fit=0.9, answer=0.4))
+    assert steps["heading"].confidence == pytest.approx(0.9 * 0.8)
+    assert steps["rooms"].confidence == pytest.approx(0.9 * 0.8)
+    assert steps["rooms"].bits == pytest.approx(1.0)
 
 
 def test_turn_tells_rooms_of_other_sizes_apart_but_not_equal_ones(manifest: Manifest) -> None:

@@ -12,13 +12,14 @@ from pathlib import Path
 import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, CDPSession, Page, expect
 
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import jpeg, sphere, take
 from tests.service.conftest import StartApp, upload
 from tests.web.conftest import _ARGUMENTS, _BROWSERS, EXAMPLES, PHONE, Visit, visit, wait_until
+from tests.web.test_on_device import BOX, SLOW_MS, recorded
 
 FLAT = json.loads((EXAMPLES / "flat.json").read_text())
 STEP_DEG = 3.0
@@ -73,6 +74,12 @@ def _open(visited: Visit) -> Page:
     return page
 
 
+def _hold(protocol: CDPSession, alpha: float, beta: float = 90.0) -> None:
+    """Turn the phone; alpha grows to the left."""
+    angles = {"alpha": alpha, "beta": beta, "gamma": 0.0}
+    protocol.send("DeviceOrientation.setDeviceOrientationOverride", angles)
+
+
 def _no_violations(page: Page) -> None:
     results = Axe().run(page)
     assert results.violations_count == 0, results.generate_report()
@@ -104,23 +111,99 @@ def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
 def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
     page = _open(phone)
     protocol = page.context.new_cdp_session(page)
-
-    def hold(alpha: float, beta: float = 90.0) -> None:
-        angles = {"alpha": alpha, "beta": beta, "gamma": 0.0}
-        protocol.send("DeviceOrientation.setDeviceOrientationOverride", angles)
-
-    hold(0.0)
+    _hold(protocol, 0.0)
     find = page.locator("#look-dialog .primary")
     expect(find).to_have_text(re.compile("\\(1 photo"))
-    hold(0.0, beta=50.0)
+    _hold(protocol, 0.0, beta=50.0)
     expect(page.locator("#look-hint")).to_have_text("Hold the phone upright, and level.")
     # Alpha grows to the left. A phone at rest takes no second photograph.
     for number, alpha in enumerate((335.0, 310.0), start=2):
-        hold(alpha)
+        _hold(protocol, alpha)
         expect(find).to_have_text(re.compile(f"\\({number} photo"))
     find.click()
     expect(page.get_by_role("button", name="Show on the plan")).to_be_visible(timeout=60_000)
     expect(page.locator("#photo-strip li")).to_have_count(3)
+
+
+def test_only_features_leave_a_phone_with_the_box_ticked(camera: Browser, service: httpx.Client) -> None:
+    with recorded(service) as (wire, through):
+        for phone in visit(camera, through, viewport=PHONE, has_touch=True, is_mobile=True, permissions=PERMISSIONS):
+            page = phone.open_example()
+            page.get_by_label(BOX).check()
+            protocol = page.context.new_cdp_session(page)
+            page.get_by_role("button", name="Look around").click()
+            find = page.locator("#look-dialog .primary")
+            for number, alpha in enumerate((0.0, 335.0), start=1):
+                _hold(protocol, alpha)
+                expect(find).to_have_text(re.compile(f"\\({number} photo"))
+            before = len(wire.sent)
+            with page.expect_response("**/localise/sequence", timeout=SLOW_MS) as answered:
+                find.click()
+            angles = [pose["view"]["relative_heading"] for pose in answered.value.json()["poses"]]
+    assert [angle["source"] for angle in angles] == ["given", "given"]
+    assert angles[1]["value_deg"] == pytest.approx(25.0, abs=1.0)
+    sent = bytes(wire.sent[before:])
+    assert len(re.findall(rb'name="features".*?\r\n\r\nLLFT', sent, re.DOTALL)) == 2
+    assert b'name="photo"' not in sent
+    # No JPEG file leaves it.
+    assert b"\xff\xd8\xff" not in sent
+
+
+_ASKED = """
+globalThis.asked = [];
+DeviceOrientationEvent.requestPermission = async () => {
+  asked.push(navigator.userActivation.isActive);
+  if (asked.length === 1) throw new DOMException("", "NotAllowedError");
+  return "granted";
+};
+"""
+
+
+def test_gyroscope_is_asked_for_again_after_a_refusal(phone: Visit) -> None:
+    # As Safari on iOS asks, within the click.
+    phone.page.add_init_script(_ASKED)
+    page = _open(phone)
+    find = page.locator("#look-dialog .primary")
+    # Without it, the picture tells how far the camera has turned.
+    expect(find).to_have_text(re.compile("\\(2 photo"))
+    page.keyboard.press("Escape")
+    protocol = page.context.new_cdp_session(page)
+    page.get_by_role("button", name="Look around").click()
+    # The page waits for it; an angle that does not change is not told again.
+    _hold(protocol, 1.0)
+    expect(find).to_have_text(re.compile("\\(1 photo"))
+    _hold(protocol, 335.0)
+    expect(find).to_have_text(re.compile("\\(2 photo"))
+    with page.expect_response("**/localise/sequence", timeout=120_000) as answered:
+        find.click()
+    angles = [pose["view"]["relative_heading"]["source"] for pose in answered.value.json()["poses"]]
+    assert angles == ["given", "given"]
+    assert page.evaluate("asked") == [True, True]
+
+
+def test_hints_for_walking_and_for_the_dark(phone: Visit) -> None:
+    page = _open(phone)
+    protocol, hint = page.context.new_cdp_session(page), page.locator("#look-hint")
+    _hold(protocol, 0.0)
+    expect(page.locator("#look-dialog .primary")).to_have_text(re.compile("\\(1 photo"))
+    walk = "dispatchEvent(new DeviceMotionEvent('devicemotion', { acceleration: { x: 2, y: 0, z: 3 } }))"
+    page.evaluate(f"for (let event = 0; event < 60; event++) {walk}")
+    expect(hint).to_have_text("Stay on the spot: turn without walking.")
+    stand = walk.replace("x: 2, y: 0, z: 3", "x: 0.1, y: 0, z: 0.1")
+    page.evaluate(f"for (let event = 0; event < 120; event++) {stand}")
+    expect(hint).to_have_text("Turn slowly to the right.")
+    page.evaluate(
+        """() => {
+        const canvas = Object.assign(document.createElement('canvas'), { width: 360, height: 640 });
+        const context = canvas.getContext('2d');
+        context.fillStyle = '#0a0a0a';
+        setInterval(() => context.fillRect(0, 0, 360, 640), 50);
+        document.querySelector('#look-dialog video').srcObject = canvas.captureStream(20); }"""
+    )
+    _hold(protocol, 320.0)
+    expect(hint).to_have_text("Too dark: switch on a light.")
+    # Nothing is taken in the dark.
+    expect(page.locator("#look-dialog .primary")).to_have_text(re.compile("\\(1 photo"))
 
 
 def test_camera_stops_with_the_dialog_by_keyboard_alone(phone: Visit) -> None:

@@ -21,6 +21,12 @@ export type Fields<Name extends keyof operations> = Form<Name> | Text;
 /** Photograph, or its features instead, with which it stays on the device: docs/reference/features.md. */
 export type Picture = Blob | { features: Blob };
 
+/** Picture of a turn with its heading relative to the other pictures, clockwise, as a gyroscope or `lalaloc encode --turn` tells it; null: unknown. */
+export interface TurnPicture {
+  picture: Picture;
+  headingDeg: number | null;
+}
+
 export interface ClientOptions {
   /** Address of the service. Default: the server of the page. */
   baseUrl?: string;
@@ -102,6 +108,16 @@ export class Client {
   /** Localise photographs of one visit, in the order in which they were taken; all of them as features, or none. */
   localiseSequence = (fields: Fields<"localiseSequence">, photos: Picture[], options: CallOptions = {}) =>
     this.json<Schemas["SequenceAnswer"]>("/localise/sequence", { ...options, ...query(fields, ...photos) });
+  /**
+   * Localise pictures that were taken while turning on the spot, such as frames of a film that were saved as images. Angles
+   * that are all null follow from what photographs show twice; features have no pictures, so state theirs.
+   */
+  localiseTurn = (fields: Fields<"localiseSequence">, turn: TurnPicture[], options: CallOptions = {}) => {
+    const known = turn.some(({ headingDeg }) => headingDeg !== null);
+    const angles = known ? { relative_heading_deg: turn.map(({ headingDeg }) => headingDeg) } : {};
+    const pictures = turn.map(({ picture }) => picture);
+    return this.localiseSequence({ ...fields, motion: "turn", ...angles }, pictures, options);
+  };
   /** Localise many photographs, each by itself; yield a line for each, in order, as they are computed. */
   async *localiseBatch(
     fields: Fields<"localiseBatch">,

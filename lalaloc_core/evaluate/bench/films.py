@@ -1,4 +1,4 @@
-"""Accuracy of turns once around: photographs with stated angles and by overlap, with the parallax of an arm."""
+"""Accuracy of turns once around: photographs with stated angles and by overlap, and films, at the end of an arm."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.evaluate.bench.annotated_films import FILMING, annotated_films
 from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
-from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
-from lalaloc_core.learn.data.synthetic.turned import Frame, Phone, photographs_of_turn
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RendererCache, split_renderer_cache
+from lalaloc_core.learn.data.synthetic.hand_held import encode_film, turn_by_hand
+from lalaloc_core.learn.data.synthetic.turned import Frame, Phone, film_of_turn, photographs_of_turn
 from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.film import read_film
 from lalaloc_core.photograph.turn_angles import TurnAngles
 
 # Photographs once around; a spot per home, so that figures are of many homes.
@@ -42,10 +46,12 @@ class _Row(NamedTuple):
     field_share: float
 
 
-def bench_films(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure turns of twelve photographs of 53° portrait in furnished test homes, with an arm of 0.4 m.
+def bench_films(bundle: Bundle, homes: int, textures: Path | None, annotated: Path | None) -> dict[str, Any]:
+    """Measure turns of twelve photographs of 53° portrait in furnished test homes, with an arm of 0.4 m, and films.
 
-    The heading is unknown. The angles are stated, or follow from overlap, with the field of view stated or unknown.
+    The heading is unknown. The angles are stated, or follow from overlap, with the field of view stated or unknown. A
+    film lasts 8 s, nothing is stated about it, and a hand holds the phone. With `annotated`, a folder of annotated
+    photographs, films are cut from these; see `annotated_films`.
     """
     model, phone = LocalModel(bundle), Phone()
     renderers = split_renderer_cache(_SPLIT, 0, textures)
@@ -56,7 +62,27 @@ def bench_films(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, 
         frames = photographs_of_turn(shot, renderers, phone, _PHOTOGRAPHS, rng)
         for name, row in _of_turn(model, shot, frames, phone).items():
             rows.setdefault(name, []).append(row)
-    return {name: _summary(found) for name, found in rows.items()}
+        rows.setdefault("film", []).append(_of_film(model, shot, renderers, rng))
+    report: dict[str, Any] = {name: _summary(found) for name, found in rows.items()}
+    return report if annotated is None else report | annotated_films(model, annotated)
+
+
+def _of_film(model: LocalModel, shot: Shot, renderers: RendererCache, rng: np.random.Generator) -> _Row:
+    """Return the result for a film."""
+    instants = turn_by_hand(rng)
+    content = encode_film(film_of_turn(shot, renderers, FILMING, instants))
+    film = read_film(content, patch_size=patch_size(model.bundle.manifest))
+    times_s = [instant.time_s for instant in instants]
+    turns = np.interp(film.times_s, times_s, [instant.turn for instant in instants])
+    height = CameraHeight(shot.camera_height_m)
+    grid = model.grid(shot.home.plan, shot.camera_height_m)
+    found = model.localise_turn(shot.home.plan, grid, film.photographs, LinkedTurn.of(film.angles), height)
+    errors = _angle_errors(film.photographs, film.angles, (turns - turns[0]).tolist(), FILMING)
+    row = _row(model, found, shot, errors)
+    # The first frame that is kept need not look along the shot's heading.
+    picture = found.pictures[0]
+    turned = photograph_heading(picture.query, picture.candidates[0]) - shot.heading - float(turns[0])
+    return row._replace(turned=abs(float(wrap_angle(turned))))
 
 
 def _of_turn(model: LocalModel, shot: Shot, frames: Sequence[Frame], phone: Phone) -> dict[str, _Row]:

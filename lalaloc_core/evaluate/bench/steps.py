@@ -166,7 +166,7 @@ class _Visit:
         return localise(plan, self.grid, self.model.encoder, query, refiner=self.model.refiner, hints=hints)
 
     def _confidence(self, found: Localisation) -> Confidence | None:
-        return found.confidence(self.model.bundle.manifest.confidence_for(view=True))
+        return found.confidence(self.model.bundle.manifest.confidence_for(view=True, turn=found.query.is_turn))
 
     def _outcome(self, found: Localisation) -> tuple[float, float]:
         confidence = self._confidence(found)

@@ -60,7 +60,7 @@ def _at_spot(spot: Spot, model: LocalModel) -> dict[str, _Answer]:
         return model.localise(plan, grid, query)
 
     known = as_one(spot.turns)
-    believed = known.confidence(manifest.confidence_for(view=True))
+    believed = known.confidence(manifest.confidence_for(view=True, turn=True))
     motions = [Motion(distance_m=0.0, distance_std_m=_TURNED_STD_M)] * (len(views) - 1)
     queries = [encoder.query(view, None, height) for view in opened]
     unknown = localise_sequence(plan, grid, model.encoder, queries, motions, refiner=refine_sequence)

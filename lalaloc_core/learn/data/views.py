@@ -13,7 +13,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
@@ -175,9 +175,17 @@ def encode_jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 
 def cut_view(
-    sphere: UInt8[np.ndarray, "h w 3"], camera: Perspective, *, azimuth: float, pitch: float, roll: float
+    sphere: UInt8[np.ndarray, "h w 3"],
+    camera: Perspective,
+    *,
+    azimuth: float | Float[np.ndarray, "h2 1"],
+    pitch: float,
+    roll: float,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Return what a camera sees of a sphere: its centre at an azimuth relative to the sphere's, its tilt in radians."""
+    """Return what a camera sees of a sphere: its centre at an azimuth relative to the sphere's, its tilt in radians.
+
+    Each row has an azimuth of its own if several are given, as under a rolling shutter.
+    """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1)) @ camera_axes(pitch=pitch, roll=roll)
     right, ahead, up = np.moveaxis(rays, -1, 0)

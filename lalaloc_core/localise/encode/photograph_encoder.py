@@ -93,8 +93,9 @@ class PhotographEncoder(LayoutEncoder):
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
         objects = self._seen_objects(turned)
-        searched = None if query.searched is None else replace(query.searched, objects=objects)
-        return replace(query, objects=objects, searched=searched)
+        several = {"objects": objects, "is_turn": bool(others)}
+        searched = None if query.searched is None else replace(query.searched, **several)
+        return replace(query, **several, searched=searched)
 
     def with_features(self, photograph: Photograph) -> Photograph:
         """Return a decoded photograph with its features, as for albums: those of spheres have an empty ring.

@@ -5,7 +5,8 @@ with it. For another photograph, predictions are drawn at some of the places, as
 compared with what all places would show. The work is bounded for plans of any size.
 
 The expected confidence is the probability that the photograph is of the plan, times the expected share of the
-posterior within 1 m of its best place after the step.
+posterior within 1 m of its best place after the step. The answer is the place that fits best, near which the share need
+not be the largest. Statements leave that as it is: the share after one is lower by the factor of the answer's share.
 """
 
 from __future__ import annotations
@@ -74,6 +75,7 @@ class Known:
     Attributes:
         support: its posterior.
         fit: probability that the photograph is of the plan.
+        answer: share of the posterior within 1 m of the answer.
         arcs: azimuths (radians, first and last) that were seen, relative to the photograph's centre.
         field: horizontal field of view (radians) of another photograph; 2π for spheres.
         height_m: the camera height.
@@ -84,6 +86,7 @@ class Known:
 
     support: Support
     fit: float
+    answer: float
     arcs: Sequence[tuple[float, float]]
     field: float
     height_m: float
@@ -189,13 +192,14 @@ def near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n
 def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[NextStep]:
     """Yield the steps that state the heading or choose a room."""
     every, weight = np.arange(len(belief.weight)), belief.weight
+    fit = known.fit * min(known.answer / belief.share, 1.0)
     # The mean over places takes each as often as it is probable.
     drawn = every[np.minimum(np.searchsorted(np.cumsum(weight), (every + 0.5) / len(every)), len(every) - 1)]
     if not known.heading:
         told = [belief.heading[drawn] + share * HEADING_ERROR for share in _HEADINGS_TOLD]
         agree = np.abs(wrap_angle(np.concatenate(told)[:, None] - belief.heading[None])) <= HEADING_ERROR
         bits, share = belief.told(agree.astype(float))
-        yield NextStep(kind="heading", bits=bits, confidence=known.fit * share)
+        yield NextStep(kind="heading", bits=bits, confidence=fit * share)
     room = belief.poses.room_index
     mass = np.bincount(room, weight, minlength=len(plan.rooms))
     probable = np.argsort(-mass, kind="stable")[: np.count_nonzero(mass >= _MIN_ROOM)]
@@ -206,7 +210,7 @@ def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[Next
         return
     bits, share = belief.told((kinds[room[drawn]][:, None] == kinds[room][None]).astype(float))
     rooms = tuple(int(index) for index in probable[:_ROOMS])
-    yield NextStep(kind="rooms", bits=bits, confidence=known.fit * share, rooms=rooms)
+    yield NextStep(kind="rooms", bits=bits, confidence=fit * share, rooms=rooms)
 
 
 class _Door(NamedTuple):

@@ -57,6 +57,7 @@ def known_of(
     return Known(
         support=found.posterior.support,
         fit=confidence.fit,
+        answer=found.posterior.position,
         arcs=arcs,
         field=field if is_view else TWO_PI,
         height_m=found.camera_height_m,

@@ -36,6 +36,7 @@ class Query:
         objects: recognised objects, whose room type replaces `room_type`; None if the model recognises none.
         searched: the same photograph with an unknown heading, to doubt a given one; None if the heading is unknown.
         is_view: whether the encoder of views read it, which has matching weights and confidence of its own.
+        is_turn: whether it is several views from one spot, which have a confidence of their own.
     """
 
     latents: Float[np.ndarray, "k d"]
@@ -50,6 +51,7 @@ class Query:
     objects: SeenObjects | None = None
     searched: Query | None = None
     is_view: bool = False
+    is_turn: bool = False
 
     def scaled(self, offset: float) -> Query:
         """Return the query if the camera stood higher by the factor `exp(offset)`."""

@@ -66,7 +66,9 @@ class SequenceLocalisation:
 
         `share` is the lowest probability that a picture is of the plans that were searched.
         """
-        models = [manifest.confidence_for(view=picture.query.is_view) for picture in self.pictures]
+        models = [
+            manifest.confidence_for(view=picture.query.is_view, turn=picture.query.is_turn) for picture in self.pictures
+        ]
         alone = [picture.confidence(model, share) for model, picture in zip(models, self.pictures, strict=True)]
         fits = [confidence.fit for confidence in alone if confidence is not None]
         return min(fits) * min(self.path_probability, 1.0) if len(fits) == len(alone) else None

@@ -14,6 +14,8 @@ export interface Attitude {
 // Smoothed acceleration (m/s²) of a person who walks; of one who turns it is far smaller.
 const WALKING = 1.4,
   SMOOTHING = 0.05;
+// Longest wait for the first direction; devices without a gyroscope tell none.
+const FIRST_MS = 1000;
 
 interface WithPermission {
   requestPermission?: () => Promise<"granted" | "denied">;
@@ -42,7 +44,7 @@ export class Orientation {
   attitude: Attitude | null = null;
   private acceleration = 0;
 
-  /** Ask for the permission that iOS wants, which needs the user's click, and follow the sensors. */
+  /** Ask for the permission that iOS wants, which needs the user's click, and follow the sensors; wait for the first direction. */
   async start(): Promise<void> {
     this.attitude = null;
     this.acceleration = 0;
@@ -52,8 +54,13 @@ export class Orientation {
     } catch {
       // Without the permission there are no events, and overlap tells the angles.
     }
-    addEventListener("deviceorientation", this.onTurn);
     addEventListener("devicemotion", this.onMove);
+    // A photograph before the first direction would leave the directions of all others unused.
+    await new Promise<void>((done) => {
+      addEventListener("deviceorientation", this.onTurn);
+      addEventListener("deviceorientation", () => done(), { once: true });
+      setTimeout(done, FIRST_MS);
+    });
   }
 
   stop(): void {

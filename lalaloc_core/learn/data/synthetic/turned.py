@@ -14,13 +14,16 @@ from jaxtyping import UInt8
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
+from lalaloc_core.learn.data.synthetic.hand_held import Instant, exposed
 from lalaloc_core.learn.data.views import cut_view, tilt_by_hand
 from lalaloc_core.learn.synth.rendering.panorama import Window
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot
 from lalaloc_core.photograph.cameras import Perspective
 
-# Part of the sphere that is rendered for a frame, with room for tilts, and its width in pixels.
+# Parts of the sphere that are rendered for a picture, with room for tilts, and their sizes: a finer one, and one for
+# cameras of at most so many pixels a radian.
 _WINDOW, _WINDOW_SIZE = Window(math.radians(100.0), math.radians(56.0)), (1008, 900)
+_COARSE_WINDOW, _COARSE_WINDOW_SIZE, _COARSE = Window(math.radians(75.0), math.radians(50.0)), (650, 488), 370.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,16 +76,31 @@ def _frames(
     shot: Shot, renderers: RendererCache, phone: Phone, poses: Sequence[tuple[float, float, float]]
 ) -> Iterator[Frame]:
     """Yield the picture of each pose: heading, pitch and roll."""
-    arm_m, camera = arm_within(shot, phone.arm_m), phone.camera
-    renderer = renderers.renderer(*_WINDOW_SIZE, (1, 1), _WINDOW)
-    rows, columns = _WINDOW_SIZE
     for heading, pitch, roll in poses:
-        place = shot.position_m + arm_m * np.array([math.sin(heading), math.cos(heading)])
-        turned = dataclasses.replace(shot, position_m=place, heading=heading % TWO_PI)
-        seen = renderer.render([turned])[0].cpu().numpy()
-        # The sphere around the part that is rendered, at its resolution.
-        width = round(columns * TWO_PI / _WINDOW.width)
-        sphere = np.full((width // 2, width, 3), 127, np.uint8)
-        top, left = round((0.5 - _WINDOW.top / math.pi) * (width // 2)), (width - columns) // 2
-        sphere[top : top + rows, left : left + columns] = seen
-        yield Frame(cut_view(sphere, camera, azimuth=0.0, pitch=pitch, roll=roll), heading, pitch, roll)
+        sphere = _seen_from(shot, renderers, phone, heading)
+        yield Frame(cut_view(sphere, phone.camera, azimuth=0.0, pitch=pitch, roll=roll), heading, pitch, roll)
+
+
+def film_of_turn(
+    shot: Shot, renderers: RendererCache, phone: Phone, instants: Sequence[Instant]
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Yield the frames of a film that a phone at arm's length takes; the first looks along the shot's heading."""
+    for instant in instants:
+        sphere = _seen_from(shot, renderers, phone, shot.heading + instant.turn)
+        yield exposed(sphere, phone.camera, instant, azimuth=0.0)
+
+
+def _seen_from(shot: Shot, renderers: RendererCache, phone: Phone, heading: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Render a part of the sphere at the end of the arm; the rest is grey."""
+    is_coarse = phone.camera.fx <= _COARSE
+    window, size = (_COARSE_WINDOW, _COARSE_WINDOW_SIZE) if is_coarse else (_WINDOW, _WINDOW_SIZE)
+    place = shot.position_m + arm_within(shot, phone.arm_m) * np.array([math.sin(heading), math.cos(heading)])
+    turned = dataclasses.replace(shot, position_m=place, heading=heading % TWO_PI)
+    seen = renderers.renderer(*size, (1, 1), window).render([turned])[0].cpu().numpy()
+    rows, columns = size
+    # The sphere around the part that is rendered, at its resolution.
+    width = round(columns * TWO_PI / window.width)
+    sphere = np.full((width // 2, width, 3), 127, np.uint8)
+    top, left = round((0.5 - window.top / math.pi) * (width // 2)), (width - columns) // 2
+    sphere[top : top + rows, left : left + columns] = seen
+    return sphere

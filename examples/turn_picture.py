@@ -1,0 +1,98 @@
+"""Draw docs/images/turn.jpg: a turn in the example flat, and its place by one photograph and by all of them.
+
+Run `python -m examples.turn_picture` after a change of the flat, the renderer or the model.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from examples.truth import FOLDER, PLAN_PATH
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.draw.answer import draw_answer, drawn_answer
+from lalaloc_core.draw.canvas import MUTED, document, image, jpeg, pixels, words
+from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.views import cut_view, encode_jpeg
+from lalaloc_core.localise.query import stated_height
+from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+from lalaloc_core.photograph import Photograph, StatedCamera
+from lalaloc_core.photograph.cameras import Perspective
+
+_COUNT, _FIELD_DEG, _SIZE = 12, 53.0, (360, 480)
+_SPHERE = FOLDER / "bedroom.jpg"
+# Size of the picture's parts, pixels.
+_WIDTH, _GAP, _HEAD = 1200, 12, 40
+_PICTURE, _QUALITY = FOLDER.parent / "docs" / "images" / "turn.jpg", 85
+
+
+def main() -> None:
+    """Draw and write the picture."""
+    plan, model = FloorPlan.from_json(PLAN_PATH.read_bytes()), LocalModel(Bundle.open(default_bundle()))
+    frames = _frames()
+    photographs, angles = model.open_turn(
+        [encode_jpeg(frame) for frame in frames], StatedCamera(projection="perspective", hfov_deg=_FIELD_DEG)
+    )
+    height, linked = stated_height(plan, None), LinkedTurn.of(angles)
+    grid = model.grid(plan, height.height_m)
+    manifest = model.bundle.manifest
+
+    def drawn(found: Localisation, photograph: Photograph) -> tuple[bytes, float]:
+        confidence_model = manifest.confidence_for(view=True, turn=found.query.is_turn)
+        answer = drawn_answer(plan, grid, found, confidence_model, "estimated", photograph=photograph)
+        return _jpeg(pixels(draw_answer(answer, None, "plan"))), answer.confidence or 0.0
+
+    alone = model.localise(plan, grid, model.encoder.query(photographs[0], None, height))
+    turn = model.localise_turn(plan, grid, photographs, linked, height).pictures[0]
+    _write(frames, [drawn(alone, photographs[0]), drawn(turn, photographs[0])])
+
+
+def _frames() -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Return the photographs that a phone takes once around."""
+    with Image.open(_SPHERE) as picture:
+        sphere = np.asarray(picture.convert("RGB"))
+    camera = Perspective.of_hfov(*_SIZE, math.radians(_FIELD_DEG))
+    turns = (2.0 * math.pi * number / _COUNT for number in range(_COUNT))
+    return [cut_view(sphere, camera, azimuth=turn, pitch=0.0, roll=0.0) for turn in turns]
+
+
+def _write(frames: Sequence[UInt8[np.ndarray, "h w 3"]], plans: Sequence[tuple[bytes, float]]) -> None:
+    """Compose the photographs above the plans."""
+    width = (_WIDTH - _GAP) / _COUNT - _GAP
+    tall = width * _SIZE[1] / _SIZE[0]
+    parts = [
+        image(jpeg(frame), "jpeg", (_GAP + number * (width + _GAP), _GAP, width, tall))
+        for number, frame in enumerate(frames)
+    ]
+    half, top = (_WIDTH - _GAP) / len(plans) - _GAP, 2 * _GAP + tall
+    below = 0.0
+    for number, ((content, confidence), text) in enumerate(
+        zip(plans, ("The first photograph alone", f"All {_COUNT}, taken while turning"), strict=True)
+    ):
+        left = _GAP + number * (half + _GAP)
+        with Image.open(io.BytesIO(content)) as picture:
+            size = picture.size
+        high = half * size[1] / size[0]
+        parts.append(words(left, top + 26, f"{text}: confidence {100.0 * confidence:.0f} %", 20, fill=MUTED))
+        parts.append(image(content, "jpeg", (left, top + _HEAD, half, high)))
+        below = max(below, top + _HEAD + high + _GAP)
+    drawing = pixels(document(_WIDTH, round(below), "A turn on the spot and its place", parts))
+    drawing.save(_PICTURE, quality=_QUALITY, optimize=True)
+    print(_PICTURE)
+
+
+def _jpeg(picture: Image.Image) -> bytes:
+    content = io.BytesIO()
+    picture.convert("RGB").save(content, "JPEG", quality=95)
+    return content.getvalue()
+
+
+if __name__ == "__main__":
+    main()
