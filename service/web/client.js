@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-Y5OS2IJ7.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,b}from"./chunk-UW6VTKS6.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};

@@ -86,6 +86,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
+    budget.begin("finding doors and walls")
     marked = marked_rooms(drawing, builder)
     lines = [stroke for stroke in drawing.strokes if stroke.role in (None, "wall")]
     walls = take_leaves(lines, drawing.swings, drawing.areas)
@@ -107,6 +108,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         if budget.trace is not None:
             budget.trace.add("wall", [reading.walls])
             budget.trace.add("gap", [gap.shape for gap in gaps])
+    budget.begin("placing names and openings")
     sketch.rooms = name_rooms(shapes, drawing.letterings, builder, sketch.drawn)
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
