@@ -24,7 +24,7 @@ _MARGIN_M = 1.5
 # Walls between slanted rooms are wedges; openings lead through wedges up to this depth.
 _MAX_WALL_DEPTH_M = 0.8
 _PIXELS_PER_M = {"thin": 80.0, "thick": 80.0, "hatched": 80.0, "coloured": 80.0, "scanned": 60.0}
-_HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
+HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
 _PALE = ((250, 240, 220), (226, 240, 250), (232, 246, 228), (250, 232, 238), (246, 246, 236))
 _SHIFT = 4
 
@@ -63,21 +63,22 @@ class DrawnPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class _Model:
-    """Home to draw, in metres from the lower left corner of the sheet."""
+class Model:
+    """Home to draw, in metres from the lower left corner of the sheet, which lies at `origin_m` in the home's plan."""
 
     rooms: list[shapely.Polygon]
     names: list[str]
     openings: list[OpeningSymbol]
     walls: BaseGeometry
     size_m: tuple[float, float]
+    origin_m: tuple[float, float]
 
 
 def draw_plan(style: Style, seed: int) -> DrawnPlan:
     """Draw a generated home in one of the styles; the same for the same seed."""
     rng = np.random.default_rng([seed, STYLES.index(style)])
     thickness = float(rng.uniform(0.1, 0.25))
-    model = _model(generate_home(rng, replace(_HOME, wall_thickness_m=(thickness, thickness))), thickness)
+    model = model_of(generate_home(rng, replace(HOME, wall_thickness_m=(thickness, thickness))), thickness)
     sheet = _Sheet(model, _PIXELS_PER_M[style])
     if style == "coloured":
         sheet.colour(rng)
@@ -91,12 +92,13 @@ def draw_plan(style: Style, seed: int) -> DrawnPlan:
     rooms, openings = _as_seen(model)
     if style == "scanned":
         degrees = float(rng.uniform(1.0, 4.0) * rng.choice([-1.0, 1.0]))
-        picture = _scan(picture, degrees, rng)
+        picture = scan(picture, degrees, rng)
         # The importer turns a skewed drawing back about its centre, so the truth stays as drawn.
     return DrawnPlan(picture, 1.0 / sheet.pixels_per_m, rooms, openings)
 
 
-def _model(home: Home, thickness: float) -> _Model:
+def model_of(home: Home, thickness: float) -> Model:
+    """Return the walls and openings of a home whose walls are `thickness` metres thick."""
     corners = np.concatenate([room.polygon_m for room in home.plan.rooms])
     origin = corners.min(axis=0) - _MARGIN_M - thickness
     size = corners.max(axis=0) + _MARGIN_M + thickness - origin
@@ -107,7 +109,14 @@ def _model(home: Home, thickness: float) -> _Model:
     walls = walls.difference(
         shapely.unary_union([opening.cut.buffer(1e-4, join_style="mitre") for opening in openings])
     )
-    return _Model(rooms, [room.name for room in home.plan.rooms], openings, walls, (float(size[0]), float(size[1])))
+    return Model(
+        rooms,
+        [room.name for room in home.plan.rooms],
+        openings,
+        walls,
+        (float(size[0]), float(size[1])),
+        (float(origin[0]), float(origin[1])),
+    )
 
 
 def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[OpeningSymbol]:
@@ -150,7 +159,7 @@ def _cut_through(
     return shapely.union(shape, shapely.difference(shapely.Polygon([start, end, end + far, start + far]), inside))
 
 
-def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]:
+def _as_seen(model: Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]:
     """Return rooms and openings as a drawing shows them: wide openings without a symbol join rooms."""
     wide = [o for o in model.openings if o.kind == "passage" and math.dist(o.start, o.end) > WIDEST_BARE_OPENING_M]
     joined = shapely.unary_union([*model.rooms, *(o.shape.buffer(1e-3, join_style="mitre") for o in wide)])
@@ -161,7 +170,7 @@ def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]
 class _Sheet:
     """Drawing in progress."""
 
-    def __init__(self, model: _Model, pixels_per_m: float) -> None:
+    def __init__(self, model: Model, pixels_per_m: float) -> None:
         self._model, self.pixels_per_m = model, pixels_per_m
         columns, rows = (math.ceil(size * pixels_per_m) for size in model.size_m)
         # The sheet is a whole number of pixels high; its lower edge is the truth's origin.
@@ -304,7 +313,7 @@ class _Sheet:
         return round(x), round(y)
 
 
-def _scan(picture: UInt8[np.ndarray, "h w 3"], degrees: float, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+def scan(picture: UInt8[np.ndarray, "h w 3"], degrees: float, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture skewed, blurred and unevenly lit, with noise, on grey paper."""
     rows, columns = picture.shape[:2]
     turn = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), degrees, 1.0)

@@ -194,6 +194,21 @@ class VenuePlanPage:
 
 
 @dataclass(frozen=True)
+class ImportStep:
+    """Step of an import that begins or goes on.
+
+    Attributes:
+        step: what the service does, such as "reading texts".
+        done: levels of the file that are done; None for a step that is not about one level of several.
+        total: levels of the file; None as `done`.
+    """
+
+    step: str
+    done: int | None = None
+    total: int | None = None
+
+
+@dataclass(frozen=True)
 class PlanEvent:
     """Progress of a plan at one moment.
 

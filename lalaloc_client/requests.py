@@ -11,13 +11,14 @@ import os
 import re
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
 
 import httpx
 
+from lalaloc_client.model import ImportStep
 from lalaloc_client.retry import Safety
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ class Request:
         safety: effect of sending the request twice.
         answers: status codes of success.
         streamed: read the answer as it arrives, for as long as it takes.
+        on_step: called with every step of the import that the request asks for; needs `Accept: application/x-ndjson`.
     """
 
     method: str
@@ -113,6 +115,7 @@ class Request:
     safety: Safety = Safety.ANY
     answers: frozenset[int] = frozenset({200, 201, 204})
     streamed: bool = False
+    on_step: Callable[[ImportStep], None] | None = None
 
 
 def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[str, Any]:
@@ -184,8 +187,12 @@ def plan_request(
     *,
     if_match: str | None = None,
     idempotency_key: str | None = None,
+    on_step: Callable[[ImportStep], None] | None = None,
 ) -> Request:
-    """Return a request that stores a plan: as a form with the file's name and the options, or as the document alone."""
+    """Return a request that stores a plan: as a form with the file's name and the options, or as the document alone.
+
+    With `on_step` the service is asked for the steps of the import.
+    """
     if isinstance(document, bytes):
         content = document
     elif isinstance(document, Mapping):
@@ -201,7 +208,9 @@ def plan_request(
     else:
         media = JSON if isinstance(document, Mapping) else _FILE
     headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}
-    return Request(method, path, headers=headers, content=content, safety=_safety(if_match))
+    if on_step is not None:
+        headers["Accept"] = f"{NDJSON}, {JSON};q=0.5"
+    return Request(method, path, headers=headers, content=content, safety=_safety(if_match), on_step=on_step)
 
 
 def query_request(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from time import monotonic
@@ -29,6 +29,7 @@ from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
     FloorPlanSummary,
+    ImportStep,
     Layout,
     Localisability,
     PlanEvent,
@@ -93,7 +94,12 @@ class Client(Albums):
     # Floor plans
 
     def upload_floorplan(
-        self, document: Document, *, options: Mapping[str, object] | None = None, idempotency_key: str | None = None
+        self,
+        document: Document,
+        *,
+        options: Mapping[str, object] | None = None,
+        idempotency_key: str | None = None,
+        on_step: Callable[[ImportStep], None] | None = None,
     ) -> FloorPlan:
         """Store a plan; its pose grid may still be computed afterwards, see `wait_until_ready`.
 
@@ -104,9 +110,12 @@ class Client(Albums):
                 `{"level": "1"}`.
             idempotency_key: uploads of the same plan with the same key are one upload. Default: a new key, which the
                 retries of this call share.
+            on_step: called with every step of the import as it begins; a service of an older version calls it never.
         """
         key = idempotency_key or uuid.uuid4().hex
-        request = run_blocking(plan_request, "POST", "/floorplans", document, options, idempotency_key=key)
+        request = run_blocking(
+            plan_request, "POST", "/floorplans", document, options, idempotency_key=key, on_step=on_step
+        )
         return self._stored(FloorPlan, request)
 
     def replace_floorplan(
@@ -282,6 +291,7 @@ class Client(Albums):
         name: str | None = None,
         options: Mapping[str, object] | None = None,
         idempotency_key: str | None = None,
+        on_step: Callable[[ImportStep], None] | None = None,
     ) -> Venue:
         """Store a plan of every level of a file, and a venue of these plans; see `venue_plans`.
 
@@ -291,10 +301,11 @@ class Client(Albums):
                 of the file.
             options: import options, as for `upload_floorplan`, without `level`.
             idempotency_key: as for `upload_floorplan`.
+            on_step: as for `upload_floorplan`.
         """
         key = idempotency_key or uuid.uuid4().hex
         values = dict(options or {}, name=name)
-        request = run_blocking(plan_request, "POST", "/venues", file, values, idempotency_key=key)
+        request = run_blocking(plan_request, "POST", "/venues", file, values, idempotency_key=key, on_step=on_step)
         return self._stored(Venue, request)
 
     def replace_venue(

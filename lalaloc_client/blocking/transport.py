@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from random import random
@@ -17,10 +19,12 @@ from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from lalaloc_client.blocking.device import Device
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
-from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
+    JSON,
+    NDJSON,
     Photograph,
     QueryOptions,
     Request,
@@ -207,13 +211,34 @@ class Transport:
         built = self._http.build_request(
             request.method, request.path, params=request.params, headers=request.headers, content=request.content
         )
-        if request.streamed:
+        is_streamed = request.streamed or request.on_step is not None
+        if is_streamed:
             timeout: dict[str, Any] = built.extensions["timeout"]
             timeout["read"] = max(timeout["read"], _STREAM_TIMEOUT_S)
-        response = self._http.send(built, stream=request.streamed)
+        response = self._http.send(built, stream=is_streamed)
+        if request.on_step is not None:
+            return self._end_of(response, request.on_step)
         if request.streamed and response.status_code not in request.answers:
             response.read()
         return response
+
+    def _end_of(self, response: httpx.Response, on_step: Callable[[ImportStep], None]) -> httpx.Response:
+        """Read the steps of an import, and return the answer in its last line as if it had come without them."""
+        with closing(response):
+            if not response.headers.get("content-type", "").startswith(NDJSON):
+                # A refusal before the import, or a service that tells no steps.
+                response.read()
+                return response
+            for line in response.iter_lines():
+                news = parse(dict[str, Any], line, "line")
+                if "status" not in news:
+                    on_step(parse(ImportStep, line, "line"))
+                    continue
+                headers = {"content-type": JSON, "etag": news.get("etag"), "retry-after": news.get("retry_after_s")}
+                given = {name: str(value) for name, value in headers.items() if value is not None}
+                content = json.dumps(news.get("answer", news.get("problem"))).encode()
+                return httpx.Response(news["status"], headers=given, content=content, request=response.request)
+        raise httpx.RemoteProtocolError("the lines end without an answer", request=response.request)
 
 
 def _retry_after_s(response: httpx.Response) -> float | None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 
 if TYPE_CHECKING:
-    from lalaloc_core.importers import ImportedPlan, Trace
+    from lalaloc_core.importers import ImportedPlan, ImportStep, OnStep, Trace
 
 # Options of an import, as `importers.ImportOptions.from_text` expects them.
 _OPTIONS = {
@@ -45,7 +49,26 @@ def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = 
 
     values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
     options = ImportOptions.from_text({name: value for name, value in values.items() if value is not None})
-    return import_plans(_content(file), options, building=building_name(file.name), trace=trace)
+    content = _content(file)
+    with _progress_line(file.name) as on_step:
+        return import_plans(content, options, building=building_name(file.name), trace=trace, on_step=on_step)
+
+
+@contextmanager
+def _progress_line(name: str) -> Iterator[OnStep | None]:
+    """Give a function that shows the step of a file's import on a line of the terminal, which is cleared at the end."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+
+    def show(step: ImportStep) -> None:
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r\x1b[K{f'{name}: {step} …'[:width]}", end="", file=sys.stderr, flush=True)
+
+    try:
+        yield show
+    finally:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def _content(file: Path) -> bytes:

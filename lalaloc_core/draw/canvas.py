@@ -83,6 +83,11 @@ def pixels(svg: str) -> Image.Image:
         return image.convert("RGB")
 
 
+def font_file(text: str) -> Path:
+    """Return the bundled font that has most letters of a text."""
+    return Path(_EAST_ASIAN_FONT if _EAST_ASIAN.search(text) else _FONT_FOLDER / "DejaVuSans.ttf")
+
+
 def xml_text(text: str) -> str:
     """Escape text for XML, and replace the two characters that plans allow and XML does not."""
     return escape(text.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd"))

@@ -14,7 +14,7 @@ Begin with `importing.py`, which detects the format and calls its module. `lalal
 
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, ImportLimits
+from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, ImportLimits, ImportStep, OnStep
 from lalaloc_core.importers.common.import_options import ImportOptions, KnownDistance
 from lalaloc_core.importers.common.import_report import ImportReport, LayerUse, Trace
 from lalaloc_core.importers.common.sketch import Level

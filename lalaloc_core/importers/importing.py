@@ -16,7 +16,7 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.importers.common.archive import member_names, read_archive
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
-from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
+from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits, OnStep
 from lalaloc_core.importers.common.import_options import DEFAULT_OPTIONS, ImportOptions
 from lalaloc_core.importers.common.import_report import Trace
 from lalaloc_core.importers.format_table import EXPORT_FORMATS, FORMATS, HEAD_BYTES, Format
@@ -62,6 +62,7 @@ def import_plans(
     *,
     building: str | None = None,
     trace: Trace | None = None,
+    on_step: OnStep | None = None,
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans in a file, one per storey, lowest first.
 
@@ -73,6 +74,7 @@ def import_plans(
         building: name for a plan that has none, and for plans of several storeys, unless the options have one:
             "Duplex – Level 1". Several plans in the native format keep their own names.
         trace: receives what is read from a drawing or a picture, also of a file that is refused.
+        on_step: called with every step as it begins.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
@@ -83,9 +85,11 @@ def import_plans(
             f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes); "
             "export a single storey"
         )
-    budget = Budget(limits, clock, trace)
+    budget = Budget(limits, clock, trace, on_step)
     try:
+        budget.begin("opening the file")
         format, source = _open(content, limits)
+        budget.begin(f"reading {format.title}")
         plans = format.read(source, options, budget)
     except RecursionError as error:
         raise InvalidFloorPlanError(
@@ -117,15 +121,16 @@ def import_plan(
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS,
     *,
     building: str | None = None,
+    on_step: OnStep | None = None,
 ) -> ImportedPlan:
-    """Return the only plan in a file; `building` names it if the file does not.
+    """Return the only plan in a file; `building` names it if the file does not, `on_step` is as for `import_plans`.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
         MissingExtraError: a library of its format is not installed.
         SeveralLevelsError: the file has several storeys and the option `level` is not set.
     """
-    plans = import_plans(content, options, limits, building=building)
+    plans = import_plans(content, options, limits, building=building, on_step=on_step)
     if len(plans) > 1:
         raise SeveralLevelsError([plan.level.name for plan in plans if plan.level is not None])
     return next(iter(plans))

@@ -16,6 +16,7 @@ from service.schemas.albums import AlbumDocument, AlbumEvent, PhotographChangeDo
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.oscp import OscpRequest
 from service.schemas.photographs import StatedIntrinsics
+from service.schemas.plan_import import ImportLine
 from service.schemas.problem_details import Problem
 from service.schemas.query_fields import PlanPoint
 from service.schemas.sequence import StatedMotion
@@ -37,6 +38,7 @@ _BY_HAND = (
     PhotographChangeDocument,
     EarthPoint,
     FloorPlanDocument,
+    ImportLine,
     KeyDocument,
     OscpRequest,
     PlanEvent,

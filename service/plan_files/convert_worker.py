@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Literal
 
@@ -20,13 +21,14 @@ from lalaloc_core.importers import (
     ImportLimits,
     ImportOptions,
     Level,
+    OnStep,
     detect_media_type,
     import_plan,
     import_plans,
 )
 from service.errors import DamagedDataError
 from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionJob
-from service.workers.process import address_space_bytes, limit_memory, serve_jobs
+from service.workers.process import address_space_bytes, limit_memory, serve_jobs, tell
 
 # A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the
 # next file.
@@ -43,6 +45,7 @@ class ImportJob:
         step_m: grid step of descriptions.
         every_level: import all levels of the file, not the only one.
         building: name for plans that have none, and for those of several levels, see `import_plans`.
+        tells_steps: tell the steps of the import as they begin: a few, and one for each level.
     """
 
     content: bytes
@@ -50,6 +53,7 @@ class ImportJob:
     step_m: float
     every_level: bool = False
     building: str | None = None
+    tells_steps: bool = False
 
 
 @dataclass(frozen=True)
@@ -147,15 +151,15 @@ def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: in
     def is_fit() -> bool:
         return address_space_bytes() - begin_bytes < _WORN * memory_bytes
 
-    serve_jobs(connection, lambda: _converting(limits), is_fit)
+    serve_jobs(connection, lambda: _converting(limits, connection), is_fit)
 
 
-def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionResult]:
+def _converting(limits: ImportLimits, connection: Connection) -> Callable[[ConversionJob], ConversionResult]:
     def convert(job: ConversionJob) -> ConversionResult:
         try:
             match job:
                 case ImportJob():
-                    return _import(job, limits)
+                    return _import(job, limits, partial(tell, connection) if job.tells_steps else None)
                 case RenditionJob():
                     # Imported late: its libraries take memory that imports do not need.
                     from service.plan_files.renditions import make_rendition
@@ -174,10 +178,11 @@ def _converting(limits: ImportLimits) -> Callable[[ConversionJob], ConversionRes
     return convert
 
 
-def _import(job: ImportJob, limits: ImportLimits) -> tuple[Imported, ...]:
+def _import(job: ImportJob, limits: ImportLimits, on_step: OnStep | None) -> tuple[Imported, ...]:
     if not job.every_level:
-        return (_imported(import_plan(job.content, job.options, limits, building=job.building), job, limits),)
-    plans = import_plans(job.content, job.options, limits, building=job.building)
+        plan = import_plan(job.content, job.options, limits, building=job.building, on_step=on_step)
+        return (_imported(plan, job, limits),)
+    plans = import_plans(job.content, job.options, limits, building=job.building, on_step=on_step)
     return tuple(_imported(plan, job, limits) for plan in plans)
 
 

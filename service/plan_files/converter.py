@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ImportOptions
+from lalaloc_core.importers import ImportOptions, OnStep
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.plan_files.convert_worker import (
     ConversionJob,
@@ -81,6 +81,7 @@ class Converter:
         *,
         every_level: bool = False,
         building: str | None = None,
+        on_step: OnStep | None = None,
     ) -> tuple[Imported, ...]:
         """Import a plan file. Blocks for up to twice `max_import_s`.
 
@@ -90,6 +91,7 @@ class Converter:
             client: client of the upload.
             every_level: return the plans of all levels, lowest first.
             building: name for plans that have none, and for those of several levels, see `import_plans`.
+            on_step: called with steps of the import as they begin, on another thread; returns at once.
 
         Raises:
             InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.
@@ -100,9 +102,10 @@ class Converter:
             ConverterNotReadyError: no worker is running.
             StoppingError: the service is shutting down.
         """
-        job = ImportJob(content, options, self._settings.grids.grid_step_m, every_level, building)
+        step_m, limit_s = self._settings.grids.grid_step_m, self._settings.plans.import_deadline_s
+        job = ImportJob(content, options, step_m, every_level, building, tells_steps=on_step is not None)
         try:
-            result = self._run(job, self._settings.plans.import_deadline_s, client)
+            result = self._run(job, limit_s, client, on_step)
         except JobLostError as error:
             self._raise_lost(error)
         if isinstance(result, ConversionRefusal):
@@ -164,13 +167,15 @@ class Converter:
             if pool is not None:
                 pool.close()
 
-    def _run(self, job: ConversionJob, limit_s: float, client: str = "") -> ConversionResult:
-        """Run a job of the imports, and wait for it.
+    def _run(
+        self, job: ConversionJob, limit_s: float, client: str = "", on_step: OnStep | None = None
+    ) -> ConversionResult:
+        """Run a job of the imports, and wait for it; `on_step` is called with its news.
 
         Raises:
             JobLostError: there is no result in time.
         """
-        future = self._running_pool().submit(job, limit_s, client)
+        future = self._running_pool().submit(job, limit_s, client, on_step or (lambda _step: None))
         done, _ = wait([future], limit_s)
         if not done:
             future.cancel()

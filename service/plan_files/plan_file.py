@@ -15,6 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import (
     ImportOptions,
     Level,
+    OnStep,
     begins_with_plans,
     detect_format,
     detect_media_type,
@@ -74,8 +75,10 @@ class PlanReader:
     settings: Settings
     permits: FairSemaphore
 
-    def read(self, content: bytes, options: ImportOptions, name: str | None, client: str) -> PlanFile:
-        """Return the only plan of a client's file; `name` is for a plan that has none.
+    def read(
+        self, content: bytes, options: ImportOptions, name: str | None, client: str, on_step: OnStep | None = None
+    ) -> PlanFile:
+        """Return the only plan of a client's file; `name` is for a plan without, `on_step` as for `Converter.read`.
 
         Raises:
             InvalidFloorPlanError: the file is invalid or exceeds a limit.
@@ -88,13 +91,16 @@ class PlanReader:
         """
         if (native := self._read_native(content, options, name, client)) is not None:
             return native
-        (imported,) = self.converter.read(content, options, client, building=name)
+        (imported,) = self.converter.read(content, options, client, building=name, on_step=on_step)
         return self._plan_file(imported, client)
 
-    def read_levels(self, content: bytes, options: ImportOptions, building: str, client: str) -> list[PlanFile]:
+    def read_levels(
+        self, content: bytes, options: ImportOptions, building: str, client: str, on_step: OnStep | None = None
+    ) -> list[PlanFile]:
         """Return the plans of the levels of a client's file, lowest first.
 
         `building` is the name for plans that have none, and for those of several levels, unless the options have one.
+        `on_step` is as for `Converter.read`.
 
         Raises:
             InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
@@ -103,7 +109,8 @@ class PlanReader:
         """
         if (native := self._read_native(content, options, building, client)) is not None:
             return [native]
-        levels = self.converter.read(content, options, client, every_level=True, building=building)
+        read = self.converter.read
+        levels = read(content, options, client, every_level=True, building=building, on_step=on_step)
         return [self._plan_file(imported, client) for imported in levels]
 
     def _read_native(self, content: bytes, options: ImportOptions, name: str | None, client: str) -> PlanFile | None:

@@ -46,13 +46,22 @@ class PendingJob:
     Attributes:
         content: the pickled job, in parts that are not empty.
         digest: of the content; equal jobs have equal digests.
+        on_news: called on the supervisor's thread with what the worker tells while it runs the job; returns at once.
     """
 
-    def __init__(self, content: Sequence[bytes], digest: bytes, deadline: float, client: str = "") -> None:
+    def __init__(
+        self,
+        content: Sequence[bytes],
+        digest: bytes,
+        deadline: float,
+        client: str = "",
+        on_news: Callable[[Any], None] = lambda _value: None,
+    ) -> None:
         self.content = content
         self.digest = digest
         self.deadline = deadline
         self.client = client
+        self.on_news = on_news
         self.deaths = 0
         self.stops = 0
         self.stalled = False

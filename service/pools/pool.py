@@ -110,8 +110,12 @@ class WorkerPool(Generic[Job, Result]):
         """True while the pool shuts down."""
         return self._queue.closed
 
-    def submit(self, job: Job, timeout_s: float, client: str = "") -> Future[Result]:
+    def submit(
+        self, job: Job, timeout_s: float, client: str = "", on_news: Callable[[Any], None] = lambda _value: None
+    ) -> Future[Result]:
         """Queue a job of a client. Cancelling the future removes a waiting job; a running job is finished.
+
+        `on_news` is called with what the worker tells meanwhile, see `PendingJob`.
 
         Returns:
             A future with the result or a `JobLostError`; it can be done later than the deadline.
@@ -121,7 +125,7 @@ class WorkerPool(Generic[Job, Result]):
         """
         content = _Parts()
         pickle.Pickler(content, protocol=pickle.HIGHEST_PROTOCOL).dump(job)
-        pending = PendingJob(content.parts, content.digest.digest(), monotonic() + timeout_s, client)
+        pending = PendingJob(content.parts, content.digest.digest(), monotonic() + timeout_s, client, on_news)
         self._queue.put(pending)
         return pending.future
 

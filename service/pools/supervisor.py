@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from service.pools.job_queue import JobQueue, PendingJob
 from service.telemetry import LOGGER_NAME
-from service.workers.process import JobResult, Ready, WorkerFailure
+from service.workers.process import JobNews, JobResult, Ready, WorkerFailure
 
 # Workers that die sooner than this after they were warm are replaced more and more slowly; the first one at once.
 _HEALTHY_S = 5.0
@@ -210,6 +210,9 @@ class Supervisor:
                 # A worker that died before it had the whole job was not crashed by it.
                 sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
+                while isinstance(answer, JobNews):
+                    pending.on_news(answer.value)
+                    answer = _receive(connection)
             # A worker that died has not told its CPU time, which is at most this long.
             known = answer.cpu_s if isinstance(answer, JobResult | WorkerFailure) else watchdog.cpu_s
             cpu_s = known if known is not None else monotonic() - begin

@@ -17,6 +17,7 @@ from lalaloc_core.errors import (
 )
 from service import errors
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
+from service.http.piecewise import NDJSON
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
 
@@ -82,6 +83,18 @@ def file_response(*media_types: str, schema_format: str | None = "binary") -> Re
     """Describe an answer that is a file; `schema_format` is None for text."""
     schema = {"type": "string"} if schema_format is None else {"type": "string", "format": schema_format}
     return {200: {"content": {name: {"schema": schema} for name in media_types}}} | NOT_MODIFIED
+
+
+def import_lines(model: type[BaseModel]) -> Responses:
+    """Describe the answer to an import that is sent as lines."""
+    line = {"$ref": "#/components/schemas/ImportLine"}
+    answer = {"answer": {"$ref": f"#/components/schemas/{model.__name__}"}}
+    schema = {"allOf": [line, {"type": "object", "properties": answer}]}
+    text = (
+        f"With `Accept: {NDJSON}`: a line of JSON for each step as it begins, and at the end one with the status that "
+        "the request would have without lines, and the answer or the problem."
+    )
+    return {200: {"description": text, "content": {NDJSON: {"schema": schema}}}}
 
 
 def json_body(model: type[BaseModel], **further: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from functools import partial
 from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.importers import OnStep
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.grids import GridState
 from service.http.conditional import not_modified, revision_etag, tagged_answer
@@ -24,7 +25,9 @@ from service.routes.descriptions import (
     REVISION_RESPONSES,
     UNLESS_CHANGED,
     UPLOAD_ERRORS,
+    import_lines,
 )
+from service.routes.import_lines import answer_import
 from service.routes.plan_uploads import UPLOAD_BODY, prepare_plan, read_upload
 from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
 from service.storage.records import PlanRecord, PlanSummary
@@ -39,7 +42,8 @@ router = APIRouter(prefix="/floorplans", tags=["floor plans"])
     summary="Upload a floor plan",
     response_model=FloorPlanAnswer,
     openapi_extra={"requestBody": UPLOAD_BODY, "parameters": [IDEMPOTENCY_KEY]},
-    responses=problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS),
+    responses=import_lines(FloorPlanAnswer)
+    | problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS),
 )
 async def create_floorplan(call: Call) -> Response:
     """Store a floor plan from a plan file.
@@ -47,14 +51,14 @@ async def create_floorplan(call: Call) -> Response:
     The format is detected from the content: JSON in the native format, GeoJSON, an IMDF archive, OpenStreetMap, a
     RoomPlan scan, SVG, DXF, IFC, PDF, or a picture. `import_report` tells how the file was read; a plan read from a
     picture is a draft, so check it before use. A small plan is `ready` at once; the pose grid of a larger plan is
-    computed in the background (see `status`, `progress` and `/events`).
+    computed in the background (see `status`, `progress` and `/events`). Lines tell the steps of the import.
     """
     idempotent = call.idempotent()
     uploaded = await read_upload(call)
     plans, grids = call.store.plans, call.runtime.grids
 
-    def store(token: str) -> Response:
-        new, file = prepare_plan(uploaded, call)
+    def store(token: str, on_step: OnStep | None) -> Response:
+        new, file = prepare_plan(uploaded, call, on_step)
         record = plans.add(call.tenant, token, new, limit=call.settings.plans.max_floorplans)
         if record.plan is new.plan:
             grids.on_plan_stored(record, new.grid)
@@ -66,8 +70,11 @@ async def create_floorplan(call: Call) -> Response:
             state = grids.states([call.plan(record.id)])[0]
         return _change_answer(call, record, file, state, created=True)
 
-    # One call from claim to answer, so that a disconnect does not interrupt it.
-    return await uploaded.store(call, idempotent.run, uploaded.parts, store)
+    async def run(on_step: OnStep | None) -> Response:
+        # One call from claim to answer, so that a disconnect does not interrupt it.
+        return await uploaded.store(call, idempotent.run, uploaded.parts, partial(store, on_step=on_step))
+
+    return await answer_import(call, run)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(*READ_ERRORS))

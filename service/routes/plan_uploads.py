@@ -10,7 +10,7 @@ from fastapi import Response
 from pydantic import BaseModel
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportOptions, building_name
+from lalaloc_core.importers import ImportOptions, OnStep, building_name
 from service.errors import InvalidRequestError
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
@@ -116,8 +116,10 @@ def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
     return faults
 
 
-def prepare_plan(uploaded: PlanUpload, call: ApiCall) -> tuple[NewPlan, PlanFile]:
+def prepare_plan(uploaded: PlanUpload, call: ApiCall, on_step: OnStep | None = None) -> tuple[NewPlan, PlanFile]:
     """Return the plan in an uploaded file, with its pose grid if that is computed at once, and as it was read. Blocks.
+
+    `on_step` is as for `Converter.read`.
 
     Raises:
         PlanTooLargeError: the plan needs too large a grid.
@@ -125,14 +127,16 @@ def prepare_plan(uploaded: PlanUpload, call: ApiCall) -> tuple[NewPlan, PlanFile
     """
     content, runtime = uploaded.file.read(), call.runtime
     name = building_name(uploaded.file.name)
-    file = _reader(call).read(content, uploaded.options, name, call.client)
+    file = _reader(call).read(content, uploaded.options, name, call.client, on_step)
     runtime.grids.check_size(file.plan)
     original = Original(content, file.media_type, file.report)
     return _new_plan(file, original, runtime.grids.prepare(file.plan, call.client), 0.0, call), file
 
 
-def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str) -> list[NewPlan]:
+def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnStep | None = None) -> list[NewPlan]:
     """Return a plan of every level of a file with rooms, with the pose grids that are computed at once. Blocks.
+
+    `on_step` is as for `Converter.read`.
 
     Raises:
         InvalidRequestError: the file has more levels than a venue can have plans.
@@ -140,7 +144,7 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str) -> list[NewPl
         LaLaLocError: see `PlanReader.read_levels`.
     """
     content, runtime = uploaded.file.read(), call.runtime
-    files = _reader(call).read_levels(content, uploaded.options, name, call.client)
+    files = _reader(call).read_levels(content, uploaded.options, name, call.client, on_step)
     limit = call.settings.plans.max_venue_plans
     if len(files) > limit:
         fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"

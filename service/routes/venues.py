@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response, status
 
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers import building_name
+from lalaloc_core.importers import OnStep, building_name
 from service.errors import (
     InvalidRequestError,
     RevisionMismatchError,
@@ -34,8 +34,10 @@ from service.routes.descriptions import (
     STORE_ERRORS,
     UNLESS_CHANGED,
     UPLOAD_ERRORS,
+    import_lines,
     json_body,
 )
+from service.routes.import_lines import answer_import
 from service.routes.plan_uploads import LEVELS_FORM, prepare_levels, read_upload
 from service.schemas.plan_import import LevelsForm
 from service.schemas.venues import (
@@ -70,29 +72,34 @@ _VENUE_RESPONSES = problem_responses(UnknownVenueError, *READ_ERRORS)
         "requestBody": json_body(VenueDocument, **{MULTIPART: LEVELS_FORM}),
         "parameters": [IDEMPOTENCY_KEY],
     },
-    responses=problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, TooManyVenuesError, *IDEMPOTENCY_ERRORS),
+    responses=import_lines(VenueAnswer)
+    | problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, TooManyVenuesError, *IDEMPOTENCY_ERRORS),
 )
 async def create_venue(call: Call) -> Response:
     """Group floor plans, each on a level, so that one query searches all of them.
 
     A JSON body lists stored plans. A form has a plan file of any format: every level with rooms becomes a plan, and all
-    of them a venue, or nothing is stored. A plan can belong to several venues. Deleting a plan removes it from its
-    venues.
+    of them a venue, or nothing is stored; lines tell the steps of the import. A plan can belong to several venues.
+    Deleting a plan removes it from its venues.
     """
     idempotent, limits = call.idempotent(), call.settings.plans
     if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
         uploaded = await read_upload(call, LevelsForm)
 
-        def store_levels(token: str) -> Response:
+        def store_levels(token: str, on_step: OnStep | None) -> Response:
             name = uploaded.options.name or building_name(uploaded.file.name) or _DEFAULT_NAME
-            plans = prepare_levels(uploaded, call, name)
+            plans = prepare_levels(uploaded, call, name, on_step)
             record, stored = call.store.venue_imports.add(
                 call.tenant, token, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
             )
             _announce(plans, stored, call)
             return _change_answer(call, record, created=True)
 
-        return await uploaded.store(call, idempotent.run, uploaded.parts, store_levels)
+        async def run(on_step: OnStep | None) -> Response:
+            work = partial(store_levels, on_step=on_step)
+            return await uploaded.store(call, idempotent.run, uploaded.parts, work)
+
+        return await answer_import(call, run)
     content = await call.read_json()
 
     def store(token: str) -> Response:

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.schemas.fields import ResponseModel
 from service.schemas.native_plan import OpeningKind
+from service.schemas.problem_details import Problem
 
 
 class _FileOptions(BaseModel):
@@ -103,4 +104,26 @@ class ImportReport(ResponseModel):
     )
     turned_deg: float = Field(
         default=0.0, description="Clockwise rotation about its centre that straightened a picture before it was read."
+    )
+
+
+class ImportLine(BaseModel):
+    """Line of the answer to an import: a step that begins, or at the end the answer or the problem.
+
+    Members that do not apply are left out.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    step: str | None = Field(None, description="Step that begins or goes on, such as `reading texts`.")
+    done: int | None = Field(None, description="Levels of the file that are done, if the step is one of several.")
+    total: int | None = Field(None, description="Levels of the file, if the step is one of several.")
+    status: int | None = Field(
+        None, description="HTTP status that the request would have without lines; only in the last line."
+    )
+    etag: str | None = Field(None, description="Header `ETag` of that answer.")
+    replayed: bool | None = Field(None, description="True for the kept answer to the same `Idempotency-Key`.")
+    problem: Problem | None = Field(None, description="The problem, if the status is one of failure.")
+    retry_after_s: int | None = Field(
+        None, description="Seconds after which the request can be sent again; left out if that does not help."
     )

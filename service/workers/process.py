@@ -26,6 +26,13 @@ class Ready:
 
 
 @dataclass(frozen=True)
+class JobNews:
+    """Message about a job that goes on."""
+
+    value: Any
+
+
+@dataclass(frozen=True)
 class JobResult:
     """Message with the result of a job, and the CPU time (s) that it took."""
 
@@ -75,6 +82,11 @@ def serve_jobs(
             message = WorkerFailure(f"{type(error).__name__}: {error}", process_time() - begin)
 
 
+def tell(connection: Connection, value: Any) -> None:
+    """Tell the parent news of the job that runs; see `PendingJob.on_news`. The value is picklable and small."""
+    _send(connection, JobNews(value))
+
+
 def limit_memory(memory_bytes: int) -> None:
     """Make allocations fail beyond the current use plus `memory_bytes`; on Linux only."""
     if sys.platform != "linux":
@@ -100,7 +112,7 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _send(connection: Connection, message: Ready | JobResult | WorkerFailure) -> bool:
+def _send(connection: Connection, message: Ready | JobNews | JobResult | WorkerFailure) -> bool:
     """Send a message; False if the parent is gone."""
     try:
         connection.send(message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from typing import Any
@@ -17,6 +18,7 @@ from lalaloc_client import (
     ConflictError,
     ConnectionFailedError,
     FloorPlanFailedError,
+    ImportStep,
     MalformedAnswerError,
     NotFoundError,
     NotReadyError,
@@ -316,3 +318,32 @@ def test_unsafe_request_is_retried_only_if_unsent(status: int) -> None:
 def test_invalid_policy_is_rejected(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         RetryPolicy(**options)
+
+
+def _lines(*lines: dict[str, Any]) -> Planned:
+    body = "".join(f"{json.dumps(line)}\n" for line in lines).encode()
+    return Planned(200, body, {"Content-Type": "application/x-ndjson"})
+
+
+def test_import_whose_lines_break_off_or_end_with_overload_is_repeated(
+    failing: FailingServer, make_client: MakeClient
+) -> None:
+    overloaded = {"status": 503, "problem": {"type": "urn:lalaloc:problem:overloaded"}, "retry_after_s": 0}
+    failing.plan = [
+        _lines({"step": "reading texts", "done": 1, "total": 3}),
+        _lines({"step": "reading texts"}, overloaded),
+        _lines({"status": 201, "etag": '"r.1"', "answer": PLAN}),
+    ]
+    steps: list[ImportStep] = []
+    with make_client(failing.url, retry=QUICK) as client:
+        plan = client.upload_floorplan(b"<svg/>", on_step=steps.append)
+    assert (plan.id, plan.etag) == (PLAN["id"], '"r.1"')
+    assert steps == [ImportStep("reading texts", 1, 3), ImportStep("reading texts")]
+    assert len({request.headers["idempotency-key"] for request in failing.requests}) == 1
+    assert all("application/x-ndjson" in request.headers["accept"] for request in failing.requests)
+
+
+def test_service_that_tells_no_steps_is_understood(failing: FailingServer, make_client: MakeClient) -> None:
+    failing.plan = [Planned(201, PLAN, {"Content-Type": "application/json", "ETag": '"r.1"'})]
+    with make_client(failing.url, retry=QUICK) as client:
+        assert client.upload_floorplan(b"<svg/>", on_step=lambda _step: None).etag == '"r.1"'

@@ -15,8 +15,10 @@ import httpx
 import pytest
 from PIL import Image
 
-from lalaloc_client import ConflictError, InvalidError, Localisation, NotFoundError
+from lalaloc_client import ConflictError, ImportStep, InvalidError, Localisation, NotFoundError
 from lalaloc_core.bundle import default_bundle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import export_plan
 from tests.client.conftest import MakeClient
 from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES
@@ -62,6 +64,20 @@ def test_plan_without_a_name_is_named_after_its_file(service: Any, tmp_path: Pat
     file.write_text(json.dumps({key: value for key, value in FLAT.items() if key != "name"}))
     plan = service.upload_floorplan(file)
     assert (plan.name, service.replace_floorplan(plan.id, str(file)).name) == ("Ground floor", "Ground floor")
+
+
+def test_steps_of_an_import_are_told(service: Any, tmp_path: Path) -> None:
+    steps: list[ImportStep] = []
+    (tmp_path / "flat.svg").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "svg"))
+    plan = service.upload_floorplan(tmp_path / "flat.svg", on_step=steps.append)
+    assert steps[0] == ImportStep("waiting for a worker")
+    assert "opening the file" in {step.step for step in steps}
+    assert (plan.etag, plan.rooms) == (service.floorplan(plan.id).etag, service.floorplan(plan.id).rooms)
+    venue = service.upload_venue({"plans": [FLAT, FLAT | {"level": 1}]}, name="House", on_step=steps.append)
+    assert (venue.name, venue.plans) == ("House", 2)
+    with pytest.raises(InvalidError) as caught:
+        service.upload_floorplan(b"%PDF-1.4", on_step=steps.append)
+    assert "PDF" in str(caught.value)
 
 
 def test_plan_is_replaced_unless_it_has_changed(service: Any, panorama: bytes) -> None:

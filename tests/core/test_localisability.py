@@ -144,3 +144,19 @@ def test_large_plan_is_predicted_on_a_coarser_grid(manifest: Manifest) -> None:
     assert found.spacing_m == 1.1
     assert "1.1 m apart" in summary_of(plan, found)[4]
     assert spacing_m(_rooms((0.0, 90.0, 90.0))) == 0.5
+
+
+def test_fewer_photographs_are_found_by_openings_that_may_be_drawn_wrongly(manifest: Manifest) -> None:
+    room = {"name": "hall", "polygon": [[0.0, 0.0], [7.0, 0.0], [7.0, 7.0], [0.0, 7.0]], "ceiling_height_m": 2.5}
+    openings = [
+        {"kind": "door", "line": [[1.0, 0.0], [2.0, 0.0]]},
+        {"kind": "window", "line": [[7.0, 4.0], [7.0, 6.5]]},
+    ]
+    document = {"rooms": [room], "openings": openings, "opening_kinds": []}
+    shares = []
+    for trust in (1.0, 0.3):
+        stated = FloorPlan.from_dict(document | {"opening_trust": {"door": trust, "window": trust}})
+        found = localisability(stated, manifest, coarse=True).plan
+        shares.append(found["sphere_unknown_heading"])
+    # The walls of a square look the same at four headings.
+    assert shares[0] > shares[1] + 0.1

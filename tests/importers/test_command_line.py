@@ -181,3 +181,21 @@ def test_debug_of_a_file_without_a_drawing_says_so(file: Path, tmp_path: Path):
     out = tmp_path / "read.svg"
     assert main(["plan", "import", str(file), "-o", str(tmp_path / "plan.json"), "--debug", str(out)]) == 0
     assert "Nothing was read from a drawing." in out.read_text(encoding="utf-8")
+
+
+def test_terminal_shows_the_steps_of_an_import_on_one_line(file: Path):
+    terminal, own_end = os.openpty()
+    try:
+        done = _run("plan", "check", str(file), stderr=own_end, stdout=subprocess.DEVNULL)
+        assert done.returncode == 0
+        shown = os.read(terminal, 65_536).decode()
+    finally:
+        os.close(own_end)
+        os.close(terminal)
+    assert "\r\x1b[Kflat.json: opening the file …" in shown
+    assert shown.endswith("\r\x1b[K")
+    assert "\n" not in shown
+
+
+def test_steps_are_not_shown_without_a_terminal(file: Path):
+    assert _run("plan", "check", str(file), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL).stderr == b""

@@ -1,5 +1,6 @@
 /** Stored plans: list, search, upload, progress, deletion. */
 
+import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
 import { button, byId, h, show } from "./dom";
 import { acceptDrops } from "./drops";
@@ -12,6 +13,14 @@ import type { Plan, PlanDocument, PlanSummary } from "./types";
 /** True if the import guessed nothing that the user may want to correct. */
 const isCertain = (plan: Plan): boolean =>
   !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
+
+/** Return a function that shows the steps of a file's import. */
+const showStep =
+  (file: File) =>
+  ({ step, done, total }: ImportStep): void => {
+    const part = total === undefined || total < 2 ? "" : ` (${(done ?? 0) + 1} of ${total})`;
+    byId("plan-state").textContent = `Importing “${file.name}”: ${step}${part} …`;
+  };
 
 const SEARCH_AFTER_MS = 250;
 const PICTURES = /^image\/(png|jpeg)$/;
@@ -175,7 +184,7 @@ export class Plans {
     const state = byId("plan-state");
     state.textContent = `Importing “${file.name}” …`;
     try {
-      const plan = await api.uploadPlan(file, fields);
+      const plan = await api.uploadPlan(file, fields, { onStep: showStep(file) });
       if (request === this.requests) {
         this.actions.picked();
         this.take(plan);
@@ -201,7 +210,7 @@ export class Plans {
       state = byId("plan-state");
     state.textContent = `Importing all levels of “${file.name}” …`;
     try {
-      const venue = await api.uploadLevels(file, fields);
+      const venue = await api.uploadLevels(file, fields, { onStep: showStep(file) });
       await this.load();
       if (request === this.requests) {
         this.importing.close();

@@ -2,9 +2,10 @@
 
 import type { components, operations } from "../generated/api.js";
 import { ServiceError } from "./errors.js";
-import { linesOf, pause, upload } from "./transport.js";
+import { endOf, type ImportStep, linesOf, NDJSON, pause, upload } from "./transport.js";
 
 export { ServiceError } from "./errors.js";
+export type { ImportStep } from "./transport.js";
 /** Schemas of the API by name. */
 export type Schemas = components["schemas"];
 /** A stored plan; `etag` is the entity tag of its revision, for `replacePlan`. */
@@ -48,6 +49,8 @@ export interface CallOptions {
   timeoutMs?: number;
   /** Called as the upload proceeds, in browsers. */
   onProgress?: (sentBytes: number, totalBytes: number) => void;
+  /** Called with every step of an import as it begins; a service of an older version calls it never. */
+  onStep?: (step: ImportStep) => void;
 }
 
 /** Connection to a service. Every method throws `ServiceError`, or the reason of an aborted `signal`. */
@@ -59,7 +62,7 @@ export class Client {
     const begin = Date.now();
     for (let attempt = 1; ;) {
       const sent = this.key();
-      const response = await this.send(path, init, sent);
+      const response = await endOf(await this.send(path, init, sent), init.onStep);
       if (response.ok || response.status === 304) return response;
       const failure = await ServiceError.of(response);
       if (response.status === 401 && (await this.hasNewKey(sent, failure))) continue;
@@ -198,14 +201,16 @@ export class Client {
   }
 
   private async send(path: string, init: RequestInit & CallOptions, key: string | null): Promise<Response> {
-    const { timeoutMs = this.options.timeoutMs ?? 120_000, onProgress, signal, ...rest } = init;
+    const { timeoutMs = this.options.timeoutMs ?? 120_000, onProgress, onStep, signal, ...rest } = init;
     const headers = new Headers(rest.headers);
+    if (onStep) headers.set("Accept", `${NDJSON}, application/json;q=0.5`);
     if (key !== null) headers.set("Authorization", `Bearer ${key}`);
     const signals = [...(signal ? [signal] : []), ...(timeoutMs > 0 ? [AbortSignal.timeout(timeoutMs)] : [])];
     const request = { ...rest, headers, signal: AbortSignal.any(signals) };
     const url = (this.options.baseUrl ?? "").replace(/\/$/, "") + path;
     try {
-      return await (onProgress && typeof XMLHttpRequest !== "undefined"
+      // XMLHttpRequest would return all lines at the end.
+      return await (onProgress && !onStep && typeof XMLHttpRequest !== "undefined"
         ? upload(url, request, onProgress)
         : fetch(url, request));
     } catch {

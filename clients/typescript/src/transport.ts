@@ -1,3 +1,5 @@
+import { ServiceError } from "./errors.js";
+
 /** Wait; throw the reason of an abort meanwhile. */
 export function pause(ms: number, signal?: AbortSignal | null): Promise<void> {
   return new Promise((resolve, reject) => {
@@ -36,6 +38,25 @@ export function upload(
     signal.addEventListener("abort", () => sending.abort(), { once: true });
     sending.send(body as XMLHttpRequestBodyInit);
   });
+}
+
+export const NDJSON = "application/x-ndjson";
+
+/** Step of an import, such as "reading texts"; `done` of `total` levels if it is about one of several. */
+export type ImportStep = { step: string; done?: number; total?: number };
+
+/** Read the steps of an import; return the answer in its last line as if it had come without them. */
+export async function endOf(response: Response, onStep?: (step: ImportStep) => void): Promise<Response> {
+  if (onStep === undefined || !response.headers.get("content-type")?.startsWith(NDJSON)) return response;
+  for await (const line of linesOf(response)) {
+    const { status, answer, problem, etag, retry_after_s: after, ...step } = JSON.parse(line);
+    if (status !== undefined) {
+      const headers = { ...(etag && { etag }), ...(after && { "retry-after": String(after) }) };
+      return new Response(JSON.stringify(answer ?? problem), { status, headers });
+    }
+    onStep(step);
+  }
+  throw new ServiceError(0, "The import broke off", "The connection ended before the answer; send the file again.");
 }
 
 /** Yield the lines of an answer as they arrive; a caller that stops early closes the connection. */

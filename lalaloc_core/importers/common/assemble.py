@@ -21,7 +21,7 @@ from lalaloc_core.importers.common.completeness import estimate_trust
 from lalaloc_core.importers.common.crossings import check_network, distinct
 from lalaloc_core.importers.common.fixtures import place_fixtures, type_rooms
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import ImportLimits
+from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
@@ -159,7 +159,7 @@ def _add_trust(document: dict[str, Any], sketch: Sketch, builder: ReportBuilder)
 def assemble_levels(
     levels: Mapping[str, tuple[Level, T]],
     options: ImportOptions,
-    limits: ImportLimits,
+    budget: Budget,
     make: Callable[[Level, T], ImportedPlan],
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans of the chosen levels, lowest first; of several levels, those without a room are left out.
@@ -167,20 +167,21 @@ def assemble_levels(
     Args:
         levels: levels of a file, with their contents.
         options: options of the import.
-        limits: limits of the import.
+        budget: limits of the import, which is told every level as it begins.
         make: makes the plan of a level.
 
     Raises:
         InvalidFloorPlanError: no level is chosen, none has a room, or the plan of one is invalid; names the level.
     """
     chosen = choose_levels(levels, options)
-    if len(chosen) > limits.max_levels:
+    if len(chosen) > (most := budget.limits.max_levels):
         raise InvalidFloorPlanError(
-            f"the file has {len(chosen)} levels; the limit is {limits.max_levels} (max_levels); choose one with level"
+            f"the file has {len(chosen)} levels; the limit is {most} (max_levels); choose one with level"
         )
     plans: list[ImportedPlan] = []
     empty: dict[str, NoRoomError] = {}
-    for level, content in chosen:
+    for done, (level, content) in enumerate(chosen):
+        budget.begin(f"reading level '{level.name}'", done, len(chosen))
         try:
             plans.append(make(level, content))
         except NoRoomError as error:

@@ -48,18 +48,42 @@ class ImportLimits:
 DEFAULT_IMPORT_LIMITS = ImportLimits()
 
 
+@dataclass(frozen=True)
+class ImportStep:
+    """Step of an import that begins now.
+
+    Attributes:
+        step: what is done, such as "reading texts".
+        done: number of levels that are done; None for a step that is not about one level of several.
+        total: number of levels; None as `done`.
+    """
+
+    step: str
+    done: int | None = None
+    total: int | None = None
+
+    def __str__(self) -> str:
+        return self.step if self.total is None else f"{self.step} ({(self.done or 0) + 1} of {self.total})"
+
+
+# Called with every step as it begins.
+OnStep = Callable[[ImportStep], None]
+
+
 @dataclass
 class Budget:
     """Counter of the entities and the time that an import has used.
 
     Attributes:
         trace: receives what is read from a drawing, if anyone asks for it.
+        on_step: called with every step of the import as it begins.
     """
 
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS
     # A busy machine refuses no file.
     clock: Callable[[], float] = time.process_time
     trace: Trace | None = None
+    on_step: OnStep | None = None
     entities: int = 0
     started_s: float = field(init=False)
 
@@ -83,6 +107,16 @@ class Budget:
                 f"the file has more than {self.limits.max_entities} entities (max_entities); {_REMEDY}"
             )
         self.check_time()
+
+    def begin(self, step: str, done: int | None = None, total: int | None = None) -> None:
+        """Tell that a step begins, see `ImportStep`, and check the time.
+
+        Raises:
+            InvalidFloorPlanError: the import takes longer than `max_import_s`.
+        """
+        self.check_time()
+        if self.on_step is not None:
+            self.on_step(ImportStep(step, done, total))
 
     def check_time(self) -> None:
         """Check the time.

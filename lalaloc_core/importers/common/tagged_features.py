@@ -143,7 +143,7 @@ def import_features(
         drawer.add_points()
         return assemble(sketch, builder, options, budget.limits.plan)
 
-    return assemble_levels(by_level, options, budget.limits, make)
+    return assemble_levels(by_level, options, budget, make)
 
 
 def _refuse_map(features: Sequence[Feature], format: str) -> None:

@@ -22,8 +22,8 @@ from lalaloc_core.importers.drawing.wall_areas import WallAreas
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
-# Largest offset between two jambs (m).
-_OUT_OF_LINE_M = 0.35
+# Largest offset between two jambs, and half the width of slits that are closed (m).
+_OUT_OF_LINE_M, _SLIT_M = 0.35, 0.001
 # Share of the lines' length without a second face from which walls can be single lines, and smallest room that counts
 # in a comparison of readings (m²).
 _MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
@@ -65,6 +65,7 @@ class Gap:
         is_sure: the walls alone identify an opening. False if a jamb is a short nib or the jambs are not in line.
         is_between_ends: both sides are ends of walls, not an end and the face of another wall.
         is_painted, is_bluish: a light area hides the wall here, and has the colour of glass.
+        is_pane: lines run through it like the panes of a window.
     """
 
     shape: shapely.Polygon
@@ -74,6 +75,7 @@ class Gap:
     is_between_ends: bool = False
     is_painted: bool = False
     is_bluish: bool = False
+    is_pane: bool = False
 
     @property
     def width(self) -> float:
@@ -117,7 +119,9 @@ def enclose(
     check_time()
     faces, loose = _faces(lines, config, check_time) if lines else ([], [])
     thin = [face for face in faces if _is_thin(face, config)]
-    solid = shapely.unary_union([*bodies, *thin]) if bodies or thin else shapely.Polygon()
+    # Lines that were rounded to 1 mm leave slits between the parts of a wall.
+    grown = shapely.unary_union([face.buffer(_SLIT_M, join_style="mitre") for face in (*bodies, *thin)])
+    solid = grown.buffer(-_SLIT_M, join_style="mitre")
     if solid.area < 0.05:
         return _from_single_lines(lines, closers, config, check_time)
     around = solid.buffer(0.02)

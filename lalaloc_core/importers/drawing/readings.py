@@ -16,10 +16,11 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.crossings import check_network, check_overlaps
-from lalaloc_core.importers.common.geometry import polygons_from_geometry, side_lengths
+from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.drawing.drawn_panes import drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Enclosed, Gap, enclose, explained_size
 from lalaloc_core.importers.drawing.painted_openings import cut_painted
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Swing
@@ -115,6 +116,7 @@ def choose_reading(
     if not is_by_word or readings[0].area_m2 < _COMPLETE * box_m2:
         refused: InvalidFloorPlanError | None = None
         for source, read in _WALLS.items():
+            budget.begin(f"finding rooms between {source}")
             try:
                 found = read(drawing, budget)
             except InvalidFloorPlanError as error:
@@ -261,16 +263,30 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     bodies = [shape for shape in painted.bodies if not _is_outline(Area(shape, "", is_dark=True))]
     if not bodies:
         return None
-    closers = [*_closers(drawing), *(gap.shape.buffer(_SEAM_M, join_style="mitre") for gap in painted.gaps)]
+    gaps = [*painted.gaps, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
+    closers = [*_closers(drawing), *(gap.shape.buffer(_SEAM_M, join_style="mitre") for gap in gaps)]
     found = enclose(bodies, [], closers, check_time=budget.check_time)
-    return replace(found, gaps=[*painted.gaps, *found.gaps])
+    return replace(found, gaps=[*gaps, *found.gaps])
 
 
 def _by_all_lines(drawing: Drawing, budget: Budget) -> Enclosed | None:
     """Return the areas between all lines on layers without a role, None if there are none."""
     lines = [stroke.line for stroke in drawing.strokes if stroke.role is None]
     lines += [area.shape.exterior for area in drawing.areas if area.role is None]
-    return enclose([], split_lines(lines), _closers(drawing), check_time=budget.check_time) if lines else None
+    if not lines:
+        return None
+    found = enclose([], split_lines(lines), _closers(drawing), check_time=budget.check_time)
+    # A wall has two lines, too.
+    return replace(found, gaps=[*_panes(drawing, found.walls, 3, budget), *found.gaps])
+
+
+def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) -> list[Gap]:
+    """Return the windows that thin lines on layers without a role draw; see `drawn_panes`."""
+    lines = [stroke.line for stroke in drawing.strokes if stroke.role is None and stroke.width < _THICK_M[0]]
+    lines += [area.shape.exterior for area in drawing.areas if area.role is None and not area.is_dark]
+    found = drawn_panes(split_lines(lines), walls, least, budget.check_time)
+    ends = [(area, shapely.get_coordinates(line)) for area, line in found]
+    return [Gap(area, point_xy(a), point_xy(b), is_between_ends=True, is_pane=True) for area, (a, b) in ends]
 
 
 def _is_outline(area: Area) -> bool:
@@ -314,7 +330,8 @@ def _closers(drawing: Drawing) -> list[BaseGeometry]:
     panes = [stroke.line for stroke in drawing.strokes if stroke.role == "window"]
     hulls = [shapely.convex_hull(cluster) for cluster in clusters(panes, SYMBOL_M)]
     windows: list[BaseGeometry] = [hull if hull.area > 0.0 else hull.buffer(0.002, cap_style="flat") for hull in hulls]
-    return [shape for shape in (*areas, *windows) if side_lengths(shape)[0] < 0.7]
+    # Drawn from corner to corner of a wall that is cut, they can miss it by a rounding error.
+    return [shape.buffer(_SEAM_M, join_style="mitre") for shape in (*areas, *windows) if side_lengths(shape)[0] < 0.7]
 
 
 class GapFinder:

@@ -30,6 +30,7 @@ from lalaloc_core.importers.drawing.door_leaves import (
 )
 from lalaloc_core.importers.drawing.drawing_scale import check_areas
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
+from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
 from lalaloc_core.importers.drawing.readings import (
     SYMBOL_M,
     GapFinder,
@@ -86,6 +87,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
+    budget.begin("finding doors and walls")
     marked = marked_rooms(drawing, builder)
     lines = [stroke for stroke in drawing.strokes if stroke.role in (None, "wall")]
     walls = take_leaves(lines, drawing.swings, drawing.areas)
@@ -102,11 +104,16 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     else:
         drawing = without
         sketch.drawn = reading.walls.envelope
+        outlines = [room.shape for room in shapes]
+        parts, wide = split_named_rooms(outlines, reading.walls, gaps, drawing.letterings, budget.check_time)
+        if wide:
+            shapes, gaps = [Area(part, "", "room") for part in parts], [*gaps, *wide]
         if leaves:
             builder.notes.append(f"{len(leaves)} leaves of doors and their arcs are not walls")
         if budget.trace is not None:
             budget.trace.add("wall", [reading.walls])
             budget.trace.add("gap", [gap.shape for gap in gaps])
+    budget.begin("placing names and openings")
     sketch.rooms = name_rooms(shapes, drawing.letterings, builder, sketch.drawn)
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
@@ -121,8 +128,10 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         line = shapely.LineString([gap.start, gap.end])
         near = shapely.union_all(taken.geometries[taken.query(line, predicate="intersects")])
         if shapely.intersection(line, near).length < 0.3 * line.length:
-            kind = _kind_without_symbol(gap, rooms) if gap.is_painted else "passage"
+            kind = _kind_without_symbol(gap, rooms) if gap.is_painted or gap.is_pane else "passage"
             sketch.openings.append(SketchedOpening(kind, gap.start, gap.end))
+            if gap.is_pane and kind == "window":
+                continue
             builder.unsure.append(
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
                 f"window; it is taken for a {kind}"

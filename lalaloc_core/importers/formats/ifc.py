@@ -95,7 +95,7 @@ def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Impor
         _join_touching(sketch, builder)
         return assemble(sketch, builder, options, budget.limits.plan)
 
-    return assemble_levels(storeys, options, budget.limits, make)
+    return assemble_levels(storeys, options, budget, make)
 
 
 def _unit(model: Any) -> float:

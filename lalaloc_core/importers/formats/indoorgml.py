@@ -110,7 +110,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         _add_doors(on_level, lowest, sketch, builder, budget)
         return assemble(sketch, builder, options, budget.limits.plan)
 
-    return assemble_levels(levels, options, budget.limits, make)
+    return assemble_levels(levels, options, budget, make)
 
 
 def _cell(element: Element, factor: float, budget: Budget) -> _Cell | None:

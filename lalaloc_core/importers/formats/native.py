@@ -57,7 +57,7 @@ def _read_plans(document: Mapping[str, Any], options: ImportOptions, budget: Bud
         own = {key: value for key, value in plan.items() if key != "level"}
         return replace(_read_plan(own, options, budget), level=level)
 
-    return assemble_levels(levels, options, budget.limits, make)
+    return assemble_levels(levels, options, budget, make)
 
 
 def _level(plan: Mapping[str, Any], number: int) -> Level:

@@ -45,6 +45,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """
     document, page = open_page(content, options.page)
     try:
+        budget.begin(f"reading page {options.page} of {len(document)}")
         found = read_page(page, budget)
         with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
             return _read_plan(page, found, options, budget)

@@ -80,7 +80,7 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
             sketch.level, sketch.name = level, level.name
         return assemble(sketch, builder, options, budget.limits.plan)
 
-    return assemble_levels(levels, options, budget.limits, make)
+    return assemble_levels(levels, options, budget, make)
 
 
 def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: ReportBuilder, budget: Budget) -> Sketch:

@@ -85,7 +85,7 @@ def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> 
         _add_pieces(storey, sketch, builder, budget)
         return assemble(sketch, builder, options, budget.limits.plan)
 
-    return assemble_levels(storeys, options, budget.limits, make)
+    return assemble_levels(storeys, options, budget, make)
 
 
 def _storeys(root: Element) -> dict[str, tuple[Level, _Storey]]:

@@ -87,6 +87,7 @@ def read_texts(
     if find_spec("rapidocr") is None:
         builder.notes.append("texts were not read, as the extra 'ocr' is not installed: name the rooms")
         return found
+    budget.begin("reading texts")
     try:
         factor, ink = _resized_ink(gray, _TILE_PX, straighten=straighten)
         boxes = _boxes(ink, builder, budget)

@@ -75,8 +75,8 @@ def sketch_picture(
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
     """
+    budget.begin("straightening the picture")
     ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)
-    budget.check_time()
     hypotheses = (dark_walls(ink), True), (outlined_walls(ink), False)
     readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
     if not readings:
@@ -99,12 +99,14 @@ def sketch_picture(
         budget.trace.add("gap", [gap.shape for gap in best.enclosed.gaps])
         budget.trace.add("room", best.enclosed.rooms)
         budget.trace.add("no room", builder.no_room)
+    budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
     openings = _openings(best, ink, builder, budget)
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, drawn=best.enclosed.walls.envelope)
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
+    budget.begin(f"finding rooms between {'dark walls' if is_dark else 'outlined walls'}")
     reader = GapReader(ink, walls)
     contents: dict[int, GapContent] = {}
 

@@ -2,7 +2,8 @@
 
 For each of some places the predictions of a model are drawn (`prediction_errors.py`) from the layout that the plan
 shows there, and searched for with the matching cost and the coarse pass of real queries. The share of draws whose
-answer is within 1 m is the probability. Ceilings and room types, which weigh little, are left out, and so is pose
+answer is within 1 m is the probability. Of openings that the plan draws in part (`FloorPlan.opening_trust`), some are
+moved: they exist elsewhere. Ceilings and room types, which weigh little, are left out, and so is pose
 refinement; `PredictionErrors.spread` is fitted to make up for both. Poses that fit equally well share the answer.
 
 The pose grids of large plans are coarser, so that the work is bounded. An answer on a grid of step s is then right
@@ -12,16 +13,16 @@ within s.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.bundle import Manifest, PredictionErrors
 from lalaloc_core.conditions import CONDITIONS, HARDEST, PHOTOGRAPHS, Condition, parts_of
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, GridCosts
@@ -196,6 +197,7 @@ class Searches:
         between = rng.uniform(-0.5, 0.5, len(places)) * (TWO_PI / len(shifts) if len(shifts) > 1 else 0.0)
         layouts = layouts_at(self._plan, places, between, columns)
         kind = np.zeros(layouts.log_profile.shape, np.uint8) if layouts.kind is None else layouts.kind
+        kind = _as_built(kind, self._plan.opening_trust, rng)
         log_m, log_scale = errors.profile(layouts.log_profile, rng)
         log_probability = errors.openings(kind, rng)
         prior = np.array(manifest.opening_prior if not views or manifest.view is None else manifest.view.opening_prior)
@@ -215,6 +217,29 @@ class Searches:
                 openings=PredictedOpenings(rolled(probability, shifts), prior),
                 is_view=views > 0,
             )
+
+
+def _as_built(
+    kind: UInt8[np.ndarray, "n w"], opening_trust: Mapping[str, float], rng: np.random.Generator
+) -> UInt8[np.ndarray, "n w"]:
+    """Return opening codes by place and azimuth as they may be where a plan draws a share of the openings.
+
+    With a trust of t, a drawn opening does not exist with a probability of 1 - t, and as many exist that are not drawn,
+    as wide as those that are, in other directions.
+    """
+    built = kind.copy()
+    for code, name in enumerate(OPENING_CLASSES):
+        trust = opening_trust.get(name, 0.0)
+        if not 0.0 < trust < 1.0:
+            continue
+        for row, column in zip(*np.nonzero((kind == code) & (np.roll(kind, 1, axis=1) != code)), strict=True):
+            others = np.flatnonzero(np.roll(kind[row], -column) != code)
+            width = int(others[0]) if len(others) else kind.shape[1]
+            if rng.random() >= trust:
+                built[row, (column + np.arange(width)) % kind.shape[1]] = 0
+                added = (int(rng.integers(kind.shape[1])) + np.arange(width)) % kind.shape[1]
+                built[row, added[built[row, added] == 0]] = code
+    return built
 
 
 def _seen(columns: int, views: int, centre: int) -> Bool[np.ndarray, "w"]:

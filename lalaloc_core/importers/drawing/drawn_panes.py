@@ -1,0 +1,113 @@
+"""Windows that are drawn without a layer's or class's word: parallel lines from end to end of a gap in a wall."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.importers.common.geometry import check_network
+
+# Lengths of panes and their distances across a wall (m).
+_LENGTH_M, _DEPTH_M = (0.3, 6.0), (0.02, 0.6)
+# Ends of the lines of a pane lie this near to each other, and the wall begins this near behind them.
+_ALIGNED_M, _BEHIND_M = 0.03, 0.04
+# Share of the strip behind the ends of a pane that is wall, and of those beside it that may be.
+_IN_WALL, _FREE = 0.6, 0.2
+# Corners of a pane beside which a wall may run on: those at one end, as in the corner of a room. Stairs have four.
+_CORNERS, _BESIDE_M = 2, 0.1
+# Lines of one pane; more are hatching. Sine of the largest angle between them.
+_MOST_LINES, _TURN = 8, 0.02
+
+
+def drawn_panes(
+    lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: Callable[[], None]
+) -> list[tuple[shapely.Polygon, shapely.LineString]]:
+    """Return the windows among the thin lines of a drawing (m), as areas and as lines along their middle.
+
+    Args:
+        lines: straight lines.
+        walls: the walls; with the areas between the lines of windows, if walls are drawn with two lines.
+        least: lines that make a window. Two do in a gap; a wall with two faces is such a pair itself.
+        check_time: called between steps; raises an exception to stop.
+
+    Raises:
+        InvalidFloorPlanError: too many lines lie over one another.
+    """
+    candidates = [line for line in lines if _LENGTH_M[0] <= line.length <= _LENGTH_M[1]]
+    if not candidates or walls.is_empty:
+        return []
+    shapely.prepare(walls)
+    check_network(candidates)
+    ends = np.array([np.asarray(line.coords)[[0, -1]] for line in candidates])
+    is_near = np.asarray(shapely.dwithin(shapely.points(ends), walls, _ALIGNED_M))
+    ends = ends[is_near[:, 0] & is_near[:, 1]]
+    tree, found = shapely.STRtree(np.asarray(shapely.linestrings(ends))), []
+    is_used = np.zeros(len(ends), bool)
+    for index, line in enumerate(tree.geometries):
+        check_time()
+        if is_used[index]:
+            continue
+        near = np.sort(tree.query(line, predicate="dwithin", distance=_DEPTH_M[1]))
+        beside = near[~is_used[near]]
+        beside = beside[_are_beside(ends[index], ends[beside])]
+        if not least <= len(beside) <= _MOST_LINES:
+            continue
+        area = _box(ends[index], ends[beside])
+        if area is not None and _is_in_wall(area, walls):
+            is_used[beside] = True
+            found.append((area, _middle(area)))
+    return found
+
+
+def _are_beside(line: Float[np.ndarray, "2 2"], others: Float[np.ndarray, "n 2 2"]) -> Bool[np.ndarray, "n"]:
+    """Return which lines are parallel to a line, given by their ends, and end beside it; a line is beside itself."""
+    along = (line[1] - line[0]) / math.dist(*line)
+    places = (others - line[0]) @ along
+    is_backward = places[:, 0] > places[:, 1]
+    places = np.where(is_backward[:, None], places[:, ::-1], places)
+    step = others[:, 1] - others[:, 0]
+    turn = np.abs(step[:, 0] * along[1] - step[:, 1] * along[0]) / np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    apart = np.abs(places - [0.0, math.dist(*line)]).max(axis=1)
+    return (apart <= _ALIGNED_M) & (turn <= _TURN)
+
+
+def _box(line: Float[np.ndarray, "2 2"], lines: Float[np.ndarray, "n 2 2"]) -> shapely.Polygon | None:
+    """Return the rectangle along a line that contains parallel lines, its long sides first; None if it is too flat."""
+    a, b = line
+    along = (b - a) / math.dist(a, b)
+    across = np.array([-along[1], along[0]])
+    offsets = (lines.mean(axis=1) - a) @ across
+    if not _DEPTH_M[0] <= float(np.ptp(offsets)) <= min(_DEPTH_M[1], 0.8 * math.dist(a, b)):
+        return None
+    low, high = offsets.min() * across, offsets.max() * across
+    return shapely.Polygon([a + low, b + low, b + high, a + high])
+
+
+def _middle(area: shapely.Polygon) -> shapely.LineString:
+    a, b, c, d = np.asarray(area.exterior.coords)[:4]
+    return shapely.LineString([0.5 * (a + d), 0.5 * (b + c)])
+
+
+def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
+    """Return whether the wall goes on behind both ends of an area, and neither beside it nor around its ends."""
+    a, b, c, d = np.asarray(area.exterior.coords)[:4]
+    along, across = (b - a) / math.dist(a, b), (d - a) / math.dist(a, d)
+
+    def share(corner: Float[np.ndarray, "2"], *steps: Float[np.ndarray, "2"]) -> float:
+        first, second = steps
+        strip = shapely.Polygon([corner, corner + first, corner + first + second, corner + second])
+        return shapely.intersection(strip, walls).area / max(strip.area, 1e-12)
+
+    behind, aside = _BEHIND_M * along, _BESIDE_M * across
+    if min(share(a, -behind, d - a), share(b, behind, c - b)) < _IN_WALL:
+        return False
+    inner = 0.1 * (b - a)
+    if max(share(a + inner, 0.8 * (b - a), -aside), share(d + inner, 0.8 * (c - d), aside)) > _FREE:
+        return False
+    corners = ((a, -behind, -aside), (b, behind, -aside), (c, behind, aside), (d, -behind, aside))
+    return sum(share(*corner) > 0.5 for corner in corners) <= _CORNERS

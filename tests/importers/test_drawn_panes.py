@@ -1,0 +1,123 @@
+"""Windows of drawings whose layers and elements do not name them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import shapely
+
+from benchmarks.drawn_files import FILE_FORMATS, FILE_STYLES, LANGUAGES, FileFormat, FileStyle, draw_file, draw_home
+from benchmarks.plan_drawing import Model, OpeningSymbol
+from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
+
+
+def _svg(*elements: str) -> ImportedPlan:
+    """Import a drawing in centimetres of a hall of 8 m x 4 m between filled walls of 20 cm."""
+    head = '<svg xmlns="http://www.w3.org/2000/svg" width="90cm" height="50cm" viewBox="0 0 900 500">'
+    return import_plan(f"{head}{''.join(elements)}</svg>".encode(), ImportOptions(metres_per_pixel=0.01))
+
+
+def _wall(x: float, y: float, width: float, height: float) -> str:
+    return f'<rect x="{x}" y="{y}" width="{width}" height="{height}" fill="black"/>'
+
+
+def _line(x0: float, y0: float, x1: float, y1: float) -> str:
+    return f'<path d="M{x0} {y0}L{x1} {y1}" fill="none" stroke="black" stroke-width="1"/>'
+
+
+# The upper wall has a gap of 4 m.
+HALL = [
+    _wall(20, 20, 220, 20), _wall(640, 20, 220, 20), _wall(20, 440, 840, 20), _wall(20, 20, 20, 440),
+    _wall(840, 20, 20, 440),
+]  # fmt: skip
+PANES = [_line(240, y, 640, y) for y in (20, 30, 40)]
+
+
+def _windows(plan: ImportedPlan) -> list[list[list[float]]]:
+    return [opening["line"] for opening in plan.document.get("openings", []) if opening["kind"] == "window"]
+
+
+@pytest.mark.parametrize(
+    "symbol",
+    [PANES, PANES[::2], ['<rect x="240" y="20" width="400" height="20" fill="none" stroke="black"/>', PANES[1]]],
+    ids=["three lines", "two lines", "outline"],
+)
+def test_wide_window_without_a_name_closes_the_wall(symbol: list[str]) -> None:
+    plan = _svg(*HALL, *symbol)
+    (room,) = plan.plan().rooms
+    assert room.area_m2 == pytest.approx(8.0 * 4.0, rel=1e-2)
+    ((start, end),) = _windows(plan)
+    assert sorted([start[0], end[0]]) == pytest.approx([2.4, 6.4], abs=0.02)
+
+
+def test_steps_across_a_room_are_no_windows() -> None:
+    steps = [_line(x, 40, x, 440) for x in range(300, 600, 28)]
+    closed = [*HALL, _wall(240, 20, 400, 20)]
+    assert _windows(_svg(*closed, *steps[:2])) == []
+    assert _windows(_svg(*closed, *steps)) == []
+
+
+def test_lines_beside_a_wall_are_no_window() -> None:
+    closed = [*HALL, _wall(240, 20, 400, 20)]
+    counter = [_line(40, 60, 840, 60), _line(40, 100, 840, 100)]
+    plan = _svg(*closed, *counter)
+    assert _windows(plan) == []
+
+
+# A wall across the middle with a gap of 2.6 m.
+DIVIDER = [_wall(430, 40, 20, 70), _wall(430, 370, 20, 70)]
+
+
+def _name(x: float, y: float, text: str) -> str:
+    return f'<text x="{x}" y="{y}" font-size="20">{text}</text>'
+
+
+def test_names_tell_rooms_apart_that_a_wide_passage_joins() -> None:
+    walls = [*HALL, *PANES, *DIVIDER]
+    named = _svg(*walls, _name(200, 250, "Kitchen"), _name(600, 250, "Living room"))
+    assert {(room.name, room.type) for room in named.plan().rooms} == {
+        ("Kitchen", "kitchen"),
+        ("Living room", "living"),
+    }
+    assert any(opening["kind"] == "passage" for opening in named.document["openings"])
+
+
+@pytest.mark.parametrize("text", ["", "3.20 m"])
+def test_one_name_is_that_of_one_room(text: str) -> None:
+    (room,) = _svg(*HALL, *PANES, *DIVIDER, _name(200, 250, "Living room"), _name(600, 250, text)).plan().rooms
+    assert room.type == "living"
+
+
+def _model() -> Model:
+    """Return a home of two rooms with a window of 3 m in each, and a door between them."""
+    rooms = [shapely.box(1.5, 1.5, 6.0, 5.5), shapely.box(6.2, 1.5, 11.0, 5.5)]
+    panes = [shapely.box(x, 5.5, x + 3.0, 5.7) for x in (2.0, 7.0)]
+    windows = [OpeningSymbol("window", p, (p.bounds[0], 5.6), (p.bounds[2], 5.6), p) for p in panes]
+    side = shapely.Polygon([(6.0, 3.0), (6.0, 3.9), (6.2, 3.9), (6.2, 3.0)])
+    door = OpeningSymbol("door", side, (6.1, 3.0), (6.1, 3.9), side)
+    openings = [*windows, door]
+    inside = shapely.union_all(rooms)
+    around = shapely.union_all([room.buffer(0.2, join_style="mitre") for room in rooms])
+    walls = around.difference(inside).difference(
+        shapely.union_all([o.cut.buffer(1e-4, join_style="mitre") for o in openings])
+    )
+    return Model(rooms, ["kitchen", "bedroom"], openings, walls, (12.5, 7.2), (0.0, 0.0))
+
+
+@pytest.mark.parametrize(("format", "style"), list(itertools.product(("svg", "dxf", "pdf"), FILE_STYLES)))
+def test_drawn_home_is_imported_untouched(format: FileFormat, style: FileStyle) -> None:
+    language = LANGUAGES[(FILE_FORMATS.index(format) * 5 + FILE_STYLES.index(style)) % len(LANGUAGES)]
+    drawing = draw_home(_model(), style, language, np.random.default_rng(0))
+    drawn = draw_file(format, style, drawing, 0)
+    if drawn is None:
+        return
+    content, options = drawn
+    plan = import_plan(content, ImportOptions.from_text(options))
+    areas = sorted(room.area_m2 for room in plan.plan().rooms)
+    assert areas == pytest.approx([4.5 * 4.0, 4.8 * 4.0], rel=0.03)
+    kinds = sorted(opening["kind"] for opening in plan.document["openings"])
+    assert kinds == ["door", "window", "window"]
+    if style != "scanned":
+        assert {room.type for room in plan.plan().rooms} == {"kitchen", "bedroom"}
