@@ -94,7 +94,7 @@ def _format(name: str, title: str, media_type: str, suffix: str, options: str, *
 
 
 _GML, _OSM = "application/gml+xml", "application/vnd.openstreetmap.data+xml"
-_SCALE = "metres_per_pixel known_distance"
+_SCALE = "metres_per_pixel known_distance multiply"
 _DXF = rb"AutoCAD Binary DXF|" + _START + rb"(?:999\r?\n[^\n]*\n\s*)*0\r?\n\s*SECTION"
 # A picture of a map, or its YAML file.
 _ROS = rb"P[25]\s|(?:[a-z_]+:[^\n]*\n|\s|#[^\n]*\n)*image:"

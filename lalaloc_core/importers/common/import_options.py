@@ -57,6 +57,7 @@ class ImportOptions:
         level: name or number of the storey to import, if the file has several.
         layers: layers, groups or classes to import, ignoring case; empty for all.
         page: page of a PDF, counted from 1.
+        multiply: factor for all lengths of a drawing, whose scale is false.
         y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
         ceiling_height_m: ceiling height of rooms without one in the file.
     """
@@ -68,6 +69,7 @@ class ImportOptions:
     level: str | None = None
     layers: tuple[str, ...] = ()
     page: int = 1
+    multiply: float | None = None
     y_axis: str | None = None
     ceiling_height_m: float | None = None
     name: str | None = None
@@ -77,6 +79,7 @@ class ImportOptions:
             check_units(self.units)
         _check_range("scale", self.scale, 1.0, 10_000.0)
         _check_range("metres_per_pixel", self.metres_per_pixel, 1e-6, 10.0)
+        _check_range("multiply", self.multiply, 1e-3, 1e3)
         _check_range("page", self.page, 1.0, 10_000.0)
         _check_range("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
         if self.y_axis is not None:
@@ -150,7 +153,7 @@ def _parse(name: str, text: str) -> object:
         if not text.isascii() or not text.isdigit() or len(text) > 9:
             raise InvalidFloorPlanError(f"page is '{text[:50]}'; it must be a whole number from 1")
         return int(text)
-    if name in ("metres_per_pixel", "ceiling_height_m"):
+    if name in ("metres_per_pixel", "multiply", "ceiling_height_m"):
         return _number(name, text)
     return text
 

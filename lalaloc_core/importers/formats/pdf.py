@@ -20,8 +20,16 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
-from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text, sketch_drawing
+from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
+from lalaloc_core.importers.drawing.scale_guess import (
+    Measures,
+    ScaleGuess,
+    assume_scale,
+    first_scale,
+    guess_scale,
+    measures_of,
+)
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
@@ -64,10 +72,16 @@ def _read_plan(
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
     scan = _read_scan(page, found, builder, budget)
+    assumed = ReportBuilder()
     # A unit of a PDF is always a point.
     without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
     factor, source = drawing_scale(
-        without_units, "the PDF", drawings, budget.check_time, paper_m_per_unit=_METRES_PER_POINT
+        without_units,
+        "the PDF",
+        drawings,
+        budget.check_time,
+        paper_m_per_unit=_METRES_PER_POINT,
+        guess=lambda: assume_scale(_guess(page, found, scan, budget), assumed),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)
@@ -82,12 +96,33 @@ def _read_plan(
         rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
         sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
     builder.metres_per_unit, builder.scale_source = factor, source
+    builder.scale_std, builder.scale_clues = assumed.scale_std, assumed.scale_clues
+    builder.warnings[:0] = assumed.warnings
     return (assemble(sketch, builder, options, budget.limits.plan),)
+
+
+def _guess(page: pypdfium2.PdfPage, found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess | None:
+    """Return the scale of a page by the usual sizes of its parts, None if they are too few."""
+    if _is_drawing(found):
+        _remove_letters(found)
+        return guess_drawing(found.drawing, budget, flip_y=False)
+    dimensions = written_dimensions(scan.drawing, budget.check_time)
+
+    def measure(scale: float) -> Measures:
+        sketch = _as_picture(page, found, scale, ReportBuilder(), budget)
+        letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
+        return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
+
+    return guess_scale(measure, first_scale(0.9 * max(found.size_pt)), budget)
+
+
+def _is_drawing(found: PageContent) -> bool:
+    return len(found.drawing.strokes) + len(found.drawing.areas) >= _MIN_LINES and found.picture_share <= _MOSTLY
 
 
 def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:
     drawing = found.drawing
-    if len(drawing.strokes) + len(drawing.areas) < _MIN_LINES or found.picture_share > _MOSTLY:
+    if not _is_drawing(found):
         return None
     builder.use("lines", "possible walls", len(drawing.strokes))
     builder.use("areas", "possible walls", len(drawing.areas))

@@ -96,6 +96,15 @@ def read_ink(
     )
 
 
+def inked_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Return the longer side (pixels) of the part of a picture that has ink in most of its rows and columns."""
+    ink = gray < min(float(np.median(gray)) - _FAINTEST, _THRESHOLD[1])
+    sides = [np.flatnonzero(ink.any(axis=axis)) for axis in (0, 1)]
+    # Speckles at the borders are no drawing.
+    spans = [np.percentile(side, (2, 98)) for side in sides if len(side)]
+    return float(max((last - first for first, last in spans), default=max(gray.shape)))
+
+
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
     """Return thin lines that are darker than their surroundings by more than the noise of the paper."""
     soft = cv2.GaussianBlur(even, (0, 0), 0.6)
