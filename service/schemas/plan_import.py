@@ -31,6 +31,11 @@ class _FileOptions(BaseModel):
     multiply: float | None = Field(
         None, gt=0, description="Factor for all lengths of a drawing or picture whose scale is false."
     )
+    crop: str | None = Field(
+        None,
+        description="Part of a page or picture to read, such as one of several storeys: `x0,y0,x1,y1` of two opposite "
+        "corners in the file's coordinates, as in `known_distance`.",
+    )
     page: int | None = Field(None, ge=1, description="Page of a PDF. Default: 1.")
     y_axis: Literal["up", "down"] | None = Field(
         None, description="Direction of y in the file. Default: that of its format."

@@ -18,6 +18,8 @@ const LABELS: Record<string, string> = {
   scale: "Scale on paper",
   metres_per_pixel: "Metres per pixel",
   known_distance: "Distance of the ends",
+  multiply: "Factor of all lengths",
+  crop: "Only this part",
   page: "Page of a PDF",
   layers: "Only these layers",
   ceiling_height_m: "Ceiling",

@@ -58,6 +58,7 @@ class ImportOptions:
         layers: layers, groups or classes to import, ignoring case; empty for all.
         page: page of a PDF, counted from 1.
         multiply: factor for all lengths of a drawing, whose scale is false.
+        crop: part of a page or picture that is read: x0, y0, x1, y1 of two opposite corners, in the file's coordinates.
         y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
         ceiling_height_m: ceiling height of rooms without one in the file.
     """
@@ -70,6 +71,7 @@ class ImportOptions:
     layers: tuple[str, ...] = ()
     page: int = 1
     multiply: float | None = None
+    crop: tuple[float, float, float, float] | None = None
     y_axis: str | None = None
     ceiling_height_m: float | None = None
     name: str | None = None
@@ -82,6 +84,8 @@ class ImportOptions:
         _check_range("multiply", self.multiply, 1e-3, 1e3)
         _check_range("page", self.page, 1.0, 10_000.0)
         _check_range("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
+        if self.crop is not None:
+            object.__setattr__(self, "crop", _ordered_crop(self.crop))
         if self.y_axis is not None:
             check_y_axis(self.y_axis)
         if len(self.layers) > _MAX_LAYERS:
@@ -147,6 +151,11 @@ def _parse(name: str, text: str) -> object:
             raise InvalidFloorPlanError(f"known_distance has {len(numbers)} numbers; give x0, y0, x1, y1, metres")
         x0, y0, x1, y1, metres = numbers
         return KnownDistance((x0, y0), (x1, y1), metres)
+    if name == "crop":
+        corners = [_number(name, part) for part in re.split(r"[,;\s]+", text)]
+        if len(corners) != 4:
+            raise InvalidFloorPlanError(f"crop has {len(corners)} numbers; give x0, y0, x1, y1 of two opposite corners")
+        return tuple(corners)
     if name == "layers":
         return tuple(part.strip() for part in text.split(",") if part.strip())
     if name == "page":
@@ -156,6 +165,21 @@ def _parse(name: str, text: str) -> object:
     if name in ("metres_per_pixel", "multiply", "ceiling_height_m"):
         return _number(name, text)
     return text
+
+
+def _ordered_crop(crop: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return the corners of a part as (left, lowest y, right, highest y).
+
+    Raises:
+        InvalidFloorPlanError: the part is empty, or a number is out of range.
+    """
+    x0, y0, x1, y1 = crop
+    if not all(abs(number) <= _MAX_NUMBER for number in crop) or x0 == x1 or y0 == y1:
+        raise InvalidFloorPlanError(
+            f"crop is {', '.join(f'{number:g}' for number in crop)}; give x0, y0, x1, y1 of two opposite corners, "
+            f"numbers up to {_MAX_NUMBER:g}"
+        )
+    return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
 
 
 def _number(name: str, text: str) -> float:

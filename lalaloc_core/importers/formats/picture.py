@@ -24,8 +24,9 @@ from lalaloc_core.importers.drawing.drawing_scale import (
 )
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
+from lalaloc_core.importers.drawing.storeys import Box, choose_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.ink import inked_extent
+from lalaloc_core.importers.picture.ink import blank_outside, inked_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from lalaloc_core.picture_kinds import Tones
@@ -47,6 +48,11 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if tones is not None and tones.is_photograph:
         raise InvalidFloorPlanError(
             "the picture is a photograph, not a floor plan: send it to be localised, or send a drawn or scanned plan"
+        )
+    if options.crop is not None:
+        gray, warmth = (
+            blank_outside(gray, options.crop),
+            None if warmth is None else blank_outside(warmth, options.crop),
         )
     texts = read_texts(gray, builder, budget)
     with naming_text(texts.drawing.letterings, "the picture"):
@@ -96,6 +102,12 @@ def _read_plan(
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
     sketch.rooms = name_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
+
+    def in_file(box: Box) -> Box:
+        x0, y0, x1, y1 = (number / factor for number in box)
+        return max(x0, 0.0), max(rows - y1, 0.0), min(x1, float(columns)), min(rows - y0, float(rows))
+
+    sketch = choose_storey(sketch, builder, in_file, is_chosen=True)
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

@@ -109,6 +109,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder("svg")
     drawing = _read_drawing(root, options, builder, budget)
+    if options.crop is not None:
+        drawing = drawing.cropped(options.crop)
     builder.metres_per_unit, builder.scale_source = drawing_scale(
         options,
         "the SVG",
