@@ -49,6 +49,20 @@ class DrawnPlan:
     rooms: list[shapely.Polygon]
     openings: list[OpeningSymbol]
 
+    def noisy(self, sigma: float, seed: int) -> DrawnPlan:
+        """Return the picture with noise of a standard deviation (of 255)."""
+        noise = np.random.default_rng(seed).normal(0.0, sigma, self.picture.shape[:2])
+        return self._with(self.picture + noise[..., None])
+
+    def shaded(self, darkest: float) -> DrawnPlan:
+        """Return the picture with a shadow from its upper left to its lower right corner, as a share of the light."""
+        rows, columns = self.picture.shape[:2]
+        across = 0.5 * (np.linspace(0.0, 1.0, rows)[:, None] + np.linspace(0.0, 1.0, columns))
+        return self._with(self.picture * (1.0 - (1.0 - darkest) * across)[..., None])
+
+    def _with(self, picture: Float[np.ndarray, "h w 3"]) -> DrawnPlan:
+        return replace(self, picture=np.clip(np.round(picture), 0, 255).astype(np.uint8))
+
     def png(self) -> bytes:
         """Return the picture as PNG."""
         stream = io.BytesIO()
@@ -74,18 +88,31 @@ class Model:
     origin_m: tuple[float, float]
 
 
-def draw_plan(style: Style, seed: int) -> DrawnPlan:
-    """Draw a generated home in one of the styles; the same for the same seed."""
+def draw_plan(
+    style: Style, seed: int, *, has_texts: bool = True, is_furnished: bool = False, pixels_per_m: float | None = None
+) -> DrawnPlan:
+    """Draw a generated home in one of the styles; the same for the same seed.
+
+    Args:
+        style: style of drawing.
+        seed: seed of the home and of the drawing.
+        has_texts: write names, areas and dimensions in the styles that have them.
+        is_furnished: draw furniture in every style.
+        pixels_per_m: resolution; that of the style by default.
+    """
     rng = np.random.default_rng([seed, STYLES.index(style)])
     thickness = float(rng.uniform(0.1, 0.25))
     model = model_of(generate_home(rng, replace(HOME, wall_thickness_m=(thickness, thickness))), thickness)
-    sheet = _Sheet(model, _PIXELS_PER_M[style])
+    sheet = _Sheet(model, pixels_per_m or _PIXELS_PER_M[style])
     if style == "coloured":
         sheet.colour(rng)
     if style in ("coloured", "scanned"):
         sheet.furnish(rng)
-        sheet.letter()
-        sheet.dimension()
+        if has_texts:
+            sheet.letter()
+            sheet.dimension()
+    elif is_furnished:
+        sheet.furnish(rng)
     sheet.draw_walls(style, rng)
     sheet.draw_openings()
     picture = sheet.picture

@@ -1,15 +1,19 @@
-"""Importing drawn floor plans: rooms, doors and windows found in pictures, by style of drawing.
+"""Importing drawn floor plans: rooms, doors and windows found in pictures, by style and by condition.
 
-`python -m benchmarks.plan_pictures` prints the table of docs/results.md.
+`python -m benchmarks.plan_pictures` prints the figures of docs/results.md by style; `--conditions` those with noise,
+shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that are estimated without any text.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal, get_args
 
+import numpy as np
 import shapely
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
@@ -19,6 +23,8 @@ from lalaloc_core.importers import ImportOptions, import_plan
 _IOU = 0.9
 # An imported opening matches when it overlaps the true one by half of the longer, at most this far (m) beside it.
 _OVERLAP, _APART_M = 0.5, 0.3
+Condition = Literal["clean", "noise, σ = 5", "shadow, 40 %", "noise and shadow", "furniture", "JPEG, 1:100 at 150 dpi"]
+_SIGMA, _DARKEST, _PIXELS_PER_M_AT_150_DPI = 5.0, 0.6, 0.01 * 150.0 / 0.0254
 
 
 @dataclass
@@ -95,10 +101,75 @@ def measure(style: Style, plans: int, first_seed: int = 0) -> Score:
     return score
 
 
-def table(scores: dict[str, Score]) -> str:
+def measure_condition(condition: Condition, plans: int, first_seed: int = 0) -> Score:
+    """Return the score of generated plans under a condition, over all styles that are no scans."""
+    score = Score()
+    for style in STYLES:
+        for seed in range(first_seed, first_seed + plans if style != "scanned" else first_seed):
+            is_jpeg = condition.startswith("JPEG")
+            drawn = draw_plan(
+                style,
+                seed,
+                is_furnished=condition == "furniture",
+                pixels_per_m=_PIXELS_PER_M_AT_150_DPI if is_jpeg else None,
+            )
+            if "shadow" in condition:
+                drawn = drawn.shaded(_DARKEST)
+            if "noise" in condition:
+                drawn = drawn.noisy(_SIGMA, seed)
+            score_plan(drawn, drawn.jpeg() if is_jpeg else drawn.png(), score)
+    return score
+
+
+@dataclass
+class ScaleScore:
+    """Relative errors of estimated scales, as logarithms, with their estimates; and the number of plans refused."""
+
+    errors: list[float] = field(default_factory=list)
+    stds: list[float] = field(default_factory=list)
+    refused: int = 0
+
+
+def measure_scale(style: Style, plans: int, first_seed: int = 0) -> ScaleScore:
+    """Return the errors of the scales of plans without any text and without options."""
+    score = ScaleScore()
+    for seed in range(first_seed, first_seed + plans):
+        drawn = draw_plan(style, seed, has_texts=False)
+        try:
+            report = import_plan(drawn.jpeg() if style == "scanned" else drawn.png()).report
+        except InvalidFloorPlanError:
+            score.refused += 1
+            continue
+        score.errors.append(abs(math.log(report.metres_per_unit / drawn.metres_per_pixel)))
+        score.stds.append(report.scale_std)
+    return score
+
+
+def scale_table(scores: dict[str, ScaleScore]) -> str:
+    """Return the errors of scales as a Markdown table, with a row of all styles."""
+    everything = ScaleScore()
+    for score in scores.values():
+        everything.errors += score.errors
+        everything.stds += score.stds
+        everything.refused += score.refused
+    lines = [
+        "| style | plans | refused | error, median | 90th percentile | within two standard deviations |",
+        "|---|---|---|---|---|---|",
+    ]
+    for style, score in {**scores, "all": everything}.items():
+        errors = 100.0 * np.array(score.errors or [np.nan])
+        within = np.mean(np.array(score.errors) <= 2.0 * np.array(score.stds)) if score.errors else np.nan
+        lines.append(
+            f"| {style} | {len(score.errors) + score.refused} | {score.refused} | {np.median(errors):.1f}% | "
+            f"{np.percentile(errors, 90.0):.1f}% | {100.0 * within:.0f}% |"
+        )
+    return "\n".join(lines)
+
+
+def table(scores: dict[str, Score], label: str = "style") -> str:
     """Return the figures as a Markdown table."""
     lines = [
-        "| style | rooms | found, IoU ≥ 0.9 | doors, F1 | windows, F1 | CPU time per picture |",
+        f"| {label} | rooms | found, IoU ≥ 0.9 | doors, F1 | windows, F1 | CPU time per picture |",
         "|---|---|---|---|---|---|",
     ]
     for style, score in scores.items():
@@ -115,10 +186,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plans", type=int, default=40, help="generated plans per style")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first plan")
+    parser.add_argument(
+        "--conditions", action="store_true", help="also measure plans with noise, shadow, furniture, JPEG"
+    )
+    parser.add_argument("--scale", action="store_true", help="measure the errors of estimated scales instead")
     arguments = parser.parse_args()
     if arguments.plans < 1:
         parser.error(f"--plans is {arguments.plans}, the minimum is 1")
+    if arguments.scale:
+        print(scale_table({style: measure_scale(style, arguments.plans, arguments.seed) for style in STYLES}))
+        return
     print(table({style: measure(style, arguments.plans, arguments.seed) for style in STYLES}))
+    if arguments.conditions:
+        # Four styles each.
+        plans = max(1, arguments.plans // 4)
+        scores = {name: measure_condition(name, plans, arguments.seed) for name in get_args(Condition)}
+        print(table(scores, "condition"))
 
 
 if __name__ == "__main__":

@@ -21,6 +21,8 @@ _OPTIONS = {
     "scale": "scale of a drawing on paper, such as 1:100",
     "metres-per-pixel": "metres per pixel, or per unit of an SVG",
     "known-distance": "two points of the drawing and their distance: x0,y0,x1,y1,metres",
+    "multiply": "factor for all lengths of a drawing whose scale is false, such as 0.652",
+    "crop": "part of a page or picture to read, such as one of several storeys: x0,y0,x1,y1 in the file's coordinates",
     "level": "name or number of the level to import",
     "layers": "import only these layers, groups or classes, separated by commas",
     "page": "page of a PDF, from 1",

@@ -94,7 +94,7 @@ def _format(name: str, title: str, media_type: str, suffix: str, options: str, *
 
 
 _GML, _OSM = "application/gml+xml", "application/vnd.openstreetmap.data+xml"
-_SCALE = "metres_per_pixel known_distance"
+_SCALE = "metres_per_pixel known_distance multiply"
 _DXF = rb"AutoCAD Binary DXF|" + _START + rb"(?:999\r?\n[^\n]*\n\s*)*0\r?\n\s*SECTION"
 # A picture of a map, or its YAML file.
 _ROS = rb"P[25]\s|(?:[a-z_]+:[^\n]*\n|\s|#[^\n]*\n)*image:"
@@ -108,16 +108,17 @@ _FORMATS = (
     _format("ros", "ROS map (zip archive of YAML and PGM)", "application/zip", "map.zip", "metres_per_pixel",
             magic=re.compile(_ROS)),
     _format("sweethome3d", "Sweet Home 3D", "application/zip", "sh3d", "level"),
-    _format("dxf", "DXF", "image/vnd.dxf", "dxf", f"units layers y_axis {_SCALE}", magic=re.compile(_DXF, re.DOTALL)),
-    _format("dwg", "DWG (with a converter)", "image/vnd.dwg", "dwg", f"units layers y_axis {_SCALE}",
+    _format("dxf", "DXF", "image/vnd.dxf", "dxf", f"units layers y_axis crop {_SCALE}",
+            magic=re.compile(_DXF, re.DOTALL)),
+    _format("dwg", "DWG (with a converter)", "image/vnd.dwg", "dwg", f"units layers y_axis crop {_SCALE}",
             magic=re.compile(rb"AC10\d\d")),
     _format("indoorgml", "IndoorGML", _GML, "gml", "units level", magic=_xml("IndoorFeatures")),
-    _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis {_SCALE}", magic=_xml("svg")),
+    _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis crop {_SCALE}", magic=_xml("svg")),
     _format("ifc", "IFC", "application/x-step", "ifc", "level", magic=re.compile(_START + rb"ISO-10303-21"),
             extra="ifc"),
-    _format("picture", "PNG and JPEG", "image/png", "png", f"scale {_SCALE}",
+    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop {_SCALE}",
             magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff")),
-    _format("pdf", "PDF", "application/pdf", "pdf", f"scale page {_SCALE}",
+    _format("pdf", "PDF", "application/pdf", "pdf", f"scale page crop {_SCALE}",
             magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL)),
 )  # fmt: skip
 FORMATS: Mapping[str, Format] = {record.name: record for record in _FORMATS}

@@ -29,6 +29,14 @@ class _FileOptions(BaseModel):
     layers: str | None = Field(
         None, description="Layers, groups or classes to read, separated by commas; case is ignored."
     )
+    multiply: float | None = Field(
+        None, gt=0, description="Factor for all lengths of a drawing or picture whose scale is false."
+    )
+    crop: str | None = Field(
+        None,
+        description="Part of a page or picture to read, such as one of several storeys: `x0,y0,x1,y1` of two opposite "
+        "corners in the file's coordinates, as in `known_distance`.",
+    )
     page: int | None = Field(None, ge=1, description="Page of a PDF. Default: 1.")
     y_axis: Literal["up", "down"] | None = Field(
         None, description="Direction of y in the file. Default: that of its format."
@@ -82,6 +90,18 @@ class OpeningTrustAnswer(ResponseModel):
     reason: str
 
 
+class ScaleClueAnswer(ResponseModel):
+    """Scale by one kind of parts of a drawing."""
+
+    kind: Literal["leaf", "wall", "tread", "fixture", "area", "dimension"] = Field(
+        description="Leaves of doors, walls, stairs, fixtures, or areas and dimensions that are written."
+    )
+    count: int
+    metres_per_unit: float = Field(description="Scale by these parts alone.")
+    std: float = Field(description="Standard deviation of that scale, as a share of it.")
+    is_used: bool = Field(description="The scale agrees with it.")
+
+
 class ImportReport(ResponseModel):
     """Report on reading a plan file."""
 
@@ -104,6 +124,18 @@ class ImportReport(ResponseModel):
     )
     turned_deg: float = Field(
         default=0.0, description="Clockwise rotation about its centre that straightened a picture before it was read."
+    )
+    scale_std: float = Field(
+        default=0.0, description="Standard deviation of an estimated scale, as a share of it; 0 if the scale is given."
+    )
+    scale_clues: list[ScaleClueAnswer] = Field(default=[], description="Parts that an estimated scale was found by.")
+    scale_factor: float | None = Field(
+        default=None,
+        description="Factor for all lengths by which they agree with the areas or dimensions written in the drawing; "
+        "the option `multiply` applies it. Null without a contradiction.",
+    )
+    rejected_texts: list[str] = Field(
+        default=[], description="Texts that were read as areas or dimensions and not believed, with the reason."
     )
 
 

@@ -202,10 +202,17 @@ def test_unknown_layers_are_rejected_with_the_known_ones():
         import_plan(dxf_file(_german_walls()), ImportOptions(layers=("walls",)))
 
 
-def test_dxf_without_unit_is_rejected_with_the_likely_one():
-    with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like millimetres: units=mm"):
-        import_plan(dxf_file(_german_walls(insunits=0)))
+def test_dxf_without_unit_gets_the_one_of_its_door_and_area_as_an_assumption():
+    report = import_plan(dxf_file(_german_walls(insunits=0))).report
+    assert (report.metres_per_unit, report.scale_std) == (0.001, 0.0)
+    assert report.scale_source.startswith("millimetres, estimated from 1 door leaf")
+    assert any("millimetres are assumed" in warning for warning in report.warnings)
     assert len(import_plan(dxf_file(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
+
+
+def test_dxf_without_unit_and_doors_is_rejected_with_the_likely_one():
+    with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like millimetres: units=mm"):
+        import_plan(dxf_file(_german_walls(insunits=0)), ImportOptions(layers=("WAND",)))
 
 
 def test_wrong_unit_gives_a_warning():
@@ -320,9 +327,17 @@ def test_dimensions_give_the_scale(texts: tuple[str, ...]):
 
 
 @pytest.mark.parametrize("texts", [("4.00", "5.90", "9.30"), ("12", "4.90", "9.30"), ("4.00", "4.90", "R 7")])
-def test_dimensions_that_disagree_give_no_scale(texts: tuple[str, ...]):
+def test_two_dimensions_that_agree_give_a_scale_that_is_assumed(texts: tuple[str, ...]):
+    report = import_plan(_dimensioned_svg(37.0, texts)).report
+    assert report.metres_per_unit == pytest.approx(1.0 / 37.0, rel=0.01)
+    assert report.scale_source.startswith("estimated from 2 written dimensions (±")
+    assert report.scale_std > 0.005
+    assert any("is assumed" in warning for warning in report.warnings)
+
+
+def test_dimensions_that_disagree_give_no_scale():
     with pytest.raises(InvalidFloorPlanError, match="gives no scale"):
-        import_plan(_dimensioned_svg(37.0, texts))
+        import_plan(_dimensioned_svg(37.0, ("4.00", "5.90", "7.10")))
 
 
 def test_whole_numbers_of_a_large_drawing_are_ambiguous():
@@ -336,8 +351,6 @@ def test_whole_numbers_of_a_large_drawing_are_ambiguous():
 
 def test_dimensions_of_a_dxf_give_its_unit():
     document = _german_walls(insunits=0)
-    with pytest.raises(InvalidFloorPlanError, match="gives no unit"):
-        import_plan(dxf_file(document))
     space = document.modelspace()
     for start, end in ((0, 4000), (0, 6200), (4000, 6200)):
         space.add_linear_dim(base=(0, -900), p1=(start, 0), p2=(end, 0), dimstyle="Standard").render()

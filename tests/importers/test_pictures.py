@@ -139,11 +139,27 @@ def test_draft_uses_its_openings_as_far_as_they_seem_complete(drawn: dict[Style,
     assert {entry.kind: entry.trust for entry in draft.report.opening_trust}["door"] < 1.0
 
 
-def test_picture_without_scale_is_rejected(drawn: dict[Style, DrawnPlan]):
-    with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
-        import_plan(drawn["thick"].png())
-    with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
-        import_plan(drawn["thick"].png(), ImportOptions(units="m"))
+@pytest.mark.parametrize("options", [ImportOptions(), ImportOptions(units="m")])
+def test_picture_without_scale_gets_that_of_its_doors(drawn: dict[Style, DrawnPlan], options: ImportOptions):
+    report = import_plan(drawn["thick"].png(), options).report
+    assert 0.0 < report.scale_std < 0.1
+    assert report.metres_per_unit == pytest.approx(drawn["thick"].metres_per_pixel, rel=3.0 * report.scale_std)
+    clues = {clue.kind: clue for clue in report.scale_clues}
+    assert clues["leaf"].is_used
+    assert clues["leaf"].count >= 2
+    assert clues["leaf"].std < clues["wall"].std
+    (assumption,) = (warning for warning in report.warnings if "m per unit is assumed" in warning)
+    assert "door leaves" in assumption
+    assert "set known_distance" in assumption
+
+
+def test_picture_without_scale_and_doors_is_rejected():
+    stream = io.BytesIO()
+    page = Image.new("RGB", (600, 400), "white")
+    ImageDraw.Draw(page).rectangle((60, 60, 540, 340), outline="black", width=12)
+    page.save(stream, "PNG")
+    with pytest.raises(InvalidFloorPlanError, match=r"the picture gives no scale, and too few doors.*known_distance"):
+        import_plan(stream.getvalue())
 
 
 @pytest.mark.slow

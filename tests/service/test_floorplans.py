@@ -137,7 +137,7 @@ def test_unknown_and_missing_parts_are_rejected(client: httpx.Client) -> None:
     )
     (fault,) = extra["errors"]
     assert fault["field"] == "colour"
-    assert fault["message"].startswith("unknown part; known: ceiling_height_m, file, known_distance, layers")
+    assert fault["message"].startswith("unknown part; known: ceiling_height_m, crop, file, known_distance, layers")
     missing = assert_problem(client.post("/floorplans", files={"plan": file}), 422, "invalid-request")
     assert {"field": "file", "message": "is missing"} in missing["errors"]
     twice = client.post("/floorplans", files=[("file", file), ("file", file)])

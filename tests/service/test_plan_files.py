@@ -95,10 +95,23 @@ def test_pdf_is_a_draft(client: httpx.Client) -> None:
 
 
 @pytest.mark.slow
-def test_picture_needs_a_scale_and_is_a_draft(client: httpx.Client) -> None:
+def test_picture_without_scale_gets_an_estimate_with_its_error_and_clues(client: httpx.Client) -> None:
     drawn = draw_plan("thick", 1)
-    problem = assert_problem(send_plan(client, drawn.png()), 422, "invalid-floorplan")
-    assert "metres_per_pixel" in problem["detail"]
+    plan = store_plan(client, drawn.png())
+    report = plan["import_report"]
+    assert 0.0 < report["scale_std"] < 0.1
+    assert report["metres_per_unit"] == pytest.approx(drawn.metres_per_pixel, rel=3.0 * report["scale_std"])
+    assert {"leaf", "wall"} <= {clue["kind"] for clue in report["scale_clues"]}
+    assert any("is assumed" in warning for warning in plan["warnings"])
+    twice = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, multiply=2.0)
+    assert twice["import_report"]["metres_per_unit"] == pytest.approx(2.0 * drawn.metres_per_pixel)
+    part = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, crop="0,0,5000,5000")
+    assert len(part["rooms"]) == len(drawn.rooms)
+
+
+@pytest.mark.slow
+def test_picture_is_a_draft(client: httpx.Client) -> None:
+    drawn = draw_plan("thick", 1)
     plan = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, name="Drawn")
     assert plan["name"] == "Drawn"
     assert len(plan["rooms"]) == len(drawn.rooms)

@@ -384,3 +384,37 @@ def test_photographed_rooms_are_an_example(desktop: Visit) -> None:
     expect(page.locator("#answer-body")).to_contain_text("Possible places", timeout=60_000)
     page.get_by_text("Plans", exact=True).click()
     expect(page.locator("#plan-list button.plan", has_text="Six photographed rooms")).to_have_count(1)
+
+
+@pytest.mark.slow
+def test_false_scale_of_a_picture_is_corrected_with_one_click(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    (tmp_path / "printed.png").write_bytes(PrintedPlan().file())
+    page.locator("#plan-file").set_input_files(tmp_path / "printed.png")
+    page.get_by_text("Other ways to state the scale").click()
+    page.get_by_label("Metres per pixel").fill("0.02")
+    page.get_by_role("button", name="Read the picture").click()
+    apply = page.get_by_role("button", name=re.compile(r"Apply × 0\.7\d\d to all lengths"))
+    expect(apply).to_be_visible(timeout=120_000)
+    expect(page.locator("#plan-warnings")).to_contain_text("check the scale")
+    apply.click()
+    expect(page.locator("#plan-facts")).to_contain_text(re.compile(r"3 rooms, 5[012]\."), timeout=120_000)
+
+
+@pytest.mark.slow
+def test_part_of_a_picture_is_read_in_a_frame(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    _scan().save(tmp_path / "scan.png")
+    page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
+    page.get_by_text("Other ways to state the scale").click()
+    page.get_by_label("Metres per pixel").fill("0.01")
+    page.get_by_label("Drag a frame around the part to read").check()
+    script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
+        document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
+    page.mouse.move(*page.evaluate(script, [60, 60]))
+    page.mouse.down()
+    page.mouse.move(*page.evaluate(script, [840, 640]), steps=3)
+    page.mouse.up()
+    expect(page.locator(".measured .frame")).to_have_count(1)
+    page.get_by_role("button", name="Read the picture").click()
+    expect(page.locator("#plan-facts")).to_contain_text("2 rooms")

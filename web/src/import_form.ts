@@ -11,12 +11,14 @@ const FIELDS: [string, string, string][] = [
   ["level", "Level", "name or number"],
   ["scale", "Scale on paper", "1:100"],
   ["metres_per_pixel", "Metres per pixel", "0.01"],
+  ["multiply", "Factor of all lengths", "0.652"],
+  ["crop", "Only this part", "x0,y0,x1,y1"],
   ["page", "Page of a PDF", "1"],
   ["layers", "Only these layers", "walls, doors"],
   ["ceiling_height_m", "Ceiling, m", "2.5"],
 ];
 // The other fields do not apply to pictures.
-const OF_PICTURES = ["metres_per_pixel", "scale", "ceiling_height_m"];
+const OF_PICTURES = ["metres_per_pixel", "scale", "multiply", "crop", "ceiling_height_m"];
 const PICTURES = /^image\/(png|jpeg)$/;
 
 // Endings of files that can be read, perhaps with other options.
@@ -74,8 +76,11 @@ export class ImportForm {
     return { ...Object.fromEntries(this.inputs), known_distance: this.picture.metres };
   }
 
-  /** Show the form for a file, open if the file cannot be read without it; `levels` are those to choose from. */
-  ask(file: File, isNeeded: boolean, levels: string[] = []): void {
+  /**
+   * Show the form for a file, open if the file cannot be read without it; `levels` are those to choose from, and
+   * `factor` multiplies all lengths if the areas or dimensions written in the file are right.
+   */
+  ask(file: File, isNeeded: boolean, levels: string[] = [], factor: number | null = null): void {
     const isPicture = PICTURES.test(file.type);
     if (isPicture && file !== this.file) {
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
@@ -112,6 +117,11 @@ export class ImportForm {
       "div",
       { class: "ask" },
       levels.length === 0 ? again : whole,
+      factor !== null &&
+        button(`Apply × ${factor.toFixed(3)} to all lengths`, () => this.multiply(factor), {
+          id: "import-multiply",
+          class: "primary",
+        }),
       button("Cancel", () => this.cancelled()),
     );
     const fields = h("div", { class: "fields" }, ...shown);
@@ -125,7 +135,7 @@ export class ImportForm {
       byId("import-form"),
       h(
         "details",
-        { open: isNeeded },
+        { open: isNeeded || factor !== null },
         h("summary", {}, heading),
         ...(levels.length > 0
           ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask]
@@ -155,6 +165,13 @@ export class ImportForm {
     return isAsked;
   }
 
+  /** Read the file again with all lengths multiplied, also those that were multiplied before. */
+  private multiply(factor: number): void {
+    const input = this.inputs.get("multiply")!;
+    input.value = (factor * (Number(input.value) || 1)).toPrecision(6);
+    this.send();
+  }
+
   private sendLevel(level: string): void {
     this.inputs.get("level")!.value = level;
     this.send();
@@ -181,8 +198,10 @@ export class ImportForm {
     const values = Object.fromEntries(
       Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)),
     );
-    const distance = this.picture.knownDistance;
+    const distance = this.picture.knownDistance,
+      part = this.picture.part;
     if (isPicture && distance !== null) values.known_distance = distance;
+    if (isPicture && part !== null) values.crop = part;
     this.again(this.file, values);
   }
 }

@@ -19,6 +19,7 @@ export class PictureScale {
     placeholder: "4.2",
     inputmode: "decimal",
   });
+  private readonly framing = h("input", { type: "checkbox", id: "picture-frame" });
   private readonly error = h("p", { class: "field-error", id: "picture-metres-error", role: "alert", hidden: true });
   private readonly svg = s("svg", {
     class: "picture",
@@ -35,6 +36,9 @@ export class PictureScale {
     [0, 0],
   ];
 
+  /** Two opposite corners of the part that is read; null for the whole picture. */
+  private frame: [Point, Point] | null = null;
+
   constructor() {
     const drawing = h("div", { class: "drawing" }, this.svg);
     this.element = h(
@@ -44,13 +48,19 @@ export class PictureScale {
         "p",
         { class: "hint" },
         "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall. " +
-          "Without a distance, the dimensions written in the picture are used.",
+          "Without a distance, the dimensions written in the picture are used, else the usual sizes of doors and " +
+          "stairs. If the picture shows several storeys, drag a frame around one.",
       ),
+      h("label", { class: "check" }, this.framing, " Drag a frame around the part to read"),
       drawing,
       h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres, this.error),
     );
     this.metres.addEventListener("input", () => clearError(this.error, { metres: this.metres }));
     this.svg.append(this.picture, this.overlay);
+    this.framing.addEventListener("change", () => {
+      if (!this.framing.checked) this.frame = null;
+      this.draw();
+    });
     // Capture runs before the viewport's listener, which would move the drawing.
     this.svg.addEventListener("pointerdown", (event) => this.onDown(event));
     this.viewport = new Viewport(this.svg, drawing, () => this.draw());
@@ -83,6 +93,8 @@ export class PictureScale {
     if (this.url !== null) URL.revokeObjectURL(this.url);
     this.url = null;
     this.metres.value = "";
+    this.framing.checked = false;
+    this.frame = null;
     clearError(this.error, { metres: this.metres });
     show(this.picture);
     show(this.overlay);
@@ -92,6 +104,12 @@ export class PictureScale {
   get knownDistance(): string | null {
     if (this.url === null || this.metres.value.trim() === "") return null;
     return [...this.ends.flatMap(([x, y]) => [x.toFixed(1), (-y).toFixed(1)]), this.metres.value.trim()].join(",");
+  }
+
+  /** `x0,y0,x1,y1` of the framed part in pixels from the upper left corner; null for the whole picture. */
+  get part(): string | null {
+    if (this.url === null || this.frame === null) return null;
+    return this.frame.flatMap(([x, y]) => [x.toFixed(0), (-y).toFixed(0)]).join(",");
   }
 
   /** Ask for the distance that is missing. */
@@ -110,10 +128,16 @@ export class PictureScale {
     const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
     show(
       this.overlay,
+      this.frame !== null && this.frameBox(this.frame),
       s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }),
       ...this.ends.map((end, index) => this.handle(end, index, size)),
     );
     if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();
+  }
+
+  private frameBox([[ax, ay], [bx, by]]: [Point, Point]): SVGElement {
+    const [x, y] = [Math.min(ax, bx), Math.min(-ay, -by)];
+    return s("rect", { x, y, width: Math.abs(bx - ax), height: Math.abs(by - ay), class: "frame" });
   }
 
   private handle([x, y]: Point, index: number, size: number): SVGElement {
@@ -144,8 +168,17 @@ export class PictureScale {
   /** Drag the nearer end of the line; far from both, the viewport moves the picture. */
   private onDown(event: PointerEvent): void {
     if (event.button !== 0) return;
-    const place = placeOf(this.svg, event),
-      reach = 4 * unitOf(this.viewport.current);
+    const place = placeOf(this.svg, event);
+    if (this.framing.checked) {
+      event.preventDefault();
+      event.stopImmediatePropagation();
+      followPointer((moving) => {
+        this.frame = [place, placeOf(this.svg, moving)];
+        this.draw();
+      });
+      return;
+    }
+    const reach = 4 * unitOf(this.viewport.current);
     const distances = this.ends.map(([x, y]) => Math.hypot(x - place[0], y - place[1]));
     const index = distances[0]! <= distances[1]! ? 0 : 1;
     if (distances[index]! > reach) return;

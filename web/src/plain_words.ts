@@ -18,6 +18,8 @@ const LABELS: Record<string, string> = {
   scale: "Scale on paper",
   metres_per_pixel: "Metres per pixel",
   known_distance: "Distance of the ends",
+  multiply: "Factor of all lengths",
+  crop: "Only this part",
   page: "Page of a PDF",
   layers: "Only these layers",
   ceiling_height_m: "Ceiling",
@@ -39,7 +41,7 @@ export const labelOf = (field: string): string => LABELS[field] ?? field;
 /** Replace names of fields in a message: `hfov_deg` and `units=mm` by the labels of their fields. */
 export function plainWords(message: string): string {
   return message
-    .replace(/\b([a-z]+)=(\w+)/g, (whole, field: string, value: string) =>
+    .replace(/\b([a-z]+)=(\w+(?:[.,:]\d+)*)/g, (whole, field: string, value: string) =>
       field in LABELS ? `“${labelOf(field)}” (${VALUES[value] ?? value})` : whole,
     )
     .replace(/`?\b([a-z]+(?:_[a-z]+)+)\b`?/g, (whole, field: string) =>

@@ -31,7 +31,12 @@ function showWarnings(plan: Plan | null): void {
   const report = plan?.import_report;
   // An assumed ceiling is a warning of the plan and a guess of the import.
   const texts = [
-    ...new Set([...(report?.is_draft ? [DRAFT] : []), ...(plan?.warnings ?? []), ...(report?.unsure ?? [])]),
+    ...new Set([
+      ...(report?.is_draft ? [DRAFT] : []),
+      ...(plan?.warnings ?? []),
+      ...(report?.unsure ?? []),
+      ...(report?.rejected_texts ?? []),
+    ]),
   ];
   const items = texts.map((text) => h("li", {}, plainWords(text)));
   const rest = items.splice(MAX_WARNINGS);

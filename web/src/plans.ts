@@ -189,7 +189,7 @@ export class Plans {
         this.actions.picked();
         this.take(plan);
         if (isCertain(plan)) this.importing.close();
-        else this.importing.ask(file, false);
+        else this.importing.ask(file, false, [], plan.import_report?.scale_factor ?? null);
       }
       await this.load();
       say(`“${plan.name}” is stored.`);

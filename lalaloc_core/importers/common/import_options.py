@@ -57,6 +57,8 @@ class ImportOptions:
         level: name or number of the storey to import, if the file has several.
         layers: layers, groups or classes to import, ignoring case; empty for all.
         page: page of a PDF, counted from 1.
+        multiply: factor for all lengths of a drawing, whose scale is false.
+        crop: part of a page or picture that is read: x0, y0, x1, y1 of two opposite corners, in the file's coordinates.
         y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
         ceiling_height_m: ceiling height of rooms without one in the file.
     """
@@ -68,6 +70,8 @@ class ImportOptions:
     level: str | None = None
     layers: tuple[str, ...] = ()
     page: int = 1
+    multiply: float | None = None
+    crop: tuple[float, float, float, float] | None = None
     y_axis: str | None = None
     ceiling_height_m: float | None = None
     name: str | None = None
@@ -77,8 +81,11 @@ class ImportOptions:
             check_units(self.units)
         _check_range("scale", self.scale, 1.0, 10_000.0)
         _check_range("metres_per_pixel", self.metres_per_pixel, 1e-6, 10.0)
+        _check_range("multiply", self.multiply, 1e-3, 1e3)
         _check_range("page", self.page, 1.0, 10_000.0)
         _check_range("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
+        if self.crop is not None:
+            object.__setattr__(self, "crop", _ordered_crop(self.crop))
         if self.y_axis is not None:
             check_y_axis(self.y_axis)
         if len(self.layers) > _MAX_LAYERS:
@@ -144,15 +151,35 @@ def _parse(name: str, text: str) -> object:
             raise InvalidFloorPlanError(f"known_distance has {len(numbers)} numbers; give x0, y0, x1, y1, metres")
         x0, y0, x1, y1, metres = numbers
         return KnownDistance((x0, y0), (x1, y1), metres)
+    if name == "crop":
+        corners = [_number(name, part) for part in re.split(r"[,;\s]+", text)]
+        if len(corners) != 4:
+            raise InvalidFloorPlanError(f"crop has {len(corners)} numbers; give x0, y0, x1, y1 of two opposite corners")
+        return tuple(corners)
     if name == "layers":
         return tuple(part.strip() for part in text.split(",") if part.strip())
     if name == "page":
         if not text.isascii() or not text.isdigit() or len(text) > 9:
             raise InvalidFloorPlanError(f"page is '{text[:50]}'; it must be a whole number from 1")
         return int(text)
-    if name in ("metres_per_pixel", "ceiling_height_m"):
+    if name in ("metres_per_pixel", "multiply", "ceiling_height_m"):
         return _number(name, text)
     return text
+
+
+def _ordered_crop(crop: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return the corners of a part as (left, lowest y, right, highest y).
+
+    Raises:
+        InvalidFloorPlanError: the part is empty, or a number is out of range.
+    """
+    x0, y0, x1, y1 = crop
+    if not all(abs(number) <= _MAX_NUMBER for number in crop) or x0 == x1 or y0 == y1:
+        raise InvalidFloorPlanError(
+            f"crop is {', '.join(f'{number:g}' for number in crop)}; give x0, y0, x1, y1 of two opposite corners, "
+            f"numbers up to {_MAX_NUMBER:g}"
+        )
+    return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
 
 
 def _number(name: str, text: str) -> float:

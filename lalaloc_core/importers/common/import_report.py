@@ -33,6 +33,25 @@ class LayerUse:
 
 
 @dataclass(frozen=True)
+class ScaleClue:
+    """Scale by one kind of parts of a drawing.
+
+    Attributes:
+        kind: "leaf" of a door, "wall", "tread" of stairs, "fixture", "area" or "dimension" that is written.
+        count: number of parts.
+        metres_per_unit: scale by these parts alone.
+        std: standard deviation of that scale, as a share of it.
+        is_used: the scale agrees with it.
+    """
+
+    kind: str
+    count: int
+    metres_per_unit: float
+    std: float
+    is_used: bool
+
+
+@dataclass(frozen=True)
 class ImportReport:
     """Report of one import.
 
@@ -46,6 +65,11 @@ class ImportReport:
         no_room: outlines (m) of the largest areas inside the drawn walls that became no room.
         opening_trust: trust in each kind of openings; empty if the file states it.
         turned_deg: clockwise rotation about its centre that straightened a picture.
+        scale_std: standard deviation of an estimated scale, as a share of it; 0 if the scale is given.
+        scale_clues: sizes of parts that an estimated scale was found by.
+        scale_factor: factor for all lengths by which they agree with the areas or dimensions that are written; None
+            without a contradiction.
+        rejected_texts: texts that were read as areas or dimensions and not believed, with the reason.
     """
 
     format: str
@@ -59,6 +83,10 @@ class ImportReport:
     no_room: tuple[Outline, ...] = ()
     opening_trust: tuple[OpeningTrust, ...] = ()
     turned_deg: float = 0.0
+    scale_std: float = 0.0
+    scale_clues: tuple[ScaleClue, ...] = ()
+    scale_factor: float | None = None
+    rejected_texts: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -69,8 +97,8 @@ class ImportReport:
 class ReportBuilder:
     """Report under construction while a file is read.
 
-    The first four fields and `turned_deg` are those of `ImportReport`; `no_room` are areas in metres inside walls, the
-    largest first.
+    The first four fields, `turned_deg` and the last four are those of `ImportReport`; `no_room` are areas in metres
+    inside walls, the largest first.
     """
 
     format: str = ""
@@ -84,6 +112,10 @@ class ReportBuilder:
     no_room: list[shapely.Polygon] = field(default_factory=list)
     opening_trust: tuple[OpeningTrust, ...] = ()
     turned_deg: float = 0.0
+    scale_std: float = 0.0
+    scale_clues: tuple[ScaleClue, ...] = ()
+    scale_factor: float | None = None
+    rejected_texts: list[str] = field(default_factory=list)
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -104,6 +136,10 @@ class ReportBuilder:
             no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
             opening_trust=self.opening_trust,
             turned_deg=self.turned_deg,
+            scale_std=self.scale_std,
+            scale_clues=self.scale_clues,
+            scale_factor=self.scale_factor,
+            rejected_texts=_limit_lines(self.rejected_texts),
         )
 
 

@@ -92,6 +92,8 @@ class Sketch:
         recall: share of drawn openings that the importer finds.
         kinds: kinds of openings that the source can hold.
         drawn: box around the drawn walls, if rooms were found between them.
+        leaves_m: widths of the leaves of doors that swing in gaps of walls.
+        wall_m: usual thickness of the walls, 0 if unknown.
     """
 
     rooms: list[SketchedRoom] = field(default_factory=list)
@@ -107,6 +109,8 @@ class Sketch:
     kinds: tuple[OpeningKind, ...] = ("door", "window", "passage")
     drawn: BaseGeometry | None = None
     fixtures: list[SketchedFixture] = field(default_factory=list)
+    leaves_m: list[float] = field(default_factory=list)
+    wall_m: float = 0.0
 
 
 def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:

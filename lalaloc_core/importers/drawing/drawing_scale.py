@@ -1,6 +1,6 @@
 """Scale of drawings: read from the options, the file, or its dimensions, which are lengths written at lines.
 
-The scale is never assumed.
+Without any, `scale_guess.py` estimates it; the assumption is reported.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
-from lalaloc_core.importers.drawing.vector_drawing import Drawing
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
 _WRITTEN = re.compile(r"(?<![\d.,:])1\s?[:/]\s?(\d{1,4})(?![\d.,:])")
 # Common scales of building drawings.
@@ -58,16 +58,34 @@ def drawing_scale(
     *,
     paper_m_per_unit: float | None = None,
     own: tuple[float, str] | None = None,
+    guess: Callable[[], tuple[float, str] | None] = lambda: None,
 ) -> tuple[float, str]:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
-    a unit has a length on paper, then the dimensions of the first drawing that has them. `subject` names the file in
-    the error message, and `check_time` raises an exception to stop.
+    a unit has a length on paper, then the dimensions of the first drawing that has them, then the `guess`. `subject`
+    names the file in the error message, and `check_time` raises an exception to stop. The option `multiply` multiplies
+    any of them.
 
     Raises:
-        InvalidFloorPlanError: neither the options nor the file give a scale.
+        InvalidFloorPlanError: neither the options nor the file give a scale, and there is no guess.
     """
+    factor, source = _given_scale(options, subject, drawings, check_time, paper_m_per_unit, own, guess)
+    if options.multiply is None:
+        return factor, source
+    return _checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)", subject)
+
+
+def _given_scale(
+    options: ImportOptions,
+    subject: str,
+    drawings: Sequence[Drawing],
+    check_time: Callable[[], None],
+    paper_m_per_unit: float | None,
+    own: tuple[float, str] | None,
+    guess: Callable[[], tuple[float, str] | None],
+) -> tuple[float, str]:
+    """Return metres per unit and their source without the option `multiply`; see `drawing_scale`."""
     if options.known_distance is not None:
         return options.known_distance.metres_per_unit, "option known_distance"
     if options.metres_per_pixel is not None:
@@ -88,10 +106,12 @@ def drawing_scale(
         return _checked(written * paper_m_per_unit, f"1:{written:g}, written in the drawing", subject)
     if measured := next(filter(None, (drawn_scale(drawing, check_time) for drawing in drawings)), None):
         return _checked(*measured, subject)
+    if guessed := guess():
+        return _checked(*guessed, subject)
     hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
     raise InvalidFloorPlanError(
-        f"{subject} gives no scale{hint}: set scale (1:100), metres_per_pixel (metres per unit of the drawing) or "
-        "known_distance (x0, y0, x1, y1, metres)"
+        f"{subject} gives no scale{hint}, and too few doors, stairs, areas or dimensions are found to estimate it: set "
+        "scale (1:100), metres_per_pixel (metres per unit of the drawing) or known_distance (x0, y0, x1, y1, metres)"
     )
 
 
@@ -124,7 +144,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
     votes = [
         (math.log(value_m / length), index, value_m)
         for index, (text, lengths) in enumerate(dimensions)
-        for value_m in _values_m(text)
+        for value_m in values_m(text)
         for length in lengths
         if length > 0.0 and _EXTENT_M[0] <= extent * value_m / length <= _EXTENT_M[1]
     ]
@@ -140,7 +160,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
 
 def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
     """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
-    return scale_by_dimensions(_written_dimensions(drawing, check_time), drawing.extent) if drawing.shapes else None
+    return scale_by_dimensions(written_dimensions(drawing, check_time), drawing.extent) if drawing.shapes else None
 
 
 def check_scale(
@@ -148,27 +168,49 @@ def check_scale(
 ) -> None:
     """Warn if a scale differs from that of the dimensions that are written in the drawing."""
     if measured is not None and abs(metres_per_unit / measured[0] - 1.0) > _TOLERANCE:
+        builder.scale_factor = measured[0] / metres_per_unit
         builder.warnings.append(
             f"{measured[1]} give {measured[0]:.4g} m per unit, and the {source} gives {metres_per_unit:.4g}; check both"
+            f", or set multiply={builder.scale_factor:.3f} to believe the dimensions"
         )
+
+
+def reject_dimensions(dimensions: Sequence[Dimension], metres_per_unit: float, builder: ReportBuilder) -> None:
+    """Report the texts that look like dimensions and are not as long as a line beside them, at the scale in use."""
+    for text, lengths in dimensions:
+        values = values_m(text)
+        # Whole numbers without a unit can be anything.
+        is_length = not text.strip().isdigit()
+        lines_m = [length * metres_per_unit for length in lengths]
+        if is_length and not any(abs(line_m / value - 1.0) <= _TOLERANCE for line_m in lines_m for value in values):
+            nearest = min(lines_m, key=lambda line_m: min(abs(math.log(line_m / value)) for value in values))
+            builder.rejected_texts.append(
+                f"'{text[:50]}' was read as a dimension of {values[0]:.4g} m; the likeliest line beside it is "
+                f"{nearest:.2f} m long"
+            )
 
 
 def check_areas(rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], builder: ReportBuilder) -> None:
     """Compare the areas (m²) of rooms with those written in them, `texts` of every room."""
-    shares: dict[int, float] = {}
-    for index, (room, written) in enumerate(zip(rooms, texts, strict=True)):
-        areas = [area for text in written for area in _areas_m2(text)]
-        # A room with two areas is two rooms, or one of them is the area of the flat.
-        if len(areas) == 1:
-            shares[index] = room.shape.area / areas[0]
+    areas = _written_areas([room.shape for room in rooms], texts)
+    shares = {index: area_m2 / written_m2 for index, (written_m2, area_m2) in areas.items()}
+    usual = float(np.median(list(shares.values()))) if shares else 1.0
+    builder.rejected_texts += [
+        f"{areas[index][0]:.4g} m² was read as the area of a room of {areas[index][1]:.1f} m²"
+        + (f" ('{rooms[index].name}')" if rooms[index].name else "")
+        for index, share in shares.items()
+        if abs(share / usual - 1.0) > _AREA_TOLERANCE or (len(shares) < _MIN_AGREEING and abs(share - 1.0) > 0.1)
+    ]
     if len(shares) < _MIN_AGREEING:
         return
     middle = float(np.median(list(shares.values())))
     length = math.sqrt(middle)
     if abs(length - 1.0) > _TOLERANCE:
+        builder.scale_factor = 1.0 / length
         builder.warnings.append(
             f"the areas written in {len(shares)} rooms are {1.0 / middle:.2f} times those of the plan; if they are "
-            f"right, all lengths have to be multiplied by {1.0 / length:.3f}: check the scale"
+            f"right, all lengths have to be multiplied by {1.0 / length:.3f}: check the scale, or set "
+            f"multiply={1.0 / length:.3f}"
         )
         return
     builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
@@ -182,6 +224,25 @@ def check_areas(rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], b
             )
 
 
+def areas_of_rooms(
+    shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
+) -> dict[int, tuple[float, float]]:
+    """Return the area (m²) that is written in each room, and the room's area, by the index of the room."""
+    tree = shapely.STRtree(shapes)
+    texts: list[list[str]] = [[] for _ in shapes]
+    for lettering in letterings:
+        inside = tree.query(shapely.Point(lettering.position), predicate="within")
+        if len(inside):
+            texts[min(inside, key=lambda index: shapes[index].area)].append(lettering.text)
+    return _written_areas(shapes, texts)
+
+
+def _written_areas(shapes: Sequence[shapely.Polygon], texts: Sequence[Sequence[str]]) -> dict[int, tuple[float, float]]:
+    areas = [[area for text in written for area in _areas_m2(text)] for written in texts]
+    # A room with two areas is two rooms, or one of them is the area of the flat.
+    return {index: (found[0], shapes[index].area) for index, found in enumerate(areas) if len(found) == 1}
+
+
 def _areas_m2(text: str) -> tuple[float, ...]:
     """Return the areas (m²) that are written in a text."""
     found = [(float(number.replace(",", ".")), unit) for number, unit in _AREA.findall(text)]
@@ -189,12 +250,12 @@ def _areas_m2(text: str) -> tuple[float, ...]:
     return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
 
 
-def _written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
+def written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
-    texts = [lettering for lettering in drawing.letterings if _values_m(lettering.text)][:_MAX_TEXTS]
+    texts = [lettering for lettering in drawing.letterings if values_m(lettering.text)][:_MAX_TEXTS]
     points = [shapely.get_coordinates(stroke.line) for stroke in drawing.strokes]
     ends = [pair for line in points for pair in pairwise(line) if (pair[0] != pair[1]).any()]
-    if len(texts) < _MIN_AGREEING or not ends or len(ends) > _MAX_PIECES:
+    if not texts or not ends or len(ends) > _MAX_PIECES:
         return []
     pieces = [shapely.LineString(pair) for pair in ends]
     tree = shapely.STRtree(pieces)
@@ -225,7 +286,7 @@ def _lengths_at(place: shapely.Point, line: shapely.LineString, tree: shapely.ST
     return [*whole, *(length for length in between if not whole or abs(length - whole[0]) > 1e-6)]
 
 
-def _values_m(text: str) -> tuple[float, ...]:
+def values_m(text: str) -> tuple[float, ...]:
     """Return the lengths (m) that a text can mean."""
     text = text.strip()
     if match := _IMPERIAL.fullmatch(text):

@@ -28,7 +28,7 @@ from lalaloc_core.importers.drawing.door_leaves import (
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.drawing_scale import check_areas
+from lalaloc_core.importers.drawing.drawing_scale import check_areas, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
 from lalaloc_core.importers.drawing.readings import (
@@ -40,6 +40,7 @@ from lalaloc_core.importers.drawing.readings import (
     report_unused,
     split_lines,
 )
+from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
@@ -121,6 +122,8 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     finder = GapFinder(gaps)
     closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
     sketch.openings = [*_symbols(drawing, closing), *_swings([*drawing.swings, *closing], finder, shapes)]
+    sketch.leaves_m = _leaf_widths([*drawing.swings, *closing], finder)
+    sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])
     for gap in gaps:
@@ -138,6 +141,21 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             )
     budget.check_time()
     return sketch
+
+
+def guess_drawing(drawing: Drawing, budget: Budget, *, flip_y: bool) -> ScaleGuess | None:
+    """Return the scale of a vector drawing by the usual sizes of its parts, None if they are too few."""
+    if not drawing.shapes:
+        return None
+    dimensions = written_dimensions(drawing, budget.check_time)
+
+    def measure(scale: float) -> Measures:
+        scaled = drawing.scaled(scale, flip_y=flip_y)
+        sketch = sketch_drawing(scaled, ReportBuilder(), budget)
+        return measures_of(sketch, scale, scaled.letterings, drawing, dimensions)
+
+    start = first_scale(drawing.extent, [swing.radius for swing in drawing.swings])
+    return guess_scale(measure, start, budget)
 
 
 def _kind_without_symbol(gap: Gap, rooms: shapely.STRtree) -> OpeningKind:
@@ -264,6 +282,13 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
         elif not walls.is_empty:
             found.append(_closed_leaf(swing, walls))
     return found
+
+
+def _leaf_widths(swings: Sequence[Swing], finder: GapFinder) -> list[float]:
+    """Return the widths of leaves that close a gap, one for every gap; of all arcs of their size without gaps."""
+    leaves = [swing for swing in swings if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
+    closing = {index: swing.radius for swing in leaves if (index := finder.closed_by(swing)) is not None}
+    return list(closing.values()) or [swing.radius for swing in leaves]
 
 
 def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:

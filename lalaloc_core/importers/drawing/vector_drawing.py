@@ -123,6 +123,28 @@ class Drawing:
         x0, y0, x1, y1 = shapely.total_bounds(self.shapes)
         return float(max(x1 - x0, y1 - y0))
 
+    def cropped(self, box: tuple[float, float, float, float]) -> Drawing:
+        """Return the part of the drawing in a box; lines are cut, other shapes belong to it by their middles."""
+        frame = shapely.box(*box)
+
+        def is_inside(shape: BaseGeometry) -> bool:
+            return bool(frame.covers(shape.centroid))
+
+        cut = [(stroke, shapely.intersection(stroke.line, frame)) for stroke in self.strokes]
+        return Drawing(
+            [area for area in self.areas if is_inside(area.shape)],
+            [
+                replace(stroke, line=part)
+                for stroke, inside in cut
+                for part in shapely.get_parts(inside)
+                if isinstance(part, shapely.LineString) and part.length > 0.0
+            ],
+            [swing for swing in self.swings if frame.covers(shapely.Point(swing.hinge))],
+            [lettering for lettering in self.letterings if frame.covers(shapely.Point(lettering.position))],
+            [patch for patch in self.patches if is_inside(patch.shape)],
+            [fixture for fixture in self.fixtures if is_inside(fixture.shape)],
+        )
+
     def scaled(self, factor: float, *, flip_y: bool) -> Drawing:
         """Return the drawing in metres, with y up."""
         factors = np.array([factor, -factor if flip_y else factor])

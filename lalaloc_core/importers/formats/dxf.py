@@ -79,7 +79,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     _check_blocks(document, budget)
     builder = ReportBuilder("dxf")
     drawing = _read_drawing(document, options, builder, budget)
-    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder)
+    if options.crop is not None:
+        drawing = drawing.cropped(options.crop)
+    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder, budget)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import islice
 
 import numpy as np
@@ -11,22 +12,27 @@ from ezdxf.lldxf.const import DXFError
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import side_lengths
-from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.plausibility import UNIT_NAMES, unit_by_parts
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
+from lalaloc_core.importers.drawing.scale_guess import assume_scale
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
 # (metres, value of the option `units`) by $INSUNITS; DXF reference.
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
 _USUAL_EXTENT_M = (4.0, 120.0)
 _MAX_DIMENSIONS = 1000
+# A unit is meant within so many standard deviations of the estimated scale, or this share of it.
+_NEAR_STDS, _NEAR = 3.0, 0.1
 
 
 def find_unit(
-    document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder
+    document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget
 ) -> tuple[float, str]:
-    """Return the metres per unit and their source, the options, $INSUNITS or the dimensions.
+    """Return the metres per unit and their source: the options, $INSUNITS, the dimensions, or the sizes of the parts.
 
     Raises:
         InvalidFloorPlanError: none gives a unit; the message names the likely one.
@@ -44,6 +50,8 @@ def find_unit(
     fitting = unit_by_parts([*doors, *(swing.radius for swing in drawing.swings)], extent, sides)
     given = (options.units, options.known_distance, options.metres_per_pixel, own_unit, measured)
     if all(scale is None for scale in given):
+        measured = _assumed_unit(drawing, options, builder, budget)
+    if measured is None and all(scale is None for scale in given):
         hint = f" and looks like {UNIT_NAMES[fitting]}: units={fitting}" if fitting else ""
         raise InvalidFloorPlanError(
             f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
@@ -57,6 +65,25 @@ def find_unit(
             hint = f"it looks like {UNIT_NAMES[fitting]}: set units={fitting}"
         builder.warnings.append(f"the drawing is {extent * factor:.4g} m across; {hint}")
     return factor, source
+
+
+def _assumed_unit(
+    drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget
+) -> tuple[float, str] | None:
+    """Return the only unit that is near the scale by the usual sizes of parts, and report it; None without one."""
+    guess = guess_drawing(drawing, budget, flip_y=options.y_axis == "down")
+    if guess is None:
+        return None
+    reach = max(_NEAR_STDS * guess.std, _NEAR)
+    fitting = [unit for unit, m in METRES_PER_UNIT.items() if abs(math.log(m / guess.metres_per_unit)) <= reach]
+    if len(fitting) != 1:
+        return assume_scale(guess, builder)
+    builder.scale_clues = guess.clues
+    builder.warnings.append(
+        f"the DXF gives no unit; {UNIT_NAMES[fitting[0]]} are assumed, as a unit is {guess.metres_per_unit:.3g} m, "
+        f"{guess.source}; set units if that is wrong"
+    )
+    return METRES_PER_UNIT[fitting[0]], f"{UNIT_NAMES[fitting[0]]}, {guess.source}"
 
 
 def _dimensions(document: DxfDocument) -> list[Dimension]:

@@ -20,10 +20,20 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
-from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
-from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text, sketch_drawing
+from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
+from lalaloc_core.importers.drawing.scale_guess import (
+    Measures,
+    ScaleGuess,
+    assume_scale,
+    first_scale,
+    guess_scale,
+    measures_of,
+)
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
+from lalaloc_core.importers.drawing.storeys import Box, choose_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
+from lalaloc_core.importers.picture.ink import blank_outside
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
@@ -47,6 +57,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     try:
         budget.begin(f"reading page {options.page} of {len(document)}")
         found = read_page(page, budget)
+        if options.crop is not None:
+            found.drawing = found.drawing.cropped(options.crop)
         with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
             return _read_plan(page, found, options, budget)
     finally:
@@ -64,11 +76,17 @@ def _read_plan(
     builder = ReportBuilder("pdf", is_draft=True)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
-    scan = _read_scan(page, found, builder, budget)
+    scan = _read_scan(page, found, options.crop, builder, budget)
+    assumed = ReportBuilder()
     # A unit of a PDF is always a point.
     without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
     factor, source = drawing_scale(
-        without_units, "the PDF", drawings, budget.check_time, paper_m_per_unit=_METRES_PER_POINT
+        without_units,
+        "the PDF",
+        drawings,
+        budget.check_time,
+        paper_m_per_unit=_METRES_PER_POINT,
+        guess=lambda: assume_scale(_guess(page, found, scan, options.crop, budget), assumed),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)
@@ -77,18 +95,47 @@ def _read_plan(
     if sketch is None or not sketch.rooms:
         notes.append(f"page {options.page} was read as a picture")
         builder = ReportBuilder("pdf", is_draft=True, notes=notes)
-        sketch = _as_picture(page, found, factor, builder, budget)
+        sketch = _as_picture(page, found, factor, options.crop, builder, budget)
         # Searchable scans contain text over the picture.
         own = found.drawing.scaled(factor, flip_y=False).letterings
         rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
         sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
+
+    def in_points(box: Box) -> Box:
+        x0, y0, x1, y1 = box
+        return x0 / factor, y0 / factor, x1 / factor, y1 / factor
+
+    sketch = choose_storey(sketch, builder, in_points, is_chosen=True)
     builder.metres_per_unit, builder.scale_source = factor, source
+    builder.scale_std, builder.scale_clues = assumed.scale_std, assumed.scale_clues
+    builder.warnings[:0] = assumed.warnings
     return (assemble(sketch, builder, options, budget.limits.plan),)
+
+
+def _guess(
+    page: pypdfium2.PdfPage, found: PageContent, scan: PictureTexts, crop: Box | None, budget: Budget
+) -> ScaleGuess | None:
+    """Return the scale of a page by the usual sizes of its parts, None if they are too few."""
+    if _is_drawing(found):
+        _remove_letters(found)
+        return guess_drawing(found.drawing, budget, flip_y=False)
+    dimensions = written_dimensions(scan.drawing, budget.check_time)
+
+    def measure(scale: float) -> Measures:
+        sketch = _as_picture(page, found, scale, crop, ReportBuilder(), budget)
+        letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
+        return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
+
+    return guess_scale(measure, first_scale(0.9 * max(found.size_pt)), budget)
+
+
+def _is_drawing(found: PageContent) -> bool:
+    return len(found.drawing.strokes) + len(found.drawing.areas) >= _MIN_LINES and found.picture_share <= _MOSTLY
 
 
 def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:
     drawing = found.drawing
-    if len(drawing.strokes) + len(drawing.areas) < _MIN_LINES or found.picture_share > _MOSTLY:
+    if not _is_drawing(found):
         return None
     builder.use("lines", "possible walls", len(drawing.strokes))
     builder.use("areas", "possible walls", len(drawing.areas))
@@ -98,7 +145,7 @@ def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budge
 
 
 def _as_picture(
-    page: pypdfium2.PdfPage, found: PageContent, factor: float, builder: ReportBuilder, budget: Budget
+    page: pypdfium2.PdfPage, found: PageContent, factor: float, crop: Box | None, builder: ReportBuilder, budget: Budget
 ) -> Sketch:
     """Render the page and read it as a picture."""
     width, height = found.size_pt
@@ -109,11 +156,21 @@ def _as_picture(
             f"the page is {width * factor:.0f} m by {height * factor:.0f} m, {width * height * scale**2:.0f} pixels; "
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
-    gray = _gray(page.render(scale=scale, grayscale=True))  # type: ignore[arg-type]
+    gray = _cropped(_gray(page.render(scale=scale, grayscale=True)), crop, scale)  # type: ignore[arg-type]
     return sketch_picture(gray, factor / scale, builder, budget)
 
 
-def _read_scan(page: pypdfium2.PdfPage, found: PageContent, builder: ReportBuilder, budget: Budget) -> PictureTexts:
+def _cropped(gray: UInt8[np.ndarray, "h w"], crop: Box | None, scale: float) -> UInt8[np.ndarray, "h w"]:
+    """Return a rendered page that is blank outside a box in points, y up."""
+    if crop is None:
+        return gray
+    x0, y0, x1, y1 = (number * scale for number in crop)
+    return blank_outside(gray, (x0, gray.shape[0] - y1, x1, gray.shape[0] - y0))
+
+
+def _read_scan(
+    page: pypdfium2.PdfPage, found: PageContent, crop: Box | None, builder: ReportBuilder, budget: Budget
+) -> PictureTexts:
     """Return the texts of a scanned page, in points; letters that are drawn as lines join the texts of the page."""
     is_scan, own = found.picture_share > _MOSTLY, list(found.drawing.letterings)
     # A page can have a title block as text, and rooms with drawn letters.
@@ -123,7 +180,7 @@ def _read_scan(page: pypdfium2.PdfPage, found: PageContent, builder: ReportBuild
     scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)
     bitmap = page.render(scale=scale, grayscale=True)  # type: ignore[arg-type]
     # Lines of a drawing are not turned, so its texts must not be.
-    scan = read_texts(_gray(bitmap), builder, budget, straighten=is_scan).scaled(1.0 / scale)
+    scan = read_texts(_cropped(_gray(bitmap), crop, scale), builder, budget, straighten=is_scan).scaled(1.0 / scale)
     if is_scan:
         return scan
     convert = bitmap.get_posconv(page)

@@ -15,9 +15,18 @@ from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.drawing.drawing_scale import check_scale, drawing_scale, drawn_scale
+from lalaloc_core.importers.drawing.drawing_scale import (
+    check_scale,
+    drawing_scale,
+    reject_dimensions,
+    scale_by_dimensions,
+    written_dimensions,
+)
+from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
+from lalaloc_core.importers.drawing.storeys import Box, choose_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area
+from lalaloc_core.importers.picture.ink import blank_outside, inked_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from lalaloc_core.picture_kinds import Tones
@@ -40,6 +49,11 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         raise InvalidFloorPlanError(
             "the picture is a photograph, not a floor plan: send it to be localised, or send a drawn or scanned plan"
         )
+    if options.crop is not None:
+        gray, warmth = (
+            blank_outside(gray, options.crop),
+            None if warmth is None else blank_outside(warmth, options.crop),
+        )
     texts = read_texts(gray, builder, budget)
     with naming_text(texts.drawing.letterings, "the picture"):
         return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)
@@ -56,11 +70,23 @@ def _read_plan(
 ) -> tuple[ImportedPlan, ...]:
     """Read the plan, after its texts."""
     # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
-    measured = drawn_scale(texts.drawing, budget.check_time)
+    dimensions = written_dimensions(texts.drawing, budget.check_time)
+    measured = scale_by_dimensions(dimensions, texts.drawing.extent) if texts.drawing.shapes else None
+
+    def measure(metres_per_pixel: float) -> Measures:
+        sketch = sketch_picture(gray, metres_per_pixel, ReportBuilder(), budget, warmth)
+        return measures_of(sketch, metres_per_pixel, texts.placed(metres_per_pixel), texts.drawing, dimensions)
+
     factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(
-        replace(options, units=None), "the picture", [texts.drawing], paper_m_per_unit=paper_m_per_pixel, own=measured
+        replace(options, units=None),
+        "the picture",
+        [texts.drawing],
+        paper_m_per_unit=paper_m_per_pixel,
+        own=measured,
+        guess=lambda: assume_scale(guess_scale(measure, first_scale(inked_extent(gray)), budget), builder),
     )
     check_scale(factor, source, measured, builder)
+    reject_dimensions(dimensions, factor, builder)
     rows, columns = gray.shape
     if max(rows, columns) * factor > _MAX_EXTENT_M:
         raise InvalidFloorPlanError(
@@ -76,6 +102,12 @@ def _read_plan(
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
     sketch.rooms = name_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
+
+    def in_file(box: Box) -> Box:
+        x0, y0, x1, y1 = (number / factor for number in box)
+        return max(x0, 0.0), max(rows - y1, 0.0), min(x1, float(columns)), min(rows - y0, float(rows))
+
+    sketch = choose_storey(sketch, builder, in_file, is_chosen=True)
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

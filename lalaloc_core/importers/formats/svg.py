@@ -29,7 +29,8 @@ from lalaloc_core.importers.common.safe_xml import local_name, read_xml
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
-from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.scale_guess import assume_scale
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,
@@ -108,8 +109,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder("svg")
     drawing = _read_drawing(root, options, builder, budget)
+    if options.crop is not None:
+        drawing = drawing.cropped(options.crop)
     builder.metres_per_unit, builder.scale_source = drawing_scale(
-        options, "the SVG", [drawing], budget.check_time, paper_m_per_unit=paper_m, own=own
+        options,
+        "the SVG",
+        [drawing],
+        budget.check_time,
+        paper_m_per_unit=paper_m,
+        own=own,
+        guess=lambda: assume_scale(guess_drawing(drawing, budget, flip_y=options.y_axis != "up"), builder),
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")

@@ -30,11 +30,13 @@ class GapContent:
     Attributes:
         kind: "swing" for the arc of a door, "pane" for two or more lines along the wall, "line" for a single line.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
+        leaf_m: width of the leaf that swings, 0 without one.
     """
 
     kind: Literal["swing", "pane", "line", "nothing"]
     confidence: float
     warmth: float = 0.0
+    leaf_m: float = 0.0
 
 
 class GapReader:
@@ -49,9 +51,9 @@ class GapReader:
 
     def classify(self, gap: Gap) -> GapContent:
         """Return the most likely content of a gap."""
-        arc = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
+        arc, leaves = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else (0.0, 1)
         if arc >= _ARC:
-            return GapContent("swing", arc)
+            return GapContent("swing", arc, leaf_m=gap.width / leaves)
         lines, share, warmth = self._lines(gap)
         if lines >= 2:
             return GapContent("pane", share, warmth)
@@ -59,19 +61,21 @@ class GapReader:
             return GapContent("line", share, warmth)
         return GapContent("nothing", 1.0 - max(arc, share if lines else 0.0))
 
-    def _arc(self, gap: Gap) -> float:
-        """Return the inked share of the best quarter circle about an end of the gap, with one leaf or two."""
+    def _arc(self, gap: Gap) -> tuple[float, int]:
+        """Return the inked share of the best quarter circle about an end of the gap, and the number of leaves."""
         start, end = np.array(gap.start), np.array(gap.end)
         along = (end - start) / gap.width
         across = np.array([-along[1], along[0]])
         half = 0.5 * gap.shape.area / gap.width
-        best = 0.0
+        best = 0.0, 1
         for leaves in (1, 2):
             for side in (1.0, -1.0):
                 hinges = [self._best_swing(start, along, side * across, half, gap.width / leaves)]
                 hinges.append(self._best_swing(end, -along, side * across, half, gap.width / leaves))
                 # Both of two leaves must be visible.
-                best = max(best, max(hinges) if leaves == 1 else min(hinges))
+                share = max(hinges) if leaves == 1 else min(hinges)
+                if share > best[0]:
+                    best = share, leaves
         return best
 
     def _best_swing(

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from lalaloc_core.errors import InvalidFloorPlanError
+
 # Finer pictures are reduced to this resolution (m per pixel).
 FINEST_M = 0.01
 # Warmth of grey pixels.
@@ -17,6 +19,8 @@ COLOURLESS = 128.0
 _LIGHT_M = 1.2
 _MAX_SKEW_DEG = 10.0
 _SKEW_PIXELS = 700
+# Shortest side of a part of a picture.
+_MIN_SIDE_PX = 64
 # Largest width of lines (m), and their smallest contrast: of 255, and as a multiple of the noise.
 _LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
 # Range of Otsu's threshold: pencil is ink, pale floors are not.
@@ -94,6 +98,37 @@ def read_ink(
         skew_deg=skew_deg,
         size=size,
     )
+
+
+def blank_outside(
+    picture: UInt8[np.ndarray, "h w"], box: tuple[float, float, float, float]
+) -> UInt8[np.ndarray, "h w"]:
+    """Return a picture that is paper outside a box: left, top, right and bottom in pixels. Coordinates stay.
+
+    Raises:
+        InvalidFloorPlanError: the box has less than 64 pixels in the picture.
+    """
+    rows, columns = picture.shape
+    x0, y0, x1, y1 = (round(number) for number in box)
+    left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, columns), min(y1, rows)
+    if min(right - left, bottom - top) < _MIN_SIDE_PX:
+        raise InvalidFloorPlanError(
+            f"crop is {x0}, {y0}, {x1}, {y1}; a part of the picture of {columns} x {rows} pixels has at least "
+            f"{_MIN_SIDE_PX} x {_MIN_SIDE_PX}, counted from its upper left corner"
+        )
+    part = picture[top:bottom, left:right]
+    blank = np.full_like(picture, int(np.median(part)))
+    blank[top:bottom, left:right] = part
+    return blank
+
+
+def inked_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Return the longer side (pixels) of the part of a picture that has ink in most of its rows and columns."""
+    ink = gray < min(float(np.median(gray)) - _FAINTEST, _THRESHOLD[1])
+    sides = [np.flatnonzero(ink.any(axis=axis)) for axis in (0, 1)]
+    # Speckles at the borders are no drawing.
+    spans = [np.percentile(side, (2, 98)) for side in sides if len(side)]
+    return float(max((last - first for first, last in spans), default=max(gray.shape)))
 
 
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:

@@ -39,6 +39,8 @@ _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M = 1.2
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
 _WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Usual width of lines (pixels).
+_PEN_PX = 2.0
 # Smallest warmth of coloured lines (of 255): glass is blue, wood is brown.
 _COLOURED = 25.0
 
@@ -102,7 +104,18 @@ def sketch_picture(
     budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
     openings = _openings(best, ink, builder, budget)
-    return Sketch(rooms=rooms, openings=openings, recall=_RECALL, drawn=best.enclosed.walls.envelope)
+    outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
+    swings = [best.contents[id(gap)] for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
+    # Faces of walls are the middles of their lines.
+    pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
+    return Sketch(
+        rooms=rooms,
+        openings=openings,
+        recall=_RECALL,
+        drawn=best.enclosed.walls.envelope,
+        leaves_m=[swing.leaf_m + pen_m for swing in swings if swing.leaf_m > 0.0],
+        wall_m=best.walls.thickness_m,
+    )
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:

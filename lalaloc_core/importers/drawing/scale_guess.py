@@ -1,0 +1,278 @@
+"""Scale of drawings without one, estimated from the usual sizes of their parts.
+
+Every kind of part is a clue: a likelihood over the logarithm of the scale. Their product gives the scale and its error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder, ScaleClue
+from lalaloc_core.importers.common.sketch import Sketch, SketchedFixture
+from lalaloc_core.importers.drawing.drawing_scale import Dimension, areas_of_rooms, values_m
+from lalaloc_core.importers.drawing.stair_treads import tread_spacings
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
+
+# Logarithms of scales that are compared, around the first one.
+_REACH, _STEP = 1.2, 0.002
+# Door leaves (m): standard widths lie between these, most near the middle; with the part of other arcs.
+_LEAF_M, _LEAF_EDGE, _USUAL_LEAF_M, _LEAF_STD, _OTHER_ARCS = (0.61, 1.01), 0.03, 0.84, 0.1, 0.08
+# Doors of one home are alike, as they are of one country and time.
+_ALIKE_STD = 0.025
+# Usual size (m) of walls, treads and buildings, with standard deviation as a share.
+_WALL, _TREAD, _EXTENT = (0.16, 0.3), (0.28, 0.06), (12.0, 0.6)
+# Longer sides of fixtures that have a standard size.
+_FIXTURE: Mapping[str, tuple[float, float]] = {
+    "bed": (2.0, 0.05), "bath": (1.7, 0.06), "stove": (0.6, 0.08), "washer": (0.6, 0.06), "fridge": (0.63, 0.1),
+    "toilet": (0.66, 0.12), "shower": (0.9, 0.12),
+}  # fmt: skip
+# Standard deviations of written areas (of a length) and dimensions, and the shares of clues of a kind that mislead.
+_AREA_STD, _DIMENSION_STD = 0.025, 0.01
+_WRONG: Mapping[str, float] = {"wall": 0.1, "tread": 0.4, "fixture": 0.2, "area": 0.3, "dimension": 0.5}
+# Probability that all parts of a kind mislead alike.
+_MISLEADS: Mapping[str, float] = {
+    "leaf": 0.1, "wall": 0.1, "tread": 0.2, "fixture": 0.1, "area": 0.01, "dimension": 0.02,
+}  # fmt: skip
+_QUANTILES = (0.1587, 0.5, 0.8413)
+# A scale with a larger error is not used; so many parts of a kind must agree on it, within so many standard deviations.
+_MAX_STD, _MIN_PARTS, _AGREE_STDS, _AGREE = 0.1, 2, 3.0, 0.03
+_MAX_PASSES, _CONVERGED, _SHARE_OF_TIME = 4, 0.04, 0.4
+_NAMES: Mapping[str, tuple[str, str]] = {
+    "leaf": ("door leaf", "door leaves"), "wall": ("thickness of walls", "thickness of walls"),
+    "tread": ("stair", "stairs"), "fixture": ("fixture", "fixtures"), "area": ("written area", "written areas"),
+    "dimension": ("written dimension", "written dimensions"),
+}  # fmt: skip
+
+Likelihood = Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Sizes of the parts of a drawing, in its units; `areas` are pairs of m² and square units."""
+
+    leaves: Sequence[float] = ()
+    wall: float = 0.0
+    treads: Sequence[float] = ()
+    fixtures: Sequence[tuple[str, float]] = ()
+    areas: Sequence[tuple[float, float]] = ()
+    dimensions: Sequence[Dimension] = ()
+    extent: float = 0.0
+
+
+@dataclass(frozen=True)
+class ScaleGuess:
+    """Estimated scale: metres per unit, its standard deviation as a share of it, and its clues."""
+
+    metres_per_unit: float
+    std: float
+    clues: tuple[ScaleClue, ...] = field(default=())
+
+    @property
+    def source(self) -> str:
+        """Source of the scale, in words."""
+        parts = [_in_words(clue) for clue in self.clues if clue.is_used]
+        return f"estimated from {', '.join(parts)} (±{100.0 * self.std:.1f} %)"
+
+    @property
+    def assumption(self) -> str:
+        """Warning about the assumed scale."""
+        unused = [_in_words(clue) for clue in self.clues if not clue.is_used]
+        against = f"; not used, as they disagree: {', '.join(unused)}" if unused else ""
+        return (
+            f"the file gives no scale; {self.metres_per_unit:.4g} m per unit is assumed, {self.source}{against}; set "
+            "known_distance, metres_per_pixel or scale for an exact one"
+        )
+
+
+def assume_scale(guess: ScaleGuess | None, builder: ReportBuilder) -> tuple[float, str] | None:
+    """Return a guessed scale with its source, and report it as an assumption; None without a guess."""
+    if guess is None:
+        return None
+    builder.scale_std, builder.scale_clues = guess.std, guess.clues
+    builder.warnings.append(guess.assumption)
+    return guess.metres_per_unit, guess.source
+
+
+def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budget) -> ScaleGuess | None:
+    """Return the scale that the sizes of parts agree on, None if they are too few or too different.
+
+    Args:
+        sketch: reads the drawing at a scale, in metres per unit, and returns the sizes of its parts.
+        start: first scale.
+        budget: time of the import; the guess takes at most a part of it.
+    """
+    trace, budget.trace = budget.trace, None
+    began_s, limit_s = budget.elapsed_s, _SHARE_OF_TIME * budget.limits.max_import_s
+    scale, guess = start, None
+    try:
+        for _ in range(_MAX_PASSES):
+            budget.check_time()
+            try:
+                measures = sketch(scale)
+            except InvalidFloorPlanError:
+                budget.check_time()
+                measures = Measures()
+            guess = combine(measures, scale)
+            if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED:
+                break
+            scale = guess.metres_per_unit
+            if budget.elapsed_s - began_s > limit_s:
+                break
+    finally:
+        budget.trace = trace
+    return guess if guess is not None and _is_certain(guess) else None
+
+
+def combine(measures: Measures, around: float) -> ScaleGuess | None:
+    """Return the scale by all clues near a scale, None without clues."""
+    grid = math.log(around) + np.arange(-_REACH, _REACH + _STEP, _STEP)
+    prior = _normal(grid, math.log(_EXTENT[0] / measures.extent), _EXTENT[1], 0.05) if measures.extent > 0.0 else 0.0
+    kinds = {kind: found for kind, found in _likelihoods(measures, grid).items() if found[0]}
+    if not kinds:
+        return None
+    bounded = [_bounded(likelihood, _MISLEADS[kind]) for kind, (_, likelihood) in kinds.items()]
+    middle, std = _middle(sum(bounded, start=prior + np.zeros(len(grid))), grid)
+    clues = []
+    agreeing = _agreeing(measures, math.exp(middle))
+    for kind, (count, likelihood) in kinds.items():
+        own, own_std = _middle(likelihood + prior, grid)
+        agrees = abs(own - middle) <= max(_AGREE_STDS * math.hypot(own_std, std), _AGREE)
+        clues.append(ScaleClue(kind, agreeing.get(kind, count), math.exp(own), own_std, agrees))
+    return ScaleGuess(math.exp(middle), std, tuple(clues))
+
+
+def measures_of(
+    sketch: Sketch, scale: float, letterings: Sequence[Lettering], drawing: Drawing, dimensions: Sequence[Dimension]
+) -> Measures:
+    """Return the sizes of the parts in a sketch at a scale, in units of the drawing.
+
+    `letterings` are placed in the metres of the sketch, `drawing` has the lines in its own units.
+    """
+    areas = areas_of_rooms([room.shape for room in sketch.rooms], letterings)
+    fixtures = [(fixture.kind, _long_side(fixture) / scale) for fixture in sketch.fixtures if fixture.kind in _FIXTURE]
+    bounds = shapely.total_bounds([room.shape for room in sketch.rooms]) if sketch.rooms else np.zeros(4)
+    return Measures(
+        [leaf_m / scale for leaf_m in sketch.leaves_m],
+        sketch.wall_m / scale,
+        tread_spacings(stroke.line for stroke in drawing.strokes),
+        fixtures,
+        [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
+        dimensions,
+        float(max(bounds[2] - bounds[0], bounds[3] - bounds[1])) / scale,
+    )
+
+
+def first_scale(extent: float, leaves: Sequence[float] = ()) -> float:
+    """Return a scale to begin with, by the median of arcs that can be leaves of doors, else by the extent."""
+    return _USUAL_LEAF_M / float(np.median(leaves)) if len(leaves) else 1.2 * _EXTENT[0] / extent
+
+
+def _is_certain(guess: ScaleGuess) -> bool:
+    """Return whether enough parts agree; walls alone have many thicknesses."""
+    parts = sum(clue.count for clue in guess.clues if clue.is_used and clue.kind != "wall")
+    return guess.std <= _MAX_STD and parts >= _MIN_PARTS
+
+
+def _agreeing(measures: Measures, scale: float) -> dict[str, int]:
+    """Return the number of written areas and dimensions that are true at a scale."""
+    lengths = [scale * math.sqrt(units2 / m2) for m2, units2 in measures.areas]
+    ratios = [
+        min(
+            (abs(math.log(scale * length / m)) for m in values_m(text) for length in lengths if length > 0.0),
+            default=9.0,
+        )
+        for text, lengths in measures.dimensions
+    ]
+    return {
+        "area": sum(abs(math.log(length)) <= _AGREE_STDS * _AREA_STD for length in lengths),
+        "dimension": sum(ratio <= _AGREE_STDS * _DIMENSION_STD for ratio in ratios),
+    }
+
+
+def _likelihoods(measures: Measures, grid: Likelihood) -> dict[str, tuple[int, Likelihood]]:
+    """Return the number of parts of each kind, and their likelihood over the grid."""
+    none = np.zeros(len(grid))
+
+    def usual(kind: str, sizes: Sequence[tuple[float, tuple[float, float]]]) -> tuple[int, Likelihood]:
+        terms = [_normal(grid, math.log(m / size), std, _WRONG[kind]) for size, (m, std) in sizes if size > 0.0]
+        return len(terms), sum(terms, start=none)
+
+    dimensions = [_dimension(grid, dimension) for dimension in measures.dimensions]
+    return {
+        "leaf": (len(measures.leaves), _leaves(grid, measures.leaves)),
+        "wall": usual("wall", [(measures.wall, _WALL)]),
+        "tread": usual("tread", [(spacing, _TREAD) for spacing in measures.treads]),
+        "fixture": usual("fixture", [(size, _FIXTURE[kind]) for kind, size in measures.fixtures]),
+        "area": usual("area", [(math.sqrt(units2), (math.sqrt(m2), _AREA_STD)) for m2, units2 in measures.areas]),
+        "dimension": (len(dimensions), sum(dimensions, start=none)),
+    }
+
+
+def _leaves(grid: Likelihood, leaves: Sequence[float]) -> Likelihood:
+    """Return the likelihood of leaves' widths, blurred as doors of a home are alike."""
+    total = np.zeros(len(grid))
+    for leaf in leaves:
+        size = grid + math.log(leaf)
+        low, high = (math.log(edge) for edge in _LEAF_M)
+        inside = _sigmoid((size - low) / _LEAF_EDGE) * _sigmoid((high - size) / _LEAF_EDGE) / (high - low)
+        usual = np.exp(-0.5 * ((size - math.log(_USUAL_LEAF_M)) / _LEAF_STD) ** 2) / (
+            _LEAF_STD * math.sqrt(2 * math.pi)
+        )
+        density = (1.0 - _OTHER_ARCS) * 0.5 * (inside + usual) + _OTHER_ARCS / (2.0 * _REACH)
+        total += np.log(density)
+    if not leaves:
+        return total
+    kernel_at = np.arange(-4.0 * _ALIKE_STD, 4.0 * _ALIKE_STD + _STEP, _STEP)
+    kernel = np.exp(-0.5 * (kernel_at / _ALIKE_STD) ** 2)
+    blurred = np.convolve(np.exp(total - total.max()), kernel / kernel.sum(), mode="same")
+    return np.log(np.maximum(blurred, 1e-300)) + float(total.max())
+
+
+def _sigmoid(values: Likelihood) -> Likelihood:
+    return 1.0 / (1.0 + np.exp(-np.clip(values, -50.0, 50.0)))
+
+
+def _normal(grid: Likelihood, middle: float, std: float, wrong: float) -> Likelihood:
+    """Return the logarithm of a normal density, and of a flat one for the share of parts that are `wrong`."""
+    density = np.exp(-0.5 * ((grid - middle) / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
+    return np.log((1.0 - wrong) * density + wrong / (2.0 * _REACH))
+
+
+def _dimension(grid: Likelihood, dimension: Dimension) -> Likelihood:
+    """Return the likelihood of a written length: one of the lines beside it is meant, or none."""
+    text, lengths = dimension
+    pairs = [(value_m, length) for value_m in values_m(text) for length in lengths if length > 0.0]
+    terms = [np.exp(-0.5 * ((grid - math.log(value_m / length)) / _DIMENSION_STD) ** 2) for value_m, length in pairs]
+    density = sum(terms, start=np.zeros(len(grid))) / (_DIMENSION_STD * math.sqrt(2.0 * math.pi) * max(len(terms), 1))
+    return np.log((1.0 - _WRONG["dimension"]) * density + _WRONG["dimension"] / (2.0 * _REACH))
+
+
+def _bounded(log_density: Likelihood, wrong: float) -> Likelihood:
+    """Return the likelihood of a kind that misleads as a whole with a probability, such as a hatch read as stairs."""
+    density = np.exp(log_density - log_density.max())
+    return np.log((1.0 - wrong) * density / density.sum() + wrong / len(density))
+
+
+def _middle(log_density: Likelihood, grid: Likelihood) -> tuple[float, float]:
+    """Return the median, and half of the interval that holds what a standard deviation around it does."""
+    total = np.cumsum(np.exp(log_density - log_density.max()))
+    low, middle, high = np.interp(_QUANTILES, total / total[-1], grid)
+    return float(middle), float(0.5 * (high - low))
+
+
+def _long_side(fixture: SketchedFixture) -> float:
+    x0, y0, x1, y1 = fixture.shape.bounds
+    return max(x1 - x0, y1 - y0)
+
+
+def _in_words(clue: ScaleClue) -> str:
+    one, several = _NAMES[clue.kind]
+    return f"the {one}" if clue.kind == "wall" else f"{clue.count} {one if clue.count == 1 else several}"

@@ -1,0 +1,72 @@
+"""Parts of pages and pictures: one of several storeys that are drawn side by side."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from PIL import Image, ImageDraw
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
+from tests.importers.conftest import shapes
+
+SCALE = 0.02
+
+
+def _storeys() -> Image.Image:
+    """Return two storeys at 2 cm per pixel: two rooms of 30 m² in all beside a room of 16 m²."""
+    page = Image.new("L", (800, 400), 255)
+    pen = ImageDraw.Draw(page)
+    for box in ((40, 60, 355, 325), (500, 60, 715, 275)):
+        pen.rectangle(box, outline=0, width=10)
+    pen.rectangle((190, 60, 199, 325), fill=0)
+    pen.rectangle((190, 150, 199, 195), fill=255)
+    return page
+
+
+def _file(page: Image.Image, format: str = "PNG", **options: float) -> bytes:
+    stream = io.BytesIO()
+    page.save(stream, format, **options)
+    return stream.getvalue()
+
+
+def test_largest_of_several_storeys_is_read_and_the_others_are_named():
+    plan = import_plan(_file(_storeys()), ImportOptions(metres_per_pixel=SCALE))
+    assert len(plan.document["rooms"]) == 2
+    (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
+    assert "only the first was read" in warning
+    crop = warning.split("m² at crop=")[2].split(";")[0]
+    other = import_plan(_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop}))
+    (room,) = shapes(other.document)
+    assert room.area == pytest.approx(15.6, abs=0.5)
+    # Coordinates stay those of the whole picture.
+    assert room.bounds[0] == pytest.approx(510 * SCALE, abs=0.05)
+
+
+def test_crop_of_a_scanned_page_is_in_points_from_its_lower_left_corner():
+    scan = _file(_storeys(), "PDF", resolution=72.0)
+    plan = import_plan(scan, ImportOptions(metres_per_pixel=SCALE, crop=(780.0, 370.0, 450.0, 90.0)))
+    assert len(plan.document["rooms"]) == 1
+    assert shapes(plan.document)[0].area == pytest.approx(15.6, abs=0.5)
+
+
+def test_crop_cuts_the_lines_of_a_drawing():
+    rooms = '<path d="M0 0H500V400H0z"/><path d="M900 0H1300V300H900z"/><path d="M-50 -60H1500"/>'
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg"><g stroke="black" fill="none" id="wall">{rooms}</g></svg>'
+    options = ImportOptions(metres_per_pixel=0.01, crop=(850.0, -20.0, 1400.0, 350.0))
+    (room,) = shapes(import_plan(svg.encode(), options).document)
+    assert room.area == pytest.approx(12.0, abs=0.2)
+
+
+def _read_part(crop: str) -> ImportedPlan:
+    return import_plan(_file(_storeys()), ImportOptions.from_text({"crop": crop, "metres_per_pixel": str(SCALE)}))
+
+
+@pytest.mark.parametrize(("crop", "message"), [
+    ("1,2,3", "crop has 3 numbers"), ("5,5,5,9", "two opposite corners"), ("0,0,20,20", "has at least 64 x 64"),
+    ("900,0,1200,300", "has at least 64 x 64"), ("a,0,1,1", "must be a number"),
+])  # fmt: skip
+def test_invalid_crop_is_rejected(crop: str, message: str):
+    with pytest.raises(InvalidFloorPlanError, match=message):
+        _read_part(crop)

@@ -1,0 +1,116 @@
+"""Scales that are estimated from the sizes of the parts of a drawing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import shapely
+
+from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
+from lalaloc_core.importers.drawing.scale_guess import Measures, combine, guess_scale
+from lalaloc_core.importers.drawing.stair_treads import tread_spacings
+from tests.importers.test_lettering import LIMITS, PrintedPlan
+
+
+def _flight(treads: int, spacing: float, width: float = 1.0) -> list[shapely.LineString]:
+    return [shapely.LineString([(0.0, spacing * k), (width, spacing * k)]) for k in range(treads + 1)]
+
+
+def test_more_doors_make_the_scale_more_certain():
+    few, many = (combine(Measures(leaves=[81.0, 86.0] * count), 0.012) for count in (1, 4))
+    assert few is not None
+    assert many is not None
+    assert many.metres_per_unit == pytest.approx(0.0101, rel=0.03)
+    assert many.std < few.std < 0.12
+
+
+def test_written_areas_outweigh_doors():
+    areas = [(12.0, 12.0e4), (20.0, 20.4e4), (9.0, 8.9e4), (7.0, 70.0e4)]
+    guess = combine(Measures(leaves=[88.0, 90.0, 91.0], areas=areas), 0.012)
+    assert guess is not None
+    assert guess.metres_per_unit == pytest.approx(0.01, rel=0.015)
+    assert guess.std < 0.03
+    assert {clue.kind: clue.count for clue in guess.clues} == {"leaf": 3, "area": 3}
+
+
+def test_a_kind_that_disagrees_is_listed_and_not_used():
+    guess = combine(Measures(areas=[(m2, m2 * 1e4) for m2 in (8.0, 12.0, 20.0, 31.0)], leaves=[40.0] * 6), 0.01)
+    assert guess is not None
+    assert {clue.kind: clue.is_used for clue in guess.clues} == {"leaf": False, "area": True}
+    assert "not used, as they disagree: 6 door leaves" in guess.assumption
+
+
+@pytest.mark.parametrize("measures", [Measures(), Measures(wall=16.0), Measures(leaves=[84.0])])
+def test_too_few_parts_give_no_scale(measures: Measures):
+    assert guess_scale(lambda scale: measures, 0.01, Budget()) is None
+
+
+def test_drawing_is_read_again_at_the_scale_that_was_found():
+    scales: list[float] = []
+
+    def sketch(scale: float) -> Measures:
+        scales.append(scale)
+        return Measures(leaves=[82.0, 84.0, 88.0, 90.0])
+
+    guess = guess_scale(sketch, 0.02, Budget())
+    assert guess is not None
+    assert len(scales) == 2
+    assert abs(math.log(scales[1] / guess.metres_per_unit)) < 0.04
+
+
+def test_estimate_ends_with_the_time_of_the_import():
+    scales: list[float] = []
+
+    def sketch(scale: float) -> Measures:
+        scales.append(scale)
+        return Measures(leaves=[1.5 / scale] * 3)
+
+    guess_scale(sketch, 0.02, Budget())
+    assert len(scales) == 4
+    clock = iter(range(1000))
+    budget = Budget(ImportLimits(max_import_s=10.0), lambda: float(next(clock)))
+    guess_scale(sketch, 0.02, budget)
+    assert len(scales) < 4 + 4
+
+
+def test_stairs_are_parallel_lines_at_equal_distances():
+    assert tread_spacings(_flight(9, 28.0, 100.0)) == pytest.approx([28.0])
+    turned = [shapely.LineString([(y, x) for x, y in line.coords]) for line in _flight(9, 28.0, 100.0)]
+    assert tread_spacings(turned) == pytest.approx([28.0])
+    # A hatch is finer than it is wide, and shelves are few.
+    assert tread_spacings(_flight(40, 5.0, 100.0)) == []
+    assert tread_spacings(_flight(3, 28.0, 100.0)) == []
+    uneven = [shapely.LineString([(0.0, y), (100.0, y)]) for y in (0, 28, 70, 90, 140, 155, 210)]
+    assert tread_spacings(uneven) == []
+
+
+def test_written_areas_of_a_picture_give_its_scale():
+    page = PrintedPlan(dimensions=False)
+    report = import_plan(page.file(), limits=LIMITS).report
+    assert report.metres_per_unit * page.px_per_m == pytest.approx(1.0, abs=0.02)
+    assert report.scale_source.startswith("estimated from the thickness of walls, 3 written areas (±")
+
+
+def test_false_scale_is_corrected_by_the_factor_of_the_report():
+    page = PrintedPlan()
+    first = import_plan(page.file(), ImportOptions(metres_per_pixel=0.02), LIMITS).report
+    assert first.scale_factor == pytest.approx(1.0 / 70.0 / 0.02, rel=0.02)
+    assert any(f"multiply={first.scale_factor:.3f}" in warning for warning in first.warnings)
+    options = ImportOptions(metres_per_pixel=0.02, multiply=round(first.scale_factor or 0.0, 3))
+    second = import_plan(page.file(), options, LIMITS).report
+    assert second.metres_per_unit * page.px_per_m == pytest.approx(1.0, rel=0.02)
+    assert second.scale_factor is None
+    assert "option multiply" in second.scale_source
+
+
+def test_texts_that_are_not_believed_are_listed():
+    page = PrintedPlan()
+    page._text((1.5, 1.0), "7.77")
+    page._line((0.6, 0.75, 2.4, 0.75))
+    page._line((0.6, 0.65, 0.6, 0.85))
+    page._line((2.4, 0.65, 2.4, 0.85))
+    report = import_plan(page.file(), limits=LIMITS).report
+    assert report.metres_per_unit * page.px_per_m == pytest.approx(1.0, rel=0.02)
+    assert any(line.startswith("'7.77' was read as a dimension of 7.77 m") for line in report.rejected_texts)
