@@ -295,6 +295,14 @@ def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
     assert done.returncode == 0, done.stderr or "torch was imported"
 
 
+def test_service_starts_without_the_libraries_of_rare_requests() -> None:
+    # Meshes, large venues, issuers of tokens, sequences, and refinement by latents.
+    rare = ("trimesh", "networkx", "faiss", "httpx", "scipy.spatial", "scipy.special", "torch")
+    program = f"import sys, service.app; print(*[name for name in {rare!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_no_name_is_undefined() -> None:
     # ruff's own check is off, because it takes the dimensions in array types for names.
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "json", "."]
