@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 
 _VIEWS = 4

@@ -17,12 +17,13 @@ import numpy as np
 
 from benchmarks.harness import print_table_head, table_row
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel, StatedHeight, encode, read_image
+from lalaloc_core.evaluate.methods.lalaloc import StatedHeight, encode, read_image
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers.common.completeness import estimate_trust
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import Query
 
 _STATED_HEIGHT = StatedHeight()

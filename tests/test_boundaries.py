@@ -26,6 +26,7 @@ LAYERS = {
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.picture_kinds": 0,
     "lalaloc_core.files": 0,
+    "lalaloc_core.model_folder": 0,
     "lalaloc_core.configuration": 1,
     # The query side.
     "lalaloc_core.floorplan.earth": 0,
@@ -46,6 +47,7 @@ LAYERS = {
     "lalaloc_core.localise.venue": 9,
     "lalaloc_core.localise.tracking": 10,
     "lalaloc_core.localise.album": 10,
+    "lalaloc_core.localise.local_model": 10,
     "lalaloc_core.draw": 10,
     "lalaloc_core.importers.common": 2,
     "lalaloc_core.importers.drawing": 3,
@@ -54,6 +56,7 @@ LAYERS = {
     "lalaloc_core.importers.format_table": 3,
     "lalaloc_core.importers": 6,
     # Training.
+    "lalaloc_core.learn.dataset_names": 0,
     "lalaloc_core.learn.metrics": 1,
     "lalaloc_core.learn.synth.records": 2,
     "lalaloc_core.learn.synth.homes": 2,
@@ -290,6 +293,14 @@ def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr or "torch was imported"
+
+
+def test_service_starts_without_the_libraries_of_rare_requests() -> None:
+    # Meshes, large venues, issuers of tokens, sequences, and refinement by latents.
+    rare = ("trimesh", "networkx", "faiss", "httpx", "scipy.spatial", "scipy.special", "torch")
+    program = f"import sys, service.app; print(*[name for name in {rare!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 def test_no_name_is_undefined() -> None:

@@ -4,7 +4,7 @@ Begin with `bundle.py`, which reads a bundle; `manifest.py` describes it. `fitte
 the matching cost and the confidence, `prediction_errors.py` the measured errors of the networks.
 """
 
-from lalaloc_core.bundle.bundle import Bundle, default_bundle, write_manifest
+from lalaloc_core.bundle.bundle import Bundle, write_manifest
 from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, LogisticModel, MatchingWeights
 from lalaloc_core.bundle.manifest import (
     BUNDLE_FILES,
@@ -15,7 +15,6 @@ from lalaloc_core.bundle.manifest import (
     IMAGE_WEIGHTS,
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
-    MANIFEST_NAME,
     OBJECTS_ONNX,
     VIEW_ONNX,
     VIEW_WEIGHTS,
@@ -24,3 +23,4 @@ from lalaloc_core.bundle.manifest import (
     ViewManifest,
 )
 from lalaloc_core.bundle.prediction_errors import PredictionErrors
+from lalaloc_core.model_folder import MANIFEST_NAME, default_bundle

@@ -8,20 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
-from lalaloc_core.bundle.manifest import CARD_NAME, MANIFEST_NAME, FileEntry, Manifest
+from lalaloc_core.bundle.manifest import CARD_NAME, FileEntry, Manifest
 from lalaloc_core.errors import BundleError
 from lalaloc_core.files import atomic_write
-
-# Folder of the model that ships: in a checkout, and in an installation.
-_CHECKOUT = Path("models/default")
-
-
-_INSTALLED = Path("share/lalaloc/models/default")
+from lalaloc_core.model_folder import MANIFEST_NAME
 
 
 @dataclass(frozen=True)
@@ -79,23 +72,6 @@ class Bundle:
                 f"bundle '{self.folder}': '{name}' has the SHA-256 {digest}; the manifest states {entry.sha256}"
             )
         return content
-
-
-def default_bundle() -> Path:
-    """Return the folder of the model that ships: in this checkout, else the installed one.
-
-    If the working folder is the checkout, the path is relative, so that recorded commands work elsewhere.
-    """
-    checkout = Path(__file__).resolve().parents[2] / _CHECKOUT
-    if (checkout / MANIFEST_NAME).is_file():
-        return _CHECKOUT if _CHECKOUT.resolve() == checkout else checkout
-    with suppress(PackageNotFoundError):
-        for file in distribution("lalaloc").files or []:
-            path = Path(file.locate()).resolve()
-            if path.name == MANIFEST_NAME and path.parent.match(f"*/{_INSTALLED}"):
-                return path.parent
-    # Opening it raises an error that names the folder.
-    return checkout
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Bundle:

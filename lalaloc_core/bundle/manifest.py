@@ -13,8 +13,8 @@ from lalaloc_core.bundle.prediction_errors import PredictionErrors
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
+from lalaloc_core.model_folder import MANIFEST_NAME
 
-MANIFEST_NAME = "manifest.json"
 # The model card, which can be corrected without changing the model's digest.
 CARD_NAME = "README.md"
 FORMAT_VERSION = 2

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Integer
-from scipy.special import ndtr
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import ConfigError
@@ -62,7 +61,7 @@ class PredictionErrors:
         """Draw predicted log distances (m) and logs of their scales for layouts."""
         count, columns = log_m.shape
         scale_level, error_level = (
-            ndtr(correlated(correlation, count, columns, rng))
+            _normal_probability(correlated(correlation, count, columns, rng))
             for correlation in (self.scale_correlation, self.error_correlation)
         )
         log_scale = np.interp(scale_level, LEVELS, self.scale_quantiles)
@@ -71,10 +70,18 @@ class PredictionErrors:
 
     def openings(self, kind: Integer[np.ndarray, "n w"], rng: np.random.Generator) -> Float[np.ndarray, "n w c"]:
         """Draw log probabilities of the opening classes for layouts, by their codes."""
-        level = ndtr(correlated(self.seen_correlation, len(kind), kind.shape[1], rng))
+        level = _normal_probability(correlated(self.seen_correlation, len(kind), kind.shape[1], rng))
         above = np.cumsum(np.array(self.seen), axis=1)[kind]
         seen = np.minimum((level[..., None] > above).sum(axis=-1), len(OPENING_CLASSES) - 1)
         return np.log(np.maximum(np.array(self.class_probability)[kind, seen], _MIN_PROBABILITY))
+
+
+def _normal_probability(score: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the probability of a smaller standard normal score."""
+    # Loading it takes as long as a query, and every program that opens a bundle loads this module.
+    from scipy.special import ndtr
+
+    return ndtr(score)
 
 
 def correlated(

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture, write_text
 from lalaloc_core.errors import InvalidInputError
 
@@ -111,6 +109,8 @@ def unread(text: str) -> str:
 
 def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the places as a GeoJSON FeatureCollection (RFC 7946)."""
+    import numpy as np
+
     assert plan.anchor is not None
     features = []
     for answer in answers:

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera
 from lalaloc_core.cli.options import add_options, positive
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture
@@ -65,6 +64,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _encode(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.localise.encode.features import FeatureEncoder
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
     from lalaloc_core.photograph import open_photograph
@@ -118,6 +118,7 @@ def _write(out: Path, content: bytes) -> None:
 
 
 def _features(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.seen_room import draw_seen_room, seen_room
     from lalaloc_core.localise.encode.features import read_features
     from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder

@@ -14,7 +14,7 @@ from typing import Any
 from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
+from lalaloc_core.learn.dataset_names import DATASET_FORMATS, SPLITS
 
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4

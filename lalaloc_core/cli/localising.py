@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.answer_files import add_file_options, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
 from lalaloc_core.cli.options import add_options, heading, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, print_json, print_table
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
@@ -141,10 +139,11 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
     """
     from tqdm import tqdm
 
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.answer import drawn_answer
-    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
     from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
     from lalaloc_core.localise.encode.features import is_features, read_features
+    from lalaloc_core.localise.local_model import LocalModel
     from lalaloc_core.localise.localisability.step_report import step_after
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.photograph import StatedCamera
@@ -210,9 +209,10 @@ def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedC
     """
     from tqdm import tqdm
 
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.cli.turning import read_turn, turn_document
     from lalaloc_core.draw.answer import drawn_answer
-    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+    from lalaloc_core.localise.local_model import LocalModel
     from lalaloc_core.localise.query import stated_height
 
     if arguments.heading is not None:
@@ -297,6 +297,8 @@ def _pixels(drawn: DrawnAnswer, content: bytes, stated: StatedCamera) -> Any:
 
 
 def _check_height(height_m: float | None, plan: FloorPlan) -> None:
+    from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+
     lowest_m = float(plan.ceiling_heights_m.min())
     if height_m is not None and not MIN_CAMERA_HEIGHT_M <= height_m < lowest_m:
         raise InvalidInputError(

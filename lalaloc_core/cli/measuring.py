@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.data.annotated import GALLERIES
+from lalaloc_core.learn.dataset_names import GALLERIES
+from lalaloc_core.model_folder import default_bundle
 
 _GROUPS = (
     "rendering",

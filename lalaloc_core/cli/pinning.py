@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, content_of, stated_camera
 from lalaloc_core.cli.options import add_options
-from lalaloc_core.cli.pin_files import PinnedFile, moved_lines, pins_document, read_previous, write_pin_files
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
+    from lalaloc_core.cli.pin_files import PinnedFile
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.localise.album.entry import AlbumPhotograph
     from lalaloc_core.localise.album.pins import Album
@@ -52,6 +52,8 @@ def add_commands(commands: Any) -> None:
 
 
 def _pin(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.cli.pin_files import moved_lines, pins_document, read_previous, write_pin_files
+
     paths, notes = _photographs_in(arguments.folder, arguments.out, arguments.plan)
     previous = None if arguments.previous is None else read_previous(arguments.previous)
     stated = stated_camera(arguments)
@@ -131,9 +133,9 @@ def _solved(
     from tqdm import tqdm
 
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
     from lalaloc_core.localise.album.ground import AlbumGround
     from lalaloc_core.localise.album.solve import solve_album
+    from lalaloc_core.localise.local_model import LocalModel
     from lalaloc_core.localise.venue.merged_plans import MergedPlans
 
     model = LocalModel(Bundle.open(arguments.bundle))
@@ -159,6 +161,7 @@ def _solved(
 
 def _read(model: Any, paths: Any, stated: StatedCamera) -> Iterator[tuple[PinnedFile, AlbumPhotograph | None]]:
     """Yield every file and its photograph; None if it cannot be read or is a copy of an earlier one."""
+    from lalaloc_core.cli.pin_files import PinnedFile
     from lalaloc_core.localise.album.entry import photograph_entry
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
     from lalaloc_core.photograph import open_photograph

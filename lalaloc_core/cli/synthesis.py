@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.cli.options import add_options
-from lalaloc_core.learn.data.dataset import SPLITS
+from lalaloc_core.learn.dataset_names import SPLITS
 
 
 def add_commands(commands: Any) -> None:

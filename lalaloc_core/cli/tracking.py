@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
 from lalaloc_core.cli.options import add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
@@ -157,7 +156,8 @@ def _followed(
     """
     from tqdm import tqdm
 
-    from lalaloc_core.evaluate.methods.lalaloc import LocalModel
+    from lalaloc_core.bundle import Bundle
+    from lalaloc_core.localise.local_model import LocalModel
     from lalaloc_core.localise.query import known_heading, stated_height
     from lalaloc_core.localise.search.pipeline import run_steps
     from lalaloc_core.localise.tracking import TrackState

@@ -11,7 +11,6 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.options import add_options
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
@@ -237,6 +236,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _export_again(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.learn.export.run_export import reexport_bundle
 
     before = Bundle.open(arguments.bundle)

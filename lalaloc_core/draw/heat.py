@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy.ndimage import find_objects, gaussian_filter
 
 from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml_text
 from lalaloc_core.draw.plan import floor_path
@@ -88,6 +87,9 @@ def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> Hea
 
     Each position represents a part of its room as wide as the pose grid's step.
     """
+    # Loading it takes as long as a query.
+    from scipy.ndimage import find_objects, gaussian_filter
+
     cells = Cells.cover(plan)
     left, _, bottom, _ = cells.extent_m
     size_m = (cells.extent_m[1] - left) / cells.room.shape[1]

@@ -11,7 +11,6 @@ from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from lalaloc_core.importers import ExportFormat, export_plan
 from service.errors import DamagedDataError
 from service.plan_files.plan_description import describe
-from service.plan_files.plan_mesh import plan_glb
 from service.schemas.stored_plans import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.stored_plan import Rendition, RenditionJob
 
@@ -56,6 +55,9 @@ def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
         case "drawing":
             return draw_rooms(plan).encode()
         case "mesh":
+            # Imported late: its library takes a third of the time in which the service starts.
+            from service.plan_files.plan_mesh import plan_glb
+
             return plan_glb(plan)
         case kind if kind in CONDITIONS:
             # Imported late for the same reason.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -13,12 +14,14 @@ from service import errors
 from service.security.exposure import check_origin, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import PresentedKey, parse_authorization, parse_token
-from service.security.oidc import TokenVerifier
 from service.security.permissions import Caller, Identity, Permission, anyone, is_page, permissions_needed
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.telemetry import add_log_fields
+
+if TYPE_CHECKING:
+    from service.security.oidc import TokenVerifier
 
 # Errors of `AuthorisationMiddleware`, besides 404 and 405.
 REFUSALS = (
@@ -48,7 +51,12 @@ class AccessControl:
         self._hosts = settings.access.allowed_host_names
         self._keys = KeyCache(keys, fresh_s=settings.access.key_cache_s)
         self._rates = RateLimits(settings)
-        self._tokens = TokenVerifier(settings.access) if settings.access.oidc_issuer else None
+        self._tokens: TokenVerifier | None = None
+        if settings.access.oidc_issuer:
+            # Imported late: services without an issuer need neither its HTTP client nor its cryptography.
+            from service.security.oidc import TokenVerifier
+
+            self._tokens = TokenVerifier(settings.access)
         self._or_token = "" if self._tokens is None else _TOKEN_TOO
 
     def close(self) -> None:

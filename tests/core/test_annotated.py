@@ -28,11 +28,12 @@ from lalaloc_core.evaluate.report.report_tables import percent
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, foreign_plans, score_galleries
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs, read_views
 from lalaloc_core.evaluate.runs.predictions import Prediction
-from lalaloc_core.learn.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom
 from lalaloc_core.learn.data.room_gallery import GALLERY_ROOMS, build_gallery
+from lalaloc_core.learn.dataset_names import GALLERIES
 from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder

@@ -299,6 +299,41 @@ def test_closed_pipe_is_not_an_error(tmp_path: Path) -> None:
         assert process.wait(60.0) == 0
 
 
+def loaded_packages(*arguments: str) -> set[str]:
+    program = (
+        "import sys; from lalaloc_core.cli import main\n"
+        "try:\n    main()\nfinally:\n    print(*{name.split('.')[0] for name in sys.modules}, file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", program, *arguments]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stderr.split())
+
+
+def test_help_loads_no_other_package() -> None:
+    found = loaded_packages("--help")
+    assert "lalaloc_core" in found
+    assert not found & {
+        "numpy",
+        "scipy",
+        "torch",
+        "onnxruntime",
+        "cv2",
+        "PIL",
+        "pydantic",
+        "jaxtyping",
+        "shapely",
+        "tqdm",
+    }
+
+
+def test_localise_leaves_torch_unloaded() -> None:
+    found = loaded_packages("localise", PLAN, KITCHEN, "--json")
+    assert "onnxruntime" in found
+    assert "torch" not in found
+
+
 def test_default_bundle_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     assert default_bundle() == Path("models/default")
@@ -331,6 +366,6 @@ def test_wheel_contains_the_model(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["room"] == "kitchen"
-    where = [python, "-c", "from lalaloc_core.bundle.manifest import default_bundle; print(default_bundle())"]
+    where = [python, "-c", "from lalaloc_core.bundle import default_bundle; print(default_bundle())"]
     found = subprocess.run(where, cwd=empty, env=environment, capture_output=True, text=True, check=True).stdout
     assert Path(found.strip()) == (installed / "share" / "lalaloc" / "models" / "default").resolve()

@@ -15,7 +15,6 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
@@ -30,6 +29,7 @@ from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import stated_height
 from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.taken import Taken

@@ -13,7 +13,6 @@ import numpy as np
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.bench.annotated_films import FILMING, annotated_films
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RendererCache, split_renderer_cache
 from lalaloc_core.learn.data.synthetic.hand_held import encode_film, turn_by_hand
@@ -23,6 +22,7 @@ from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn

@@ -11,10 +11,10 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.bench.speed import home_of_area
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import StageClock, localise
 

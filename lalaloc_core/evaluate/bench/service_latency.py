@@ -31,7 +31,7 @@ _REQUESTS = 40
 _STARTUP_SECONDS = 60.0
 _SMALL_PROCESS_MB = 50.0
 # Width and height (pixels) and horizontal field of view (degrees) of a phone's photographs, and how many are made.
-_PHONE_SIZE, _PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
+_PHONE_SIZE, PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
 
 
 def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
@@ -54,8 +54,8 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
         }
         rows["without_openings"] = rows["unknown_heading"]
         if bundle.manifest.view is not None:
-            views = [_phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
-            lens = {"hfov_deg": f"{_PHONE_FIELD_DEG:g}"}
+            views = [phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
+            lens = {"hfov_deg": f"{PHONE_FIELD_DEG:g}"}
             rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]
         for name, requests in rows.items():
             report[name] = _latency(client, bare_id if name == "without_openings" else plan_id, requests)
@@ -87,9 +87,9 @@ def _latency(client: httpx.Client, plan_id: str, requests: list[tuple[bytes, dic
     }
 
 
-def _phone_photograph(sphere: np.ndarray) -> bytes:
+def phone_photograph(sphere: np.ndarray) -> bytes:
     """Return a part of a sphere as a JPEG of 12 megapixels, with the noise that makes such files 4 MB."""
-    camera = Perspective.of_hfov(*_PHONE_SIZE, math.radians(_PHONE_FIELD_DEG))
+    camera = Perspective.of_hfov(*_PHONE_SIZE, math.radians(PHONE_FIELD_DEG))
     view = cut_view(sphere, camera, azimuth=0.0, pitch=0.0, roll=0.0)
     noise = np.random.default_rng(0).normal(0.0, 4.0, view.shape)
     return encode_jpeg((view + noise).clip(0.0, 255.0).astype(np.uint8))

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.learn.data.synthetic.generated import (
     SPLIT_NUMBERS,
     RenderedPhotograph,
@@ -25,6 +24,7 @@ from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.belief import CONFIDENT, Confidence
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.localisability.next_step import BEHIND_M, HEADING_ERROR, NextStep, next_steps
 from lalaloc_core.localise.localisability.step_report import known_of
 from lalaloc_core.localise.match import PoseGrid

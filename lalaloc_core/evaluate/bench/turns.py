@@ -11,11 +11,11 @@ import numpy as np
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.calibrate.measured_errors import Spot, photograph_of, spots
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.joint_refinement import refine_sequence

@@ -11,12 +11,12 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import WALL_CODE, wrap_angle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.localise.belief import CONFIDENT
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import StatedCamera

@@ -21,13 +21,13 @@ from lalaloc_core.bundle.prediction_errors import LEVELS
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.lalaloc import GRID_STEP_M, LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Split
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
+from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
 from lalaloc_core.localise.localisability.predicted_localisability import Errors, Searches, errors_of
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, Query

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading_errors_deg, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
@@ -16,6 +15,7 @@ from lalaloc_core.learn.data.annotated import GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 
 # A position is right within this distance or this share of the room's size (the root of its area).

@@ -15,8 +15,8 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, is_annotation, read_annotation
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.room_gallery import build_gallery
+from lalaloc_core.learn.dataset_names import GALLERIES
 
-GALLERIES = 3
 _SCENE = re.compile(r"(?P<photograph>.+)-(?P<gallery>\d+)(?P<alternative>-alternative)?")
 
 

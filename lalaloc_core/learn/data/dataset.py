@@ -9,23 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, get_args, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-
-Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = get_args(Split)
-# Formats by their name on the command line.
-DATASET_FORMATS = {
-    "structured3d": "Structured3D",
-    "zind": "ZInD",
-    "own": "own data",
-    "annotated": "annotated photographs",
-}
+from lalaloc_core.learn.dataset_names import Split
 
 
 @dataclass(frozen=True, order=True)

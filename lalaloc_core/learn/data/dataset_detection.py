@@ -6,16 +6,17 @@ from pathlib import Path
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
-from lalaloc_core.learn.data.dataset import DATASET_FORMATS, Dataset
+from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
+from lalaloc_core.learn.dataset_names import DATASET_FORMATS
 
 _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 
 
 def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
-    """Open the data set in a folder; the format is a key of `dataset.DATASET_FORMATS`, or None to detect it.
+    """Open the data set in a folder; the format is a key of `DATASET_FORMATS`, or None to detect it.
 
     Raises:
         DatasetError: the folder does not exist, holds no data set of the given or of any known format, or holds

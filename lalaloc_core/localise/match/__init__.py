@@ -2,8 +2,8 @@
 
 Begin with `matching_cost.py`, which has the equations; `cost_terms.py` has the formulas of its terms. `pose_grid.py`
 has the poses of a plan, `layouts.py` what the plan shows there, and `binned_layouts.py` the same as `coarse_pass.py`
-compares it. `place_cost.py` has the cost of hints and fixtures. `cohort.py` costs poses of other homes, to tell
-a good cost from chance.
+compares it by the costs of `coarse_table.py`. `place_cost.py` has the cost of hints and fixtures. `cohort.py` costs
+poses of other homes, to tell a good cost from chance.
 """
 
 from lalaloc_core.localise.match.binned_layouts import BinnedLayouts

@@ -6,8 +6,8 @@ pose at an azimuth is one row of
     table[azimuth, bin] = log(1 + r²) for every δ and hypothesis, over the number of azimuths
 
 and its cost under all δ and hypotheses is the sum of its rows: the product of a sparse matrix, made from the plan, with
-the table, made from the query. This takes a tenth of the time per azimuth, and there are fewer azimuths. Openings have
-rows as well; views through them are left to the full comparison.
+the table, made from the query (`coarse_table.py`). This takes a tenth of the time per azimuth, and there are fewer
+azimuths. Openings have rows as well, the same for every δ; views through them are left to the full comparison.
 
 In large plans most poses are excluded before that, by a lower bound of their cost over all δ and some neighbouring
 hypotheses. The bounds come from a table of minima in short integers, which stays in the cache. Poses are compared by
@@ -19,18 +19,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import WALL_CODE
-from lalaloc_core.localise.match.binned_layouts import OPENING_ROWS, BinnedLayouts
+from lalaloc_core.localise.match.binned_layouts import BinnedLayouts
+from lalaloc_core.localise.match.coarse_table import MAX_SUM, CoarseTable
 from lalaloc_core.localise.match.matching_cost import MatchingCost
 from lalaloc_core.localise.match.place_cost import PlaceCost
 
 # Poses compared at a time by rising bounds, in plans of more than the last number: few at first, as these limit the
-# number of poses; and for the bounds themselves.
-_FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
-# Neighbouring hypotheses that share a bound.
-_NEIGHBOURS = 2
-# Sums of bounds stay below this, close to the largest short integer.
-_MAX_SUM = 30_000
+# number of poses.
+_FIRST_CHUNK, _LAST_CHUNK = 128, 1024
 
 
 class LowestCosts:
@@ -97,21 +93,24 @@ def likeliest(
     result equals the best of all `coarse_costs`; some pairs beyond these and `at_most` can follow. `place_cost` is
     added to the costs of all pairs; infinite excludes a pair.
     """
-    table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
-    shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
-    bound = room_costs.min(axis=0)[room_index]
-    if len(binned) > _LAST_CHUNK:
-        bound = bound + _bounds(binned, table.reshape(len(table), *shape[1:]))
+    best = LowestCosts(at_most)
+    if len(binned) <= _LAST_CHUNK:
+        cost = coarse_costs(binned, matching_cost, room_index)
+        every = np.arange(len(binned))
+        best.offer(every, cost if place_cost is None else cost + place_cost.of_poses(every))
+        return best.ranked()
+    table, room_costs = CoarseTable(binned, matching_cost), matching_cost.room_costs
+    bound = room_costs.min(axis=0)[room_index] + table.bounds(binned)
     bound = bound if place_cost is None else bound + place_cost.lowest
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers sort fastest.
     order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
     least_after = np.minimum.accumulate(bound[order][::-1])[::-1]
-    best, least = LowestCosts(at_most), LowestCosts(at_least)
+    least = LowestCosts(at_least)
     lowest, first, count = np.inf, 0, _FIRST_CHUNK
     while first < len(order) and least_after[first] <= min(best.bound, max(lowest + window, least.bound)):
         pose = order[first : first + count]
-        cost = _at_best_offset(binned.rows[pose] @ table, room_costs[:, room_index[pose]], shape)
+        cost = table.costs(binned.part(pose), room_costs[:, room_index[pose]])
         cost = cost if place_cost is None else cost + place_cost.of_poses(pose)
         best.offer(pose, cost)
         least.offer(pose, cost)
@@ -124,77 +123,15 @@ def coarse_costs(
     binned: BinnedLayouts, matching_cost: MatchingCost, room_index: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n k"]:
     """Return the coarse costs of all poses under all hypotheses, each at its best δ."""
-    table, room_costs = _table(binned, matching_cost), matching_cost.room_costs
-    shape = (-1, len(matching_cost.offsets), matching_cost.hypotheses)
+    table, room_costs = CoarseTable(binned, matching_cost), matching_cost.room_costs
     costs, first = [], 0
-    for rows in binned.parts:
-        last = first + len(rows.indptr) - 1
-        costs.append(_at_best_offset(rows @ table, room_costs[:, room_index[first:last]], shape))
-        first = last
+    for part in binned.parts:
+        costs.append(table.costs(part, room_costs[:, room_index[first : first + len(part)]]))
+        first += len(part)
     return np.concatenate(costs)
 
 
 def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Return short integers in nearly the same order."""
     low, span = float(bound.min(initial=np.inf)), float(np.ptp(bound)) if len(bound) else 0.0
-    return ((bound - low) * (_MAX_SUM / max(span, 1e-9))).astype(np.int16)
-
-
-def _bounds(binned: BinnedLayouts, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
-    """Return a lower bound of the cost of every pose's walls and openings over all δ and hypotheses."""
-    azimuths = len(binned.columns)
-    least = np.minimum.reduceat(table.min(axis=1), np.arange(0, table.shape[2], _NEIGHBOURS), axis=1)
-    walls, openings = np.split(least, [azimuths * len(binned.bins)])
-    # Every azimuth has one row of walls, and at most one of openings.
-    most = azimuths * float(np.abs(walls).max() + np.abs(openings).max(initial=0.0))
-    scale = _MAX_SUM / max(most, 1e-6)
-    short = np.floor(least * scale).astype(np.int16)
-    bound = np.empty(len(binned), np.float32)
-    for first in range(0, len(binned), _BOUNDED_CHUNK):
-        part = slice(first, first + _BOUNDED_CHUNK)
-        bound[part] = (binned.rows[part] @ short).min(axis=1)
-    # The costs themselves are rounded to single precision.
-    return bound / scale - 1e-5
-
-
-def _at_best_offset(
-    costs: Float[np.ndarray, "n c"], room_costs: Float[np.ndarray, "j n"], shape: tuple[int, int, int]
-) -> Float[np.ndarray, "n k"]:
-    """Return the cost of poses under every hypothesis, each at its best δ."""
-    costs = costs.reshape(shape)
-    costs += room_costs.T[:, :, None]
-    return costs.min(axis=1)
-
-
-def _table(binned: BinnedLayouts, matching_cost: MatchingCost) -> Float[np.ndarray, "r c"]:
-    """Return the cost of each row under every δ and hypothesis, δ by δ."""
-    modes, loss = matching_cost.predicted_modes(binned.columns), matching_cost.opening_costs(binned.columns)
-    azimuths, bins = len(binned.columns), len(binned.bins)
-    offsets = matching_cost.offsets.astype(np.float32)
-    shape = (len(offsets), matching_cost.hypotheses)
-    # Hypotheses are one prediction, turned, so there are few different ones at an azimuth.
-    different, which = _different(modes.reshape(-1, modes.shape[2]))
-    apart = binned.bins[:, None, None] - offsets[:, None]
-    likelihood = sum(
-        odds / (1.0 + np.square((apart - centre) * precision))
-        for centre, precision, odds in different.reshape(len(different), -1, 3).transpose(1, 2, 0)
-    )
-    wall_costs = -np.log(np.minimum(likelihood, 1.0)) / azimuths
-    table = np.zeros((azimuths * (bins + OPENING_ROWS), *shape), np.float32)
-    walls = table[: azimuths * bins].reshape(azimuths, bins, *shape)
-    openings = table[azimuths * bins :].reshape(azimuths, OPENING_ROWS, *shape)
-    for azimuth, pair in enumerate(which.reshape(modes.shape[:2]).T):
-        walls[azimuth] = wall_costs[:, :, pair]
-    if loss is not None:
-        loss = loss.transpose(1, 2, 0)[:, :, None] / azimuths
-        walls += loss[:, WALL_CODE, None]
-        openings[:] = loss[:, 1:] - loss[:, :1]
-    return table.reshape(len(table), -1)
-
-
-def _different(rows: Float[np.ndarray, "n v"]) -> tuple[Float[np.ndarray, "d v"], Int[np.ndarray, "n"]]:
-    """Return the different rows, and which of them each row is; as `np.unique`, which compares column by column."""
-    rows = np.ascontiguousarray(rows)
-    whole = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
-    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
-    return rows[first], which
+    return ((bound - low) * (MAX_SUM / max(span, 1e-9))).astype(np.int16)

@@ -18,6 +18,8 @@ _MIN_CEILING_SCALE = 0.04
 _MIN_CLEARANCE_M = 0.05
 # `log` is slow, so multiply this many factors, each at most the maximum, before taking it.
 _FACTORS, _MAX_FACTOR = 4, 1e9
+# Seen columns are compared alone if they are at most this share of all.
+_FEW_SEEN = 0.75
 
 
 class WallMode(NamedTuple):
@@ -41,6 +43,14 @@ class WallMode(NamedTuple):
         values = log_m, precisions(log_m, log_scale, reach_m, tail), odds
         return cls(*(np.ascontiguousarray(value[:, ::stride], np.float32) for value in values))
 
+    def spread(self) -> WallMode:
+        """Return the mode with odds for every column."""
+        return self._replace(odds=np.ascontiguousarray(np.broadcast_to(self.odds, self.centre.shape)))
+
+    def at(self, columns: Int[np.ndarray, "k s"]) -> WallMode:
+        """Return the mode, of all values, at some columns of each hypothesis."""
+        return WallMode(*(np.take_along_axis(value, columns, axis=1) for value in self))
+
     def likelihood(self, log_m: np.ndarray, place: Any) -> np.ndarray:
         """Return the likelihoods of log distances at places: an index into (k, w)."""
         centre, precision = self.centre[place], self.precision[place]
@@ -49,6 +59,34 @@ class WallMode(NamedTuple):
     def likelihood_at(self, log_m: Float[np.ndarray, "n"], place: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the likelihoods of log distances at flat places."""
         return self.odds.take(place) / (1.0 + np.square((log_m - self.centre.take(place)) * self.precision.take(place)))
+
+
+class SeenWalls(NamedTuple):
+    """Modes at the columns that each hypothesis shows, of which views have few; others cost nothing.
+
+    Attributes:
+        modes: the modes at these columns, each (k, s).
+        columns: (k, s) the columns, filled up with unseen ones.
+        place: (k, w) the place of every column in a row of `columns`; -1 for those that are left out.
+    """
+
+    modes: tuple[WallMode, ...]
+    columns: Int[np.ndarray, "k s"]
+    place: Int[np.ndarray, "k w"]
+
+    @classmethod
+    def of(cls, modes: Sequence[WallMode]) -> SeenWalls:
+        """Return the modes at the seen columns; all, if most are seen."""
+        hypotheses, width = modes[0].centre.shape
+        is_seen = np.any([mode.precision > 0.0 for mode in modes], axis=0)
+        count = -(-max(int(is_seen.sum(axis=1).max(initial=0)), 1) // _FACTORS) * _FACTORS
+        if count > _FEW_SEEN * width:
+            every = np.broadcast_to(np.arange(width), (hypotheses, width))
+            return cls(tuple(mode.spread() for mode in modes), every, every)
+        columns = np.argsort(~is_seen, axis=1, kind="stable")[:, :count]
+        place = np.full((hypotheses, width), -1)
+        np.put_along_axis(place, columns, np.arange(count), axis=1)
+        return cls(tuple(mode.spread().at(columns) for mode in modes), columns, place)
 
 
 def precisions(
@@ -106,20 +144,27 @@ def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarra
 
 
 def mean_log(
-    factor: Float[np.ndarray, "n w"], *, factors: int = _FACTORS, max_factor: float = _MAX_FACTOR
+    factor: Float[np.ndarray, "n w"],
+    *,
+    columns: int | None = None,
+    factors: int = _FACTORS,
+    max_factor: float = _MAX_FACTOR,
 ) -> Float[np.ndarray, "n"]:
     """Return the mean logarithm of each row.
+
+    The sums are divided by `columns` if it is given; factors that are left out are 1.
 
     Values of `factor`, from 1 upwards, are overwritten. So many `factors` are multiplied before the logarithm if they
     divide the number of columns; values above `max_factor` count as that, so that products stay finite.
     """
-    columns = factor.shape[1]
-    if columns % factors:
-        return np.log(factor).mean(axis=1)
+    given = factor.shape[1]
+    columns = given if columns is None else columns
+    if given % factors:
+        return np.log(factor).sum(axis=1) / columns
     np.minimum(factor, max_factor, out=factor)
-    width = columns // factors
+    width = given // factors
     product = factor[:, :width].copy()
-    for begin in range(width, columns, width):
+    for begin in range(width, given, width):
         product *= factor[:, begin : begin + width]
     return np.log(product).sum(axis=1) / columns
 

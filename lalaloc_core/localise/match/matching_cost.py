@@ -42,6 +42,7 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match.cost_terms import (
+    SeenWalls,
     WallMode,
     ceiling_costs,
     class_losses,
@@ -290,17 +291,27 @@ class MatchingCost:
         self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
-        precision, offset = self._first.precision[hypothesis], offset.astype(np.float32)
+        seen, offset = self._seen_walls, offset.astype(np.float32)
+        first, *rivals = seen.modes
+        (count, width), shown = gathered.log_profile.shape, first.centre.shape[1]
+        log_profile = gathered.log_profile
+        if shown < width:
+            log_profile = log_profile.take(seen.columns[hypothesis] + np.arange(count)[:, None] * width)
+        precision = first.precision[hypothesis]
         # Residuals at δ = 0 for the opening or the pose's own wall; the offset is subtracted for each δ.
-        residual = gathered.log_profile - self._first.centre[hypothesis]
+        residual = log_profile - first.centre[hypothesis]
         residual *= precision
         # Residuals of the walls behind openings, by flat indices, which numpy takes fastest.
-        count, columns = residual.shape
-        place = gathered.pose * columns + gathered.column
-        predicted = np.broadcast_to(hypothesis * columns, count)[gathered.pose] + gathered.column
-        precision_behind = self._first.precision.take(predicted)
-        residual_behind = (gathered.log_behind - self._first.centre.take(predicted)) * precision_behind
-        offset_behind = offset if offset.shape[1] == 1 else offset[:, gathered.pose]
+        own = np.broadcast_to(hypothesis, count)[gathered.pose]
+        pose, log_behind, odds, place = gathered.pose, gathered.log_behind, gathered.odds, gathered.column
+        if shown < width:
+            place = seen.place.take(own * width + gathered.column)
+            (kept,) = np.nonzero(place >= 0)
+            own, pose, log_behind, odds, place = (part[kept] for part in (own, pose, log_behind, odds, place))
+        predicted, place = own * shown + place, pose * shown + place
+        precision_behind = first.precision.take(predicted)
+        residual_behind = (log_behind - first.centre.take(predicted)) * precision_behind
+        offset_behind = offset if offset.shape[1] == 1 else offset[:, pose]
         cost = np.empty((len(offset), count), np.float32)
         for j in range(len(offset)):
             # The last δ reuses the memory of the residuals.
@@ -308,19 +319,18 @@ class MatchingCost:
             factor = np.subtract(residual, offset[j, :, None] * precision, out=out)
             np.square(factor, out=factor)
             factor += 1.0
-            if self._rival is not None:
-                rival = self._rival.likelihood(gathered.log_profile - offset[j, :, None], hypothesis)
-                factor = np.maximum(1.0 / (1.0 / factor + rival), 1.0)
+            for mode in rivals:
+                factor = np.maximum(
+                    1.0 / (1.0 / factor + mode.likelihood(log_profile - offset[j, :, None], hypothesis)), 1.0
+                )
             if len(place):
                 behind = np.square(residual_behind - offset_behind[j] * precision_behind) + 1.0
-                if self._rival is not None:
-                    behind = 1.0 / (
-                        1.0 / behind + self._rival.likelihood_at(gathered.log_behind - offset_behind[j], predicted)
-                    )
+                for mode in rivals:
+                    behind = 1.0 / (1.0 / behind + mode.likelihood_at(log_behind - offset_behind[j], predicted))
                 # At least 1: an opening costs nothing where its own wall fits, as networks learn to see that wall.
-                either = np.maximum(1.0 / (1.0 / factor.take(place) + gathered.odds / behind), 1.0)
+                either = np.maximum(1.0 / (1.0 / factor.take(place) + odds / behind), 1.0)
                 factor.put(place, either)
-            cost[j] = mean_log(factor)
+            cost[j] = mean_log(factor, columns=width)
         return cost
 
     def _openings(self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
@@ -329,6 +339,11 @@ class MatchingCost:
         if loss is None or gathered.opening is None:
             return np.zeros(len(gathered.room_index), np.float32)
         return loss.take(hypothesis[:, None] * loss[0].size + gathered.opening).mean(axis=1)
+
+    @cached_property
+    def _seen_walls(self) -> SeenWalls:
+        """Predicted walls at the columns that count."""
+        return SeenWalls.of([self._first] if self._rival is None else [self._first, self._rival])
 
     @cached_property
     def _opening_losses(self) -> Float[np.ndarray, "k w c"] | None:

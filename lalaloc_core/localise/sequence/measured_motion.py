@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
-from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
@@ -178,6 +177,9 @@ class _Pairs(NamedTuple):
 
 def _pairs_at_distance(distance_m: float, std_m: float, first: States, second: States) -> _Pairs:
     """Return the pairs of places at about a distance (m)."""
+    # Imported late: few programs that load this module need it, and it takes as long as a query.
+    from scipy.spatial import KDTree
+
     near = KDTree(second.position_m).query_ball_point(first.position_m, distance_m + _MAX_DEVIATIONS * std_m)
     count = np.array([len(targets) for targets in near])
     source = np.repeat(np.arange(len(near)), count)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import block_diag, coo_array, csr_array, eye_array
-from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import PASSAGE_CODE, TWO_PI, WALL_CODE, WINDOW_CODE, wrap_angle
 from lalaloc_core.errors import InvalidMotionError
@@ -176,6 +175,9 @@ class WalkGraph:
     @classmethod
     def of(cls, poses: PoseSet, layouts: Layouts, step_m: float) -> WalkGraph:
         """Link the poses of a plan's grid, given their layouts."""
+        # Imported late: it takes as long as a query, and only tracking needs it.
+        from scipy.spatial import KDTree
+
         count, position = len(poses), poses.position_m
         reach_m = max(_LINK_STEPS * step_m, _DOORWAY_M)
         pair = KDTree(position).query_pairs(reach_m, output_type="ndarray")

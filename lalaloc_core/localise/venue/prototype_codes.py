@@ -18,7 +18,6 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from typing import Any, cast
 
-import faiss
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
@@ -70,6 +69,9 @@ class CodeScan:
 
         `begin` is the begin of each list in `code`, and the end of the last list.
         """
+        # Imported late: only large venues need it, and it takes as long as several queries.
+        import faiss
+
         dimensions = _PARTS * _VALUES
         lists = len(begin) - 1
         # The constructor needs a coarse quantiser, but callers choose the lists. The index refers to it, so keep it.
@@ -114,6 +116,8 @@ class CodeScan:
     def _search(
         self, tables: Float[np.ndarray, "q d"], lists: Bool[np.ndarray, "q l"], count: int
     ) -> tuple[Int[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
+        import faiss
+
         # Queries of several callers run on threads of their own; by default faiss takes all cores for each.
         faiss.omp_set_num_threads(1)
         number = np.where(lists, np.arange(lists.shape[1]), -1)

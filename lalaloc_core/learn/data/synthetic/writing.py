@@ -30,7 +30,6 @@ from tqdm import tqdm
 
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.files import PART_SUFFIX, atomic_write
-from lalaloc_core.learn.data.dataset import SPLITS, Split
 from lalaloc_core.learn.data.structured3d import (
     RENDERING_FOLDER,
     SYNTHETIC_FILE,
@@ -47,6 +46,7 @@ from lalaloc_core.learn.data.structured3d_writer import (
     write_picture,
 )
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
+from lalaloc_core.learn.dataset_names import SPLITS, Split
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
