@@ -83,7 +83,7 @@ def import_plans(
             f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes); "
             "export a single storey"
         )
-    budget = Budget(limits, clock, trace)
+    budget = Budget(limits, clock, trace, len(content))
     try:
         format, source = _open(content, limits)
         plans = format.read(source, options, budget)
