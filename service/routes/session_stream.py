@@ -24,7 +24,8 @@ from service.http.socket_requests import (
 )
 from service.routes.query_request import PHOTO
 from service.runtime import Runtime
-from service.security import caller_of, put_caller
+from service.security import caller_of
+from service.security.permissions import put_caller
 from service.security.audit import entry_of
 
 router = APIRouter(tags=["sessions"])
