@@ -25,8 +25,8 @@ from service.http.socket_requests import (
 from service.routes.query_request import PHOTO
 from service.runtime import Runtime
 from service.security import caller_of
-from service.security.permissions import put_caller
 from service.security.audit import entry_of
+from service.security.permissions import put_caller
 
 router = APIRouter(tags=["sessions"])
 _SUFFIX = "/stream"
